@@ -1,0 +1,156 @@
+"""What the iterating integrators share: parameters, the session that runs iterations, and the film at the end."""
+
+from __future__ import annotations
+
+import math
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..transport.film import Accumulator, variance_channels
+from ..transport.random import mix
+from ..transport.traits import UnsupportedScene, check_scene
+from .parameters import Parameters
+
+
+class IterativeIntegrator(mi.AdjointIntegrator):
+    """Base of integrators that render by independent iterations and average them.
+
+    A subclass reads its own parameters in `read_parameters` and makes the object that runs iterations in `new_session`.
+    """
+
+    def __init__(self, props):
+        parameters = Parameters(props)
+        self.plugin = parameters.plugin
+        self.max_depth = parameters.integer("max_depth", -1, -1, "-1 (unlimited) or at least 0")
+        self.rr_depth = parameters.integer("rr_depth", 5, 1, "at least 1")
+        self.hide_emitters = parameters.boolean("hide_emitters", False)
+        self.camera_paths = parameters.integer("camera_paths", 1, 1, "at least 1")
+        self.variance = parameters.boolean("variance", False)
+        self.read_parameters(parameters)
+        parameters.finish()
+        super().__init__(props)
+
+    def read_parameters(self, parameters):
+        """Reads the subclass's own parameters."""
+        raise NotImplementedError
+
+    def new_session(self, scene, sensor, seed, iterations):
+        """The object that runs iterations; see `mis_integrators.session.Session`."""
+        raise NotImplementedError
+
+    def aov_names(self):
+        return variance_channels() if self.variance else []
+
+    def to_string(self):
+        lines = ",\n".join(f"  {name} = {value}" for name, value in self.settings().items())
+        return f"{type(self).__name__}[\n{lines}\n]"
+
+    def settings(self):
+        """Parameter names and values."""
+        return {"max_depth": self.max_depth, "rr_depth": self.rr_depth, "hide_emitters": self.hide_emitters,
+                "camera_paths": self.camera_paths, "variance": self.variance}
+
+    def session(self, scene, sensor=0, seed=0, spp=0):
+        """Prepares a rendering of `scene`: `spp` camera paths a pixel are planned (0: the sampler's own count)."""
+        sensor = self._sensor(scene, sensor)
+        check_scene(scene, sensor, self.plugin)
+        spp = spp or sensor.sampler().sample_count()
+        iterations = math.ceil(spp / self.camera_paths)
+        if iterations * self.camera_paths != spp:
+            mi.Log(mi.LogLevel.Warn, f"{self.plugin}: {spp} samples per pixel rounded up to {iterations} iterations of "
+                                     f"camera_paths = {self.camera_paths}")
+        if self.variance and iterations < 2:
+            raise ValueError(f'{self.plugin}: parameter "variance" needs at least two iterations; ask for spp >= '
+                             f'{2 * self.camera_paths}')
+        return self.new_session(scene, sensor, _scalar(seed), iterations)
+
+    @staticmethod
+    def _sensor(scene, sensor):
+        if isinstance(sensor, int):
+            sensors = scene.sensors() if isinstance(scene, mi.Scene) else []
+            if not 0 <= sensor < len(sensors):
+                raise UnsupportedScene(f"the scene has {len(sensors)} sensors under variant {mi.variant()}; sensor {sensor} "
+                                       "does not exist")
+            return sensors[sensor]
+        return sensor
+
+    def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
+        with dr.suspend_grad():
+            session = self.session(scene, sensor, seed, spp)
+            for _ in range(session.iterations_planned):
+                session.iterate()
+            session.fill_film()
+            if not develop:
+                return mi.TensorXf()
+            image = session.sensor.film().develop()
+            if evaluate:
+                dr.eval(image)
+            return image
+
+    def render_forward(self, scene, params, sensor=0, seed=0, spp=0):
+        raise NotImplementedError(f"{self.plugin}: gradients are not supported; use Mitsuba's prb")
+
+    def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0):
+        raise NotImplementedError(f"{self.plugin}: gradients are not supported; use Mitsuba's prb")
+
+
+class IterativeSession:
+    """Runs iterations and accumulates them; a subclass implements `_iteration(index) -> block tensor`.
+
+    `seed` is an integer; iteration `i` draws all its random numbers from (seed, i), so iterations are independent and any
+    subset of them can be rendered anywhere.
+    """
+
+    def __init__(self, integrator, scene, sensor, seed, iterations):
+        self.integrator, self.scene, self.sensor, self.seed = integrator, scene, sensor, seed
+        self.iterations_planned = iterations
+        self.samples_per_iteration = integrator.camera_paths
+        self.accumulator = Accumulator(integrator.variance)
+
+    @property
+    def iterations(self):
+        """Iterations done."""
+        return self.accumulator.iterations
+
+    @property
+    def settings(self):
+        """Names and values that reproduce the image, together with the scene."""
+        return {"integrator": self.integrator.plugin, **self.integrator.settings(), "seed": self.seed}
+
+    def iterate(self):
+        """Runs one iteration to its end."""
+        with dr.suspend_grad():
+            self.accumulator.add(self._iteration(self.iterations))
+            dr.eval(self.accumulator.total)
+            dr.sync_thread()
+
+    def _seed(self, iteration, purpose):
+        return dr.opaque(mi.UInt32, mix(self.seed, iteration, purpose))
+
+    def fill_film(self):
+        """Hands what has been rendered so far to the sensor's film, ready to develop."""
+        film = self.sensor.film()
+        film.clear()
+        film.prepare(self.integrator.aov_names())
+        self.accumulator.put(film)
+
+    def image(self):
+        """The image so far: float32, (height, width, channels)."""
+        if self.integrator.variance and self.iterations < 2:
+            raise ValueError(f'{self.integrator.plugin}: parameter "variance" needs at least two iterations')
+        self.fill_film()
+        return np.array(self.sensor.film().develop(), dtype=np.float32)
+
+    @property
+    def channels(self):
+        """Channel names of `image()`."""
+        film = self.sensor.film()
+        film.clear()
+        film.prepare(self.integrator.aov_names())
+        return [field.name for field in film.bitmap().struct_()]
+
+
+def _scalar(seed):
+    return int(seed) if isinstance(seed, int) else int(np.array(seed).ravel()[0])

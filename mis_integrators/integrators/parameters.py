@@ -1,0 +1,58 @@
+"""Reading plugin parameters: types and ranges checked, unknown names refused, before any sampling."""
+
+from __future__ import annotations
+
+REFUSED = {"samples_per_pass": 'iterations are passes already; use "camera_paths" and spp',
+           "timeout": 'use "mis-render --time SECONDS"',
+           "block_size": "there are no blocks: an iteration covers the whole film"}
+
+
+class ParameterError(ValueError):
+    """A plugin parameter that is unknown, of the wrong type or out of range; the message says what is allowed."""
+
+
+class Parameters:
+    """Typed access to a plugin's `mi.Properties`; remembers what was asked for, so that the rest can be refused."""
+
+    def __init__(self, props):
+        self.props = props
+        self.plugin = props.plugin_name()
+        self.known = []
+        for name, advice in REFUSED.items():
+            if props.has_property(name):
+                raise ParameterError(f'{self.plugin}: parameter "{name}" is not supported: {advice}')
+
+    def _fail(self, name, value, allowed):
+        raise ParameterError(f'{self.plugin}: parameter "{name}" = {value!r} is not allowed: expected {allowed}')
+
+    def _get(self, name, default):
+        self.known.append(name)
+        return self.props.get(name, default) if self.props.has_property(name) else default
+
+    def integer(self, name, default, low, allowed, high=None):
+        """An integer in [low, high]; `allowed` is the range in words."""
+        value = self._get(name, default)
+        if type(value) is not int or value < low or (high is not None and value > high):
+            self._fail(name, value, f"an integer, {allowed}")
+        return value
+
+    def number(self, name, default, accept, allowed):
+        """A float for which `accept(value)` holds; `allowed` is the range in words."""
+        value = self._get(name, default)
+        if type(value) not in (int, float) or not accept(float(value)):
+            self._fail(name, value, f"a number, {allowed}")
+        return float(value)
+
+    def boolean(self, name, default):
+        """True or false."""
+        value = self._get(name, default)
+        if type(value) is not bool:
+            self._fail(name, value, "true or false")
+        return value
+
+    def finish(self):
+        """Refuses whatever was given but not asked for."""
+        unknown = [name for name in self.props.unqueried() if name not in self.known]
+        if unknown:
+            names = ", ".join(sorted(self.known))
+            raise ParameterError(f'{self.plugin}: unknown parameter "{unknown[0]}"; allowed are: {names}')

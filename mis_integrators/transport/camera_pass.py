@@ -1,0 +1,170 @@
+"""Camera sub-paths: direct light on the way, and the vertices at which photons are to be gathered."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from .lights import mis_power
+from .packing import Store
+from .random import next_2d, streams
+
+
+def film_samples(sensor, index, camera_paths: int, rng):
+    """Film positions of camera paths `index` (in pixels, crop offset included), in the order pixel by pixel, row by row.
+
+    Returns `(position in [0, 1]^2 of the crop window, position for splatting)`; with a film that samples its border the
+    grid covers the border too, as in Mitsuba's own integrators.
+    """
+    film = sensor.film()
+    size = mi.ScalarVector2i(film.crop_size())
+    border = film.rfilter().border_size() if film.sample_border() else 0
+    width = size.x + 2 * border
+    pixel = index // camera_paths
+    corner = mi.Vector2i(mi.Int32(pixel % width), mi.Int32(pixel // width)) - border + mi.Vector2i(film.crop_offset())
+    position = mi.Vector2f(corner) + mi.Vector2f(next_2d(rng))
+    scale = dr.rcp(mi.ScalarVector2f(film.crop_size()))
+    unit = (position - mi.ScalarVector2f(film.crop_offset())) * scale
+    splat = mi.Vector2f(corner) if film.rfilter().is_box_filter() else position
+    return mi.Point2f(unit), mi.Point2f(splat)
+
+
+def film_sample_count(sensor):
+    """Pixels that camera paths are sent through: the crop window, with its border where the film samples it."""
+    film = sensor.film()
+    size = film.crop_size()
+    border = 2 * film.rfilter().border_size() if film.sample_border() else 0
+    return (int(size[0]) + border) * (int(size[1]) + border)
+
+
+def new_vertex_buffer(capacity):
+    """Room for `capacity` camera vertices that wait for photons: what rebuilds the surface interaction there, the path's
+    throughput up to it, its path's number, and its depth in segments with the top bit set where all photons are wanted (else
+    only caustic ones). Unused places have throughput zero."""
+    return {"ray_o": dr.empty(mi.Point3f, capacity), "ray_d": dr.empty(mi.Vector3f, capacity),
+            "hit": dr.empty(mi.PreliminaryIntersection3f, capacity), "throughput": dr.zeros(mi.Spectrum, capacity),
+            "path": dr.empty(mi.UInt32, capacity), "depth": dr.empty(mi.UInt32, capacity)}
+
+
+LAST_VERTEX = 1 << 31
+
+
+@dr.syntax
+def trace_camera_paths(scene, sensor, integrator, lights, traits, seed, first, n_paths: int, camera_paths: int, wavelength_sample,
+                       bdd: int, max_depth: int, rr_depth: int, hide_emitters: bool, capacity: int, has_caustics: bool,
+                       has_indirect: bool, one_vertex: bool):
+    """Traces camera paths `first` ... `first + n_paths` (numbered as by `film_samples`) to their `bdd`-th smooth vertex.
+
+    On the way: emission seen directly or through delta surfaces; at every smooth vertex up to the `bdd`-th, direct light by
+    next-event estimation combined with BSDF sampling (power heuristic). Light that reaches a smooth vertex through delta
+    surfaces belongs to caustic photons and is left out. Delta vertices do not count; a BSDF with both parts is a smooth
+    vertex whose delta part goes on.
+
+    Returns `(radiance, alpha, splat position, vertices, count)`: the vertices at which photons are to be gathered, as made by
+    `new_vertex_buffer`, and how many wanted a place in it (width one). With `one_vertex` each path owns the place of its number.
+    """
+    path = dr.arange(mi.UInt32, n_paths)
+    number = path + first
+    active = number < film_sample_count(sensor) * camera_paths
+    rng = streams(number, seed)
+    unit, splat = film_samples(sensor, number, camera_paths, rng)
+    aperture = mi.Point2f(0.5)
+    if dr.hint(sensor.needs_aperture_sample(), mode='scalar'):
+        aperture = next_2d(rng)
+    time = mi.Float(sensor.shutter_open())
+    if dr.hint(sensor.shutter_open_time() > 0, mode='scalar'):
+        time += rng.next_float32() * sensor.shutter_open_time()
+    ray, sensor_weight = sensor.sample_ray(time, wavelength_sample, unit, aperture, active)
+
+    ray = mi.Ray3f(ray)
+    throughput = mi.Spectrum(sensor_weight)
+    radiance = mi.Spectrum(0)
+    vertex = mi.UInt32(0)                            # smooth vertices left behind
+    depth = mi.UInt32(0)                             # segments so far
+    behind_delta = mi.Bool(False)                    # last vertex scattered by a delta function
+    eta = mi.Float(1)
+    scatter_pdf = mi.Float(1)                        # of the last smooth vertex
+    origin = dr.zeros(mi.Interaction3f)              # the last smooth vertex
+    context = mi.BSDFContext()
+    store = Store(vertices=new_vertex_buffer(capacity), count=dr.zeros(mi.UInt32, 1))
+    environment_shows = (scene.environment() is not None) and not hide_emitters
+    visible = mi.Bool(environment_shows)
+    if dr.hint(max_depth == 0, mode='scalar'):
+        active &= False
+
+    hit = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
+    if dr.hint(hide_emitters, mode='scalar'):
+        on_light = active & hit.is_valid() & (hit.shape.emitter() != None)  # noqa: E711 (array comparison)
+        behind = hit.compute_surface_interaction(ray, mi.RayFlags.Minimal, on_light).spawn_ray(ray.d)
+        skipped = integrator.skip_area_emitters(scene, behind, True, on_light)
+        hit[on_light] = skipped
+        ray.o[on_light] = behind.o
+
+    while dr.hint(active, label="camera paths"):
+        si = hit.compute_surface_interaction(ray, mi.RayFlags.All, active=active)
+        depth += 1
+
+        # ---- Emission met by the path
+        if dr.hint(traits.has_light_surfaces, mode='scalar'):
+            ds = mi.DirectionSample3f(scene, si, origin)
+            shown = active & ((vertex == 0) | ~behind_delta)
+            if dr.hint(hide_emitters, mode='scalar'):
+                shown &= (depth > 1) | si.is_valid()
+            light_pdf = lights.pdf_direct(origin, ds, shown & (vertex > 0))
+            share = dr.select(vertex == 0, 1, mis_power(scatter_pdf, light_pdf))
+            radiance[shown] += throughput * share * ds.emitter.eval(si, shown)
+
+        active &= si.is_valid() & (vertex <= bdd)
+        if dr.hint(max_depth > 0, mode='scalar'):
+            active &= depth < max_depth
+        bsdf = si.bsdf(ray)
+        smooth = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+
+        # ---- Direct light
+        if dr.hint(not lights.dark, mode='scalar'):
+            ds, light, light_pdf = lights.sample_direct(si, rng, smooth)
+            response, response_pdf = bsdf.eval_pdf(context, si, si.to_local(ds.d), smooth)
+            share = dr.select(ds.delta, 1, mis_power(light_pdf, response_pdf))
+            radiance[smooth] += throughput * share * response * light
+
+        # ---- Ask for photons
+        last = vertex == bdd
+        wants = smooth & (dr.max(throughput) > 0)
+        if dr.hint(not has_caustics, mode='scalar'):
+            wants &= last & has_indirect
+        slot = mi.UInt32(path)
+        if dr.hint(not one_vertex, mode='scalar'):
+            slot = dr.scatter_inc(store.count, mi.UInt32(0), wants)
+            wants &= slot < capacity
+        if dr.hint(capacity > 0, mode='scalar'):
+            dr.scatter(store.vertices["ray_o"], ray.o, slot, wants)
+            dr.scatter(store.vertices["ray_d"], ray.d, slot, wants)
+            dr.scatter(store.vertices["hit"], hit, slot, wants)
+            dr.scatter(store.vertices["throughput"], throughput, slot, wants)
+            dr.scatter(store.vertices["path"], path, slot, wants)
+            dr.scatter(store.vertices["depth"], depth | dr.select(last, mi.UInt32(LAST_VERTEX), mi.UInt32(0)), slot, wants)
+
+        # ---- Go on
+        bs, weight = bsdf.sample(context, si, rng.next_float32(active), next_2d(rng, active), active)
+        delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+        visible |= active & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
+        if dr.hint(not traits.has_light_surfaces, mode='scalar'):
+            active &= delta | ~last
+        throughput *= weight
+        eta *= bs.eta
+        ray = si.spawn_ray(si.to_world(bs.wo))
+        scattered = active & ~delta
+        origin[scattered] = mi.Interaction3f(si)
+        scatter_pdf[scattered] = bs.pdf
+        vertex[scattered] += 1
+        behind_delta = mi.Bool(delta)
+        strength = dr.max(throughput)
+        active &= strength > 0
+        survival = dr.minimum(strength * dr.square(eta), 0.95)
+        roulette = active & (depth >= rr_depth)
+        active &= ~roulette | (rng.next_float32(roulette) < survival)
+        throughput = dr.select(roulette, throughput * dr.rcp(survival), throughput)
+        hit = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
+
+    alpha = dr.select(visible, mi.Float(1), mi.Float(0))
+    return radiance, alpha, splat, store.vertices, store.count

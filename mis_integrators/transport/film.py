@@ -1,0 +1,84 @@
+"""From samples to the film: reconstruction, accumulation over iterations, and the variance of the pixel means."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+
+def colour_channels(radiance, wavelengths):
+    """Three display channels of a `Spectrum` (spectral: CIE to linear sRGB; mono: grey)."""
+    if mi.is_spectral:
+        return mi.spectrum_to_srgb(radiance, wavelengths)
+    if mi.is_monochromatic:
+        return mi.Color3f(radiance.x)
+    return radiance
+
+
+def splat_samples(film, position, radiance, alpha, wavelengths, active):
+    """Reconstructs one pass: an image tensor (height, width, channels), border included, that holds sums of filter weight
+    times (R, G, B, [alpha,] 1)."""
+    channels = 5 if mi.has_flag(film.flags(), mi.FilmFlags.Alpha) else 4
+    block = mi.ImageBlock(film.crop_size(), film.crop_offset(), channels, film.rfilter(), border=True, coalesce=False)
+    colour = colour_channels(radiance, wavelengths)
+    values = [colour.x, colour.y, colour.z]
+    if mi.has_flag(film.flags(), mi.FilmFlags.Alpha):
+        values.append(alpha)
+    block.put(position, values + [mi.Float(1)], active)
+    return block.tensor()
+
+
+class Accumulator:
+    """Sums of the iterations' blocks and, for the variance, of their squares. Its size does not grow with iterations."""
+
+    def __init__(self, with_variance):
+        self.with_variance = with_variance
+        self.iterations = 0
+        self.total = None
+        self.square = None          # colour squared
+        self.cross = None           # colour times weight
+        self.weight_square = None
+
+    def add(self, block):
+        """Adds one iteration's block tensor."""
+        if self.iterations == 0:
+            self.total = dr.zeros(mi.TensorXf, block.shape)
+            if self.with_variance:
+                height, width, _ = block.shape
+                self.square = dr.zeros(mi.TensorXf, (height, width, 3))
+                self.cross = dr.zeros(mi.TensorXf, (height, width, 3))
+                self.weight_square = dr.zeros(mi.TensorXf, (height, width, 1))
+        self.total += block
+        if self.with_variance:
+            colour, weight = block[:, :, :3], block[:, :, -1:]
+            self.square += colour * colour
+            self.cross += colour * weight
+            self.weight_square += weight * weight
+        self.iterations += 1
+        dr.schedule(self.total, self.square, self.cross, self.weight_square)
+
+    def variance_of_mean(self):
+        """Estimated variance of each pixel's mean (height, width, 3) from the iterations, by the ratio estimator's
+        delta method: sum (A_i - m W_i)^2 / (n (n - 1) mean(W)^2), A_i and W_i the weighted colour and weight of iteration i."""
+        n = self.iterations
+        weight = self.total[:, :, -1:]
+        safe = dr.select(weight == 0, 1, weight)
+        mean = self.total[:, :, :3] / safe
+        spread = self.square - 2 * mean * self.cross + mean * mean * self.weight_square
+        return dr.maximum(spread, 0) * (n / ((n - 1) * safe * safe))
+
+    def put(self, film):
+        """Writes the accumulated image, with variance channels where kept, into a film prepared with matching AOVs."""
+        tensor = self.total
+        if self.with_variance:
+            weight = tensor[:, :, -1:]
+            variance = self.variance_of_mean() * weight
+            if mi.is_monochromatic:
+                variance = variance[:, :, :1]
+            tensor = dr.concat([tensor, variance], axis=2)
+        film.put_block(mi.ImageBlock(tensor, film.crop_offset(), film.rfilter(), border=True))
+
+
+def variance_channels():
+    """Names of the variance AOVs in the active variant."""
+    return ["var.Y"] if mi.is_monochromatic else ["var.R", "var.G", "var.B"]

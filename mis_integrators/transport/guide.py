@@ -1,0 +1,303 @@
+"""Where light from infinitely far away should start so that it reaches what the camera sees.
+
+A sun, a sky or an environment map sends its sub-paths through the disk of the whole scene's bounding sphere; through a window,
+almost none would enter. A pilot of camera paths asks from which directions, and through which part of the plane across each
+direction, the places that matter are lit. Sub-paths then start mostly there: a histogram over (direction cell, position cell),
+mixed with the plain densities, which keeps every estimate unbiased however poor the pilot.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from .random import next_2d, streams
+
+POLAR_CELLS = 16
+AZIMUTH_CELLS = 32
+DIRECTION_CELLS = POLAR_CELLS * AZIMUTH_CELLS
+POSITION_CELLS = 32
+DEFENSIVE_SHARE = 0.1
+"""Share of sub-paths that start anywhere on the scene's disk."""
+PILOT_PATHS = 65536
+PILOT_BOUNCES = 4
+PASS_THROUGH = 8
+"""Transmissive surfaces that the pilot's visibility test looks straight through (panes, masks)."""
+FEWEST_RECORDS = 64
+
+
+def infinite_emitters(scene):
+    """Indices and emitters whose light comes from infinitely far away."""
+    return [(i, e) for i, e in enumerate(scene.emitters()) if e.flags() & mi.EmitterFlags.Infinite]
+
+
+def direction_cell(d):
+    """Cell number of world directions on an equal-area grid (16 in z, 32 in azimuth)."""
+    row = dr.clip(mi.UInt32((d.z + 1) * (0.5 * POLAR_CELLS)), 0, POLAR_CELLS - 1)
+    azimuth = dr.atan2(d.y, d.x) * dr.inv_two_pi
+    azimuth = dr.select(azimuth < 0, azimuth + 1, azimuth)
+    column = dr.clip(mi.UInt32(azimuth * AZIMUTH_CELLS), 0, AZIMUTH_CELLS - 1)
+    return row * AZIMUTH_CELLS + column
+
+
+def cell_direction(cell, sample):
+    """A direction uniformly distributed in direction cell `cell`."""
+    z = (mi.Float(cell // AZIMUTH_CELLS) + sample.x) * (2 / POLAR_CELLS) - 1
+    phi = (mi.Float(cell % AZIMUTH_CELLS) + sample.y) * (2 * dr.pi / AZIMUTH_CELLS)
+    sin_phi, cos_phi = dr.sincos(phi)
+    radius = dr.safe_sqrt(1 - z * z)
+    return mi.Vector3f(radius * cos_phi, radius * sin_phi, z)
+
+
+class EnvironmentGuide:
+    """Densities of position and direction for infinite emitters (`environment` and `directional` kinds).
+
+    Attributes: `center`, `radius` of the scene's bounding sphere; `focus_center`, `focus_radius` of the lit places that the
+    pilot met; `direction_share`, the share of environment sub-paths whose direction comes from the emitter's own sampler.
+    """
+
+    def __init__(self, scene, sensor):
+        box = scene.bbox()
+        low, high = np.array(box.min).ravel(), np.array(box.max).ravel()
+        if not np.all(np.isfinite(low) & np.isfinite(high)):
+            low, high = np.full(3, -1.0), np.full(3, 1.0)
+        self._set_sphere((low + high) / 2, max(np.linalg.norm(high - low) / 2, 1e-3))
+        self.scene = scene
+        self.infinite = infinite_emitters(scene)
+        first_rows, row = np.zeros(len(scene.emitters()), dtype=np.uint32), 0
+        for index, emitter in self.infinite:
+            first_rows[index] = row
+            row += DIRECTION_CELLS if emitter.is_environment() else 1
+        self.row_count = row
+        self._first_row = mi.UInt32(first_rows)
+        self.direction_share = 1.0
+        self._learn(sensor)
+
+    def _set_sphere(self, center, radius):
+        self.center, self.radius = mi.Point3f([float(x) for x in center]), float(radius) * 1.001
+        self.focus_center, self.focus_radius = mi.Point3f(self.center), self.radius
+
+    def row_of_emitter(self, index):
+        """First table row of emitter `index`: the only one of a directional emitter."""
+        return dr.gather(mi.UInt32, self._first_row, index)
+
+    # ------------------------------------------------------------------ pilot
+
+    def _learn(self, sensor):
+        records = [self._numpy(r) for r in self._pilot(sensor)]
+        p, d, row, weight, tested, reached = (np.concatenate(x, axis=-1) for x in zip(*records))
+        useful = (weight > 0) & np.isfinite(weight)
+        cells = POSITION_CELLS ** 2
+        pmf = np.zeros((self.row_count, cells))
+        if np.count_nonzero(useful) >= FEWEST_RECORDS:
+            low, high = np.percentile(p[:, useful], [0.1, 99.9], axis=1)
+            center, radius = (low + high) / 2, max(np.linalg.norm(high - low) / 2, 1e-4 * self.radius)
+            self.focus_center, self.focus_radius = mi.Point3f([float(x) for x in center]), float(radius) * 1.05
+            cell, inside = self._position_cell(mi.Vector3f(d), mi.Point3f(p))
+            cell, inside = np.array(cell), np.array(inside)
+            keep = useful & inside
+            # Heavy records (a glossy peak, a texel of the sun) guide no better than others of their row.
+            weight = np.minimum(weight, 20 * np.mean(weight[keep])) if keep.any() else weight
+            np.add.at(pmf, (row[keep], cell[keep]), weight[keep])
+        grid = pmf.reshape(-1, POSITION_CELLS, POSITION_CELLS)
+        padded = np.pad(grid, ((0, 0), (1, 1), (1, 1)))
+        spread = sum(padded[:, i:i + POSITION_CELLS, j:j + POSITION_CELLS] for i in range(3) for j in range(3))
+        pmf = (grid + 0.25 * spread).reshape(self.row_count, cells)
+        total = pmf.sum(axis=1)
+        self._learn_directions(row, tested, reached)
+        pmf /= np.maximum(total, 1e-300)[:, None]
+        self._pmf = mi.Float(pmf.astype(np.float32).ravel())
+        self._cdf = mi.Float(np.cumsum(pmf, axis=1).astype(np.float32).ravel())
+        self._guided = mi.Float(np.where(total > 0, 1 - DEFENSIVE_SHARE, 0.0))
+
+    def _learn_directions(self, row, tested, reached):
+        """Direction cells by (radiance without its sharp peaks) x (share of the tests that saw the sky)."""
+        environment = next(((i, e) for i, e in self.infinite if e.is_environment()), None)
+        if environment is None:
+            return
+        index, emitter = environment
+        first = int(np.array(self._first_row)[index])
+        tests = np.bincount(row, weights=tested, minlength=self.row_count)[first:first + DIRECTION_CELLS]
+        seen = np.bincount(row, weights=reached, minlength=self.row_count)[first:first + DIRECTION_CELLS]
+        reach = seen / np.maximum(tests, 1)
+        draws = 64
+        cell = dr.arange(mi.UInt32, DIRECTION_CELLS * draws) // draws
+        rng = streams(dr.arange(mi.UInt32, DIRECTION_CELLS * draws), mi.UInt32(0x64697273))
+        smooth = self._radiance(emitter, cell_direction(cell, next_2d(rng))).numpy().reshape(-1, draws)
+        smooth = np.minimum(smooth, 4 * np.median(smooth, axis=1, keepdims=True) + 1e-6 * smooth.mean()).mean(axis=1)
+        smooth_power = smooth * reach * (4 * np.pi / DIRECTION_CELLS)
+        ds, weight = emitter.sample_direction(self._point(self.center, mi.Float(0)), next_2d(streams(cell, mi.UInt32(1))))
+        drawn = np.array(direction_cell(ds.d))
+        weight = np.nan_to_num(np.array(dr.mean(weight)))
+        total_power = np.bincount(np.broadcast_to(drawn, weight.shape), weights=weight, minlength=DIRECTION_CELLS) / len(weight)
+        if smooth_power.sum() <= 0:
+            return
+        self.direction_share = float(np.clip(1 - smooth_power.sum() / max((total_power * reach).sum(), 1e-30), 0.25, 0.9))
+        pmf = smooth_power / smooth_power.sum()
+        self._direction_pmf = mi.Float(pmf)
+        self._direction_cdf = mi.Float(np.cumsum(pmf))
+
+    @staticmethod
+    def _numpy(record):
+        return [np.array(x) for x in record]
+
+    @staticmethod
+    def _point(p, time):
+        it = dr.zeros(mi.Interaction3f)
+        it.p = p
+        it.time = time
+        return it
+
+    def _radiance(self, emitter, towards, active=True):
+        si = dr.zeros(mi.SurfaceInteraction3f, dr.width(towards))
+        si.wi = -towards
+        if mi.is_spectral:
+            si.wavelengths = mi.UnpolarizedSpectrum(450, 520, 590, 640)
+        return dr.mean(emitter.eval(si, active))
+
+    def _pilot(self, sensor):
+        """Yields records (p, direction to the light, table row, weight, tested, reached) along camera paths."""
+        rng = streams(dr.arange(mi.UInt32, PILOT_PATHS), mi.UInt32(0x67756964))
+        wavelength_sample = 0.5
+        ray, _ = sensor.sample_ray(sensor.shutter_open(), wavelength_sample, next_2d(rng), next_2d(rng))
+        active = mi.Bool(True)
+        context = mi.BSDFContext()
+        for _ in range(PILOT_BOUNCES):
+            si = self.scene.ray_intersect(ray, active)
+            active &= si.is_valid()
+            bsdf = si.bsdf()
+            smooth = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+            for index, emitter in self.infinite:
+                first = int(np.array(self._first_row)[index])
+                ds, weight = emitter.sample_direction(si, next_2d(rng), smooth)
+                if emitter.is_environment():
+                    yield self._record(si, bsdf, context, ds.d, direction_cell(ds.d) + first, dr.mean(weight), smooth & (ds.pdf > 0))
+                    towards = mi.warp.square_to_uniform_sphere(next_2d(rng))
+                    weight = self._radiance(emitter, towards, smooth) * (4 * dr.pi)
+                    yield self._record(si, bsdf, context, towards, direction_cell(towards) + first, weight, smooth)
+                else:
+                    yield self._record(si, bsdf, context, ds.d, mi.UInt32(first), dr.mean(weight), smooth & (ds.pdf > 0))
+            bs, value = bsdf.sample(context, si, rng.next_float32(), next_2d(rng), active)
+            active &= dr.mean(value) > 0
+            ray = si.spawn_ray(si.to_world(bs.wo))
+            dr.eval(ray, active, rng)
+
+    def _record(self, si, bsdf, context, towards, row, weight, active):
+        wo = si.to_local(towards)
+        response = dr.minimum(dr.mean(bsdf.eval(context, si, wo, active)), 1)
+        tested = active & (response > 0)
+        reached = mi.Bool(tested)
+        ray = si.spawn_ray(towards)
+        for _ in range(PASS_THROUGH):
+            hit = self.scene.ray_intersect(ray, reached)
+            through = mi.has_flag(hit.bsdf().flags(), mi.BSDFFlags.Null) | \
+                mi.has_flag(hit.bsdf().flags(), mi.BSDFFlags.DeltaTransmission)
+            blocked = reached & hit.is_valid() & ~through
+            reached &= ~blocked
+            pending = reached & hit.is_valid()
+            ray = dr.select(pending, hit.spawn_ray(towards), ray)
+            dr.eval(ray, reached, pending)
+            if not dr.any(pending):
+                break
+        weight = dr.select(reached, weight * response, 0)
+        width = dr.width(si)
+        tested, reached = dr.select(tested, mi.Float(1), 0), dr.select(reached, mi.Float(1), 0)
+        row = row + dr.zeros(mi.UInt32, width)
+        return si.p, towards + dr.zeros(mi.Vector3f, width), row, weight, tested, reached
+
+    # ------------------------------------------------------------------ densities
+
+    def _position_cell(self, towards, p):
+        """Cell of the focus grid that a line along `towards` through `p` crosses, and whether it crosses the grid."""
+        frame = mi.Frame3f(towards)
+        offset = (p - self.focus_center) * (1 / self.focus_radius)
+        u, v = dr.dot(offset, frame.s), dr.dot(offset, frame.t)
+        n = POSITION_CELLS
+        column = dr.clip(mi.Int32(dr.floor((u + 1) * (0.5 * n))), 0, n - 1)
+        line = dr.clip(mi.Int32(dr.floor((v + 1) * (0.5 * n))), 0, n - 1)
+        return mi.UInt32(line * n + column), (dr.abs(u) <= 1) & (dr.abs(v) <= 1)
+
+    def position_density(self, towards, row, p, active=True):
+        """Density per unit area (across `towards`) of sub-paths along the line through `p`."""
+        cell, inside = self._position_cell(towards, p)
+        guided = dr.gather(mi.Float, self._guided, row, active)
+        probability = dr.gather(mi.Float, self._pmf, row * POSITION_CELLS ** 2 + cell, active & inside)
+        cell_area = (2 * self.focus_radius / POSITION_CELLS) ** 2
+        offset = p - self.center
+        offset -= towards * dr.dot(offset, towards)
+        on_disk = dr.squared_norm(offset) <= self.radius ** 2
+        return guided * probability / cell_area + dr.select(on_disk, (1 - guided) / (dr.pi * self.radius ** 2), 0)
+
+    def sample_position(self, towards, row, sample, jitter, extra, active):
+        """Origin of a sub-path that travels against `towards`, and its density per unit area.
+
+        `extra` chooses between the histogram and the plain disk; `jitter` (a second pair of uniform numbers, or None) places
+        the origin inside its cell, else `sample`'s own leftover digits do.
+        """
+        frame = mi.Frame3f(towards)
+        guided = dr.gather(mi.Float, self._guided, row, active)
+        use_grid = extra < guided
+        cells = POSITION_CELLS ** 2
+        base = row * cells
+        cell = dr.binary_search(0, cells - 1, lambda i: dr.gather(mi.Float, self._cdf, base + i, active) <= sample.x)
+        upper = dr.gather(mi.Float, self._cdf, base + cell, active)
+        lower = dr.select(cell > 0, dr.gather(mi.Float, self._cdf, base + dr.maximum(cell, 1) - 1, active), 0)
+        if jitter is None:
+            leftover = dr.clip((sample.x - lower) / dr.maximum(upper - lower, 1e-20), 0, 0.9999999)
+            jitter = mi.Point2f(leftover, sample.y)
+        u = (mi.Float(cell % POSITION_CELLS) + jitter.x) * (2 / POSITION_CELLS) - 1
+        v = (mi.Float(cell // POSITION_CELLS) + jitter.y) * (2 / POSITION_CELLS) - 1
+        on_grid = self.focus_center + self.focus_radius * (u * frame.s + v * frame.t)
+        disk = mi.warp.square_to_uniform_disk_concentric(sample)
+        on_disk = self.center + self.radius * (disk.x * frame.s + disk.y * frame.t)
+        p = dr.select(use_grid, on_grid, on_disk)
+        density = self.position_density(towards, row, p, active)
+        p += towards * (1.01 * self.radius - dr.dot(p - self.center, towards))
+        return p, density
+
+    def sample_direction(self, emitter, index, it, sample, extra, active):
+        """Direction towards an environment, its density per solid angle, its table row, and what is left of `extra`."""
+        first = self.row_of_emitter(index)
+        ds, _ = emitter.sample_direction(it, sample, active)
+        if self.direction_share == 1.0:
+            return ds.d, ds.pdf, first + direction_cell(ds.d), extra
+        share = self.direction_share
+        own = extra < share
+        extra = dr.select(own, extra / share, (extra - share) / (1 - share))
+        cell = dr.binary_search(0, DIRECTION_CELLS - 1,
+                                lambda i: dr.gather(mi.Float, self._direction_cdf, i, active) <= sample.x)
+        upper = dr.gather(mi.Float, self._direction_cdf, cell, active)
+        lower = dr.select(cell > 0, dr.gather(mi.Float, self._direction_cdf, dr.maximum(cell, 1) - 1, active), 0)
+        leftover = dr.clip((sample.x - lower) / dr.maximum(upper - lower, 1e-20), 0, 0.9999999)
+        towards = dr.select(own, ds.d, cell_direction(cell, mi.Point2f(leftover, sample.y)))
+        row = direction_cell(towards)
+        ds.d = towards
+        own_pdf = emitter.pdf_direction(it, ds, active)
+        table_pdf = dr.gather(mi.Float, self._direction_pmf, row, active) * (DIRECTION_CELLS / (4 * dr.pi))
+        return towards, share * own_pdf + (1 - share) * table_pdf, first + row, extra
+
+    # ------------------------------------------------------------------ power
+
+    def useful_power(self, power):
+        """Emitters' powers with those of infinite emitters replaced by the power that passes where the pilot saw use."""
+        result = np.array(power, dtype=np.float64)
+        count = 16384
+        rng = streams(dr.arange(mi.UInt32, count), mi.UInt32(0x75736566))
+        for index, emitter in self.infinite:
+            number = mi.UInt32(index)
+            it = self._point(self.center, mi.Float(0))
+            if emitter.is_environment():
+                towards, pdf, row, extra = self.sample_direction(emitter, number, it, next_2d(rng), rng.next_float32(), True)
+                value = self._radiance(emitter, towards) * dr.select(pdf > 0, dr.rcp(pdf), 0)
+            else:
+                ds, irradiance = emitter.sample_direction(it, mi.Point2f(0.5))
+                towards, value = ds.d + dr.zeros(mi.Vector3f, count), dr.mean(irradiance)
+                row, extra = self.row_of_emitter(number), rng.next_float32()
+            p, density = self.sample_position(towards, row, next_2d(rng), next_2d(rng), extra, True)
+            cell, inside = self._position_cell(towards, p)
+            used = inside & (dr.gather(mi.Float, self._pmf, row * POSITION_CELLS ** 2 + cell, inside) > 0)
+            useful = float(dr.mean(dr.select(used & (density > 0), value / density, 0))[0])
+            if np.isfinite(useful) and useful > 0:
+                result[index] = useful
+        return result

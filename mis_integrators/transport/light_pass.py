@@ -1,0 +1,100 @@
+"""Light sub-paths and the photons they leave."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from .packing import Store, float_bits, pack_direction, pack_surface
+from .random import next_2d, streams
+
+
+def photon_words():
+    """32-bit words of a photon's second record: its flux (one a channel or wavelength) and its packed direction, padded to a
+    power of two so that it moves in one packet."""
+    channels = dr.size_v(mi.Spectrum)
+    return {1: 2, 3: 4, 4: 8}[channels]
+
+
+@dr.syntax
+def trace_light_paths(scene, lights, seed, n_paths: int, capacity: int, wavelengths, shutter_open: float,
+                      shutter_time: float, max_depth: int, rr_depth: int):
+    """Traces `n_paths` light sub-paths and stores photons on surfaces that scatter smoothly.
+
+    Stored are photons of two or more segments that have scattered smoothly at least once ("indirect"), and photons that have
+    met only delta surfaces on the way from the emitter ("caustic"); a photon's first smooth vertex straight from the emitter is
+    next-event estimation's business and is not stored. `max_depth` counts the segments of a whole path (0 or less:
+    unlimited); a photon's own depth is its number of segments from the emitter.
+
+    Returns `(surface, power, count)`: uint32 arrays with four words a photon (position's bits; normal, depth and kind packed) and
+    `photon_words()` words a photon (bits of the flux that one sub-path carries, packed direction to where it came from), in no
+    particular order, and the number of photons, of width one. If it exceeds `capacity` the surplus is missing: repeat the pass
+    with more room. Shading normals: Veach 1997, section 5.3 (adjoint factor).
+    """
+    index = dr.arange(mi.UInt32, n_paths)
+    rng = streams(index, seed)
+    words = photon_words()
+    store = Store(surface=dr.empty(mi.UInt32, 4 * capacity), power=dr.empty(mi.UInt32, words * capacity),
+                  count=dr.zeros(mi.UInt32, 1))
+    time = mi.Float(shutter_open)
+    if dr.hint(shutter_time > 0, mode='scalar'):
+        time += rng.next_float32() * shutter_time
+    ray, flux, only_delta = lights.sample_emission(rng, time, wavelengths)
+
+    ray = mi.Ray3f(ray)
+    flux = mi.Spectrum(flux)
+    strength = dr.rcp(dr.maximum(dr.max(flux), 1e-38))          # for roulette: flux relative to its start
+    had_delta = mi.Bool(only_delta)                              # delta chain since the emitter (or unreachable by it)
+    scattered = mi.Bool(False)                                   # met a smooth surface
+    depth = mi.UInt32(0)
+    eta = mi.Float(1)
+    active = dr.max(flux) > 0
+    context = mi.BSDFContext(mi.TransportMode.Importance)
+
+    while dr.hint(active, label="light sub-paths"):
+        si = scene.ray_intersect(ray, mi.RayFlags.All, coherent=False, reorder=False, active=active)
+        active &= si.is_valid()
+        depth += 1
+        bsdf = si.bsdf(ray)
+
+        # ---- Store a photon
+        keep = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth) & (scattered | had_delta)
+        slot = dr.scatter_inc(store.count, mi.UInt32(0), keep)
+        keep &= slot < capacity
+        dr.scatter(store.surface, mi.Vector4u(float_bits(si.p.x), float_bits(si.p.y), float_bits(si.p.z),
+                                              pack_surface(si.n, depth, ~scattered)), slot, keep)
+        from_where = pack_direction(-ray.d)
+        if dr.hint(words == 2, mode='scalar'):
+            dr.scatter(store.power, mi.Vector2u(float_bits(flux[0]), from_where), slot, keep)
+        elif dr.hint(words == 4, mode='scalar'):
+            dr.scatter(store.power, mi.Vector4u(float_bits(flux[0]), float_bits(flux[1]), float_bits(flux[2]), from_where),
+                       slot, keep)
+        else:
+            dr.scatter(store.power, mi.Vector4u(float_bits(flux[0]), float_bits(flux[1]), float_bits(flux[2]),
+                                                float_bits(flux[3])), 2 * slot, keep)
+            dr.scatter(store.power, mi.Vector4u(from_where, 0, 0, 0), 2 * slot + 1, keep)
+
+        # ---- Go on: a photon on the next surface needs one more segment, and the camera one after it
+        if dr.hint(max_depth > 0, mode='scalar'):
+            active &= depth + 2 <= max_depth
+        bs, weight = bsdf.sample(context, si, rng.next_float32(active), next_2d(rng, active), active)
+        wo = si.to_world(bs.wo)
+        wi_geometric, wo_geometric = dr.dot(si.n, -ray.d), dr.dot(si.n, wo)
+        wi_shading, wo_shading = mi.Frame3f.cos_theta(si.wi), mi.Frame3f.cos_theta(bs.wo)
+        active &= (wi_geometric * wi_shading > 0) & (wo_geometric * wo_shading > 0)
+        flux *= weight * dr.abs(wi_shading * wo_geometric / (wo_shading * wi_geometric))
+        delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+        had_delta |= delta
+        scattered |= ~delta
+        eta *= bs.eta
+        ray = si.spawn_ray(wo)
+
+        # ---- Russian roulette
+        relative = dr.max(flux) * strength
+        active &= relative > 0
+        survival = dr.minimum(relative * dr.square(eta), 0.95)
+        roulette = active & (depth >= rr_depth)
+        active &= ~roulette | (rng.next_float32(roulette) < survival)
+        flux = dr.select(roulette, flux * dr.rcp(survival), flux)
+
+    return store.surface, store.power, store.count

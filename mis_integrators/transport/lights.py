@@ -1,0 +1,288 @@
+"""Emitters seen from both sides: points chosen on them for direct light, and light sub-paths started from them.
+
+Emitters are chosen by power. Positional and directional emission densities are ours throughout, because Mitsuba's
+`sample_ray` returns a ray's weight without its density, draws its own wavelengths, and starts the rays of a rotated `envmap`
+from the wrong disk; textured area lights are sampled by surface area (by their texture, `path`'s way, they come out wrong
+where texture coordinates overlap).
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from .random import next_2d, streams
+from .traits import UnsupportedScene, lookup, registry_table
+
+POWER_SAMPLES = 4096
+UNIFORM_SHARE = 0.1
+"""Share of the choices among emitters that ignores power, so that a dim but near emitter is not starved."""
+
+
+def mis_power(pdf_a, pdf_b):
+    """Power heuristic weight (beta = 2) of the strategy with density `pdf_a`; zero where both vanish (Veach 1997, eq. 9.13)."""
+    a, b = dr.square(pdf_a), dr.square(pdf_b)
+    return dr.select(a > 0, a * dr.rcp(dr.maximum(a + b, 1e-38)), 0)
+
+
+def luminance_of(spectrum):
+    """Mean over channels or wavelengths: the scalar by which samples are distributed."""
+    return dr.mean(spectrum)
+
+
+class Choice:
+    """A discrete choice among emitters; free of random numbers and tables where there is one emitter only."""
+
+    def __init__(self, weights):
+        weights = np.asarray(weights, dtype=np.float64)
+        self.count = len(weights)
+        total = weights.sum()
+        self.pmf = weights / total if total > 0 else np.zeros_like(weights)
+        if self.count > 1:
+            self._pmf = mi.Float(self.pmf)
+            self._cdf = mi.Float(np.cumsum(self.pmf)[:-1])
+
+    def sample(self, u):
+        """Index of the chosen emitter and its probability, from uniform numbers `u`."""
+        if self.count == 1:
+            return mi.UInt32(0), mi.Float(1)
+        index = dr.binary_search(0, self.count - 1, lambda i: dr.gather(mi.Float, self._cdf, i) <= u)
+        return index, dr.gather(mi.Float, self._pmf, index)
+
+    def probability(self, index):
+        """Probability of `index`."""
+        return mi.Float(1) if self.count == 1 else dr.gather(mi.Float, self._pmf, index)
+
+
+def _is_textured_area(emitter):
+    flags = emitter.flags()
+    return bool(flags & mi.EmitterFlags.Surface) and bool(flags & mi.EmitterFlags.SpatiallyVarying)
+
+
+def _mean_power(emitter):
+    """Estimated emitted power (channel mean, deterministic), from Mitsuba's own light rays."""
+    rng = streams(dr.arange(mi.UInt32, POWER_SAMPLES), mi.UInt32(0x70776572))
+    _, weight = emitter.sample_ray(0, rng.next_float32(), next_2d(rng), next_2d(rng))
+    value = dr.mean(luminance_of(weight))[0]
+    return float(value) if np.isfinite(value) and value > 0 else 0.0
+
+
+class Lights:
+    """All emitters of a scene, chosen by power.
+
+    Parameters: `scene`; `guide`, an `EnvironmentGuide` or None (needed exactly if the scene has infinite emitters).
+    """
+
+    def __init__(self, scene, plugin="bdpm", guide=None):
+        self.scene = scene
+        self.emitters = scene.emitters()
+        self.guide = guide
+        self.has_textured = any(_is_textured_area(e) for e in self.emitters)
+        self.kinds = [self._kind(e, plugin) for e in self.emitters]
+        power = np.array([_mean_power(e) for e in self.emitters])
+        if guide is not None:
+            power = guide.useful_power(power)
+        self.emission_power = power
+        self.total_power = power.sum()
+        if not self.emitters:
+            return
+        uniform = UNIFORM_SHARE * power.sum() / max(np.count_nonzero(power), 1)
+        weights = (1 - UNIFORM_SHARE) * power + uniform * (power > 0)
+        self.choice = Choice(weights)
+        self.numbers = registry_table(self.emitters, mi.EmitterPtr, range(len(self.emitters)), mi.UInt32)
+        self.kind_table = mi.UInt32([_KINDS.index(k) for k in self.kinds])
+        self._spot_tables(self.emitters)
+
+    @property
+    def dark(self):
+        """True where no emitter emits anything."""
+        return not self.emitters or self.total_power == 0
+
+    def needs_photons_for_direct_light(self):
+        """Whether some emitter's direct light is out of reach of next-event estimation (`directionalarea`)."""
+        return "directionalarea" in self.kinds
+
+    @staticmethod
+    def _kind(emitter, plugin):
+        name = emitter.class_name()
+        kind = {"PointLight": "point", "SpotLight": "spot", "DirectionalEmitter": "directional",
+                "AreaLight": "area", "DirectionalArea": "directionalarea"}.get(name)
+        if kind is None:
+            kind = "environment" if emitter.is_environment() else "ray"
+        if kind in ("ray", "directionalarea") and mi.is_spectral:
+            raise UnsupportedScene(f'{plugin}: emitter {name} is not supported in spectral variants (its light rays choose '
+                                   'their own wavelengths); use an rgb or mono variant')
+        return kind
+
+    def _spot_tables(self, emitters):
+        axes, cosines = [], []
+        for emitter, kind in zip(emitters, self.kinds):
+            axis, cosine = [0, 0, 1], -1.0
+            if kind == "spot":
+                params = mi.traverse(emitter)
+                matrix = np.array(params["to_world"].matrix).reshape(4, 4)
+                axis = matrix[:3, :3] @ np.array([0, 0, 1.0])
+                axis = axis / np.linalg.norm(axis)
+                cosine = np.cos(np.radians(float(np.array(params["cutoff_angle"]).ravel()[0])))
+            axes.append(axis)
+            cosines.append(cosine)
+        if "spot" in self.kinds:
+            self._spot_axis = mi.Float(np.array(axes, dtype=np.float64).ravel())
+            self._spot_cosine = mi.Float(cosines)
+
+    def pointer(self, index):
+        """Emitter pointers for an index array (a literal, so that calls need no dispatch, if there is one emitter)."""
+        if len(self.emitters) == 1:
+            return mi.EmitterPtr(self.emitters[0])
+        return dr.gather(mi.EmitterPtr, self.scene.emitters_dr(), index)
+
+    # ------------------------------------------------------------------ direct light
+
+    def sample_direct(self, ref, rng, active):
+        """Chooses a point on an emitter as seen from interaction `ref`.
+
+        Returns `(ds, weight, pdf)`: a `DirectionSample3f`, radiance over density with visibility included (zero where
+        blocked), and the density per solid angle with the emitter's choice included; `ds.delta` marks emitters that no ray
+        can meet.
+        """
+        index, probability = self.choice.sample(rng.next_float32(active) if self.choice.count > 1 else mi.Float(0))
+        emitter = self.pointer(index)
+        sample = next_2d(rng, active)
+        textured = active & self._textured_mask(emitter) if self.has_textured else mi.Bool(False)
+        ds, weight = emitter.sample_direction(ref, sample, active & ~textured)
+        if self.has_textured:
+            ds_t, weight_t = self._sample_by_area(ref, emitter, sample, textured)
+            ds = dr.select(textured, ds_t, ds)
+            weight = dr.select(textured, weight_t, weight)
+        valid = active & (ds.pdf > 0) & dr.any(weight != 0)
+        visible = valid & ~self.scene.ray_test(ref.spawn_ray_to(ds.p), valid)
+        return ds, dr.select(visible, weight * dr.rcp(probability), 0), ds.pdf * probability
+
+    def pdf_direct(self, ref, ds, active):
+        """Density per solid angle with which `sample_direct` finds the emitter point of `ds` from `ref`."""
+        emitter = ds.emitter
+        pdf = emitter.pdf_direction(ref, ds, active)
+        if self.has_textured:
+            textured = active & self._textured_mask(emitter)
+            by_area = dr.square(ds.dist) / (dr.abs_dot(ds.d, ds.n) * emitter.get_shape().surface_area())
+            pdf = dr.select(textured, dr.select(dr.dot(ds.d, ds.n) < 0, by_area, 0), pdf)
+        if len(self.emitters) > 1:
+            pdf *= self.choice.probability(lookup(self.numbers, emitter, mi.UInt32, active))
+        return dr.select(active, pdf, 0)
+
+    @staticmethod
+    def _textured_mask(emitter):
+        flags = emitter.flags()
+        return mi.has_flag(flags, mi.EmitterFlags.Surface) & mi.has_flag(flags, mi.EmitterFlags.SpatiallyVarying)
+
+    @staticmethod
+    def _sample_by_area(ref, emitter, sample, active):
+        ps = emitter.get_shape().sample_position(ref.time, sample, active)
+        ds = mi.DirectionSample3f(ps)
+        ds.d = ds.p - ref.p
+        distance_squared = dr.squared_norm(ds.d)
+        ds.dist = dr.sqrt(distance_squared)
+        ds.d *= dr.rcp(ds.dist)
+        ds.emitter = emitter
+        cosine = -dr.dot(ds.d, ds.n)
+        ds.pdf = dr.select(active & (cosine > 0), ps.pdf * distance_squared / cosine, 0)
+        si = mi.SurfaceInteraction3f(ps, ref.wavelengths)
+        si.wi = si.to_local(-ds.d)
+        radiance = emitter.eval(si, active)
+        return ds, dr.select(ds.pdf > 0, radiance * dr.rcp(ds.pdf), 0)
+
+    # ------------------------------------------------------------------ light sub-paths
+
+    def sample_emission(self, rng, time, wavelengths, active=True):
+        """Starts a light sub-path.
+
+        Returns `(ray, flux, unreachable)`: the ray, the flux it carries (emitted radiance times cosine over all densities,
+        so that its mean over sub-paths is the power that leaves the emitters), and whether next-event estimation cannot make
+        the light of this ray's first vertex.
+        """
+        index, probability = self.choice.sample(rng.next_float32() if self.choice.count > 1 else mi.Float(0))
+        emitter = self.pointer(index)
+        sample_a, sample_b = next_2d(rng), next_2d(rng)
+        extra = rng.next_float32() if self.guide is not None else mi.Float(0)
+        kind = mi.UInt32(_KINDS.index(self.kinds[0])) if len(self.emitters) == 1 else \
+            dr.gather(mi.UInt32, self.kind_table, index)
+        ray = mi.Ray3f(mi.Point3f(0), mi.Vector3f(0, 0, 1), mi.Float(time), wavelengths)
+        flux = mi.Spectrum(0)
+        unreachable = mi.Bool(False)
+        for number, name in enumerate(_KINDS):
+            if name not in self.kinds:
+                continue
+            chosen = kind == number
+            o, d, value = getattr(self, "_emit_" + name)(emitter, index, sample_a, sample_b, extra, time, wavelengths, chosen)
+            ray.o = dr.select(chosen, o, ray.o)
+            ray.d = dr.select(chosen, d, ray.d)
+            flux = dr.select(chosen, value, flux)
+            if name == "directionalarea":
+                unreachable |= chosen
+        flux = dr.select(active, flux * dr.rcp(probability), 0)
+        return ray, dr.select(dr.isfinite(luminance_of(flux)), flux, 0), unreachable
+
+    @staticmethod
+    def _reference(p, time, wavelengths):
+        it = dr.zeros(mi.Interaction3f)
+        it.p = p
+        it.time = mi.Float(time)
+        it.wavelengths = wavelengths
+        return it
+
+    def _intensity(self, emitter, position, d, time, wavelengths, active):
+        """Radiant intensity of a positional emitter into direction `d`: next-event estimation from distance one."""
+        ds, value = emitter.sample_direction(self._reference(position + d, time, wavelengths), mi.Point2f(0.5), active)
+        return value * dr.square(ds.dist)
+
+    def _position(self, emitter, time, wavelengths, active):
+        return emitter.sample_direction(self._reference(mi.Point3f(0), time, wavelengths), mi.Point2f(0.5), active)[0].p
+
+    def _emit_point(self, emitter, index, sample_a, sample_b, extra, time, wavelengths, active):
+        position = self._position(emitter, time, wavelengths, active)
+        d = mi.warp.square_to_uniform_sphere(sample_a)
+        return position, d, self._intensity(emitter, position, d, time, wavelengths, active) * (4 * dr.pi)
+
+    def _emit_spot(self, emitter, index, sample_a, sample_b, extra, time, wavelengths, active):
+        axis = dr.gather(mi.Vector3f, self._spot_axis, index, active)
+        cosine = dr.gather(mi.Float, self._spot_cosine, index, active)
+        position = self._position(emitter, time, wavelengths, active)
+        d = mi.Frame3f(axis).to_world(mi.warp.square_to_uniform_cone(sample_a, cosine))
+        pdf = mi.warp.square_to_uniform_cone_pdf(mi.Vector3f(0, 0, 1), cosine)
+        return position, d, self._intensity(emitter, position, d, time, wavelengths, active) * dr.rcp(pdf)
+
+    def _emit_directional(self, emitter, index, sample_a, sample_b, extra, time, wavelengths, active):
+        it = self._reference(self.guide.center, time, wavelengths)
+        ds, irradiance = emitter.sample_direction(it, mi.Point2f(0.5), active)
+        o, pdf = self.guide.sample_position(ds.d, self.guide.row_of_emitter(index), sample_a, sample_b, extra, active)
+        return o, -ds.d, irradiance * dr.rcp(pdf)
+
+    def _emit_environment(self, emitter, index, sample_a, sample_b, extra, time, wavelengths, active):
+        it = self._reference(self.guide.center, time, wavelengths)
+        towards, pdf_direction, row, extra = self.guide.sample_direction(emitter, index, it, sample_a, extra, active)
+        o, pdf_position = self.guide.sample_position(towards, row, sample_b, None, extra, active)
+        si = dr.zeros(mi.SurfaceInteraction3f)
+        si.wi = -towards
+        si.time = mi.Float(time)
+        si.wavelengths = wavelengths
+        radiance = emitter.eval(si, active)
+        return o, -towards, radiance * dr.select(pdf_direction > 0, dr.rcp(pdf_direction * pdf_position), 0)
+
+    def _emit_area(self, emitter, index, sample_a, sample_b, extra, time, wavelengths, active):
+        ps = emitter.get_shape().sample_position(mi.Float(time), sample_a, active)
+        si = mi.SurfaceInteraction3f(ps, wavelengths)
+        si.wi = mi.warp.square_to_cosine_hemisphere(sample_b)
+        radiance = emitter.eval(si, active)
+        ray = si.spawn_ray(si.to_world(si.wi))
+        return ray.o, ray.d, radiance * dr.select(ps.pdf > 0, dr.pi * dr.rcp(ps.pdf), 0)
+
+    def _emit_directionalarea(self, emitter, index, sample_a, sample_b, extra, time, wavelengths, active):
+        return self._emit_ray(emitter, index, sample_a, sample_b, extra, time, wavelengths, active)
+
+    def _emit_ray(self, emitter, index, sample_a, sample_b, extra, time, wavelengths, active):
+        ray, weight = emitter.sample_ray(mi.Float(time), mi.Float(0.5), sample_a, sample_b, active)
+        return ray.o, ray.d, weight
+
+
+_KINDS = ("point", "spot", "directional", "area", "directionalarea", "environment", "ray")

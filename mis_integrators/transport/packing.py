@@ -1,0 +1,89 @@
+"""Unit vectors and small integers in 32 bits, so that a photon's position and what its distance test needs next to it
+share one 16-byte record."""
+
+import drjit as dr
+import mitsuba as mi
+
+DEPTH_BITS = 9
+MAX_DEPTH = (1 << DEPTH_BITS) - 1
+_SURFACE_NORMAL_BITS = 11
+
+
+def float_bits(x):
+    """The bits of a float32 array as a uint32 array."""
+    return dr.reinterpret_array(mi.UInt32, x)
+
+
+def bits_float(u):
+    """The float32 array whose bits are `u` (inverse of `float_bits`)."""
+    return dr.reinterpret_array(mi.Float, u)
+
+
+def _octahedral(v):
+    """Maps unit vectors to [-1, 1]^2 (Meyer et al. 2010, octahedron unfolded to a square)."""
+    scale = dr.rcp(dr.abs(v.x) + dr.abs(v.y) + dr.abs(v.z))
+    x, y = v.x * scale, v.y * scale
+    lower = v.z < 0
+    return (dr.select(lower, dr.mulsign(1 - dr.abs(y), x), x),
+            dr.select(lower, dr.mulsign(1 - dr.abs(x), y), y))
+
+
+def _inverse_octahedral(x, y):
+    z = 1 - dr.abs(x) - dr.abs(y)
+    fold = dr.maximum(-z, 0)
+    return dr.normalize(mi.Vector3f(x - dr.mulsign(fold, x), y - dr.mulsign(fold, y), z))
+
+
+def _quantise(x, bits):
+    half = 0.5 * ((1 << bits) - 1)
+    return mi.UInt32(dr.fma(x, half, half + 0.5))
+
+
+def _dequantise(u, bits):
+    half = 0.5 * ((1 << bits) - 1)
+    return dr.fma(mi.Float(u), 1 / half, -1)
+
+
+def pack_direction(v):
+    """Unit vector to uint32, 16 bits an axis (error below 1e-4 radians)."""
+    x, y = _octahedral(v)
+    return _quantise(x, 16) | (_quantise(y, 16) << 16)
+
+
+def unpack_direction(u):
+    """Inverse of `pack_direction`."""
+    return _inverse_octahedral(_dequantise(u & 0xffff, 16), _dequantise(u >> 16, 16))
+
+
+def pack_surface(normal, depth, caustic):
+    """A surface normal (11 bits an axis, error below 0.002 radians), a path depth (9 bits, saturated at `MAX_DEPTH`) and the
+    photon's kind (1 bit: caustic or not) in one uint32."""
+    bits = _SURFACE_NORMAL_BITS
+    x, y = _octahedral(normal)
+    word = _quantise(x, bits) | (_quantise(y, bits) << bits)
+    word |= dr.minimum(depth, MAX_DEPTH) << (2 * bits)
+    return word | dr.select(caustic, mi.UInt32(1 << 31), mi.UInt32(0))
+
+
+def unpack_normal(word):
+    """The normal stored by `pack_surface`."""
+    bits = _SURFACE_NORMAL_BITS
+    mask = (1 << bits) - 1
+    return _inverse_octahedral(_dequantise(word & mask, bits), _dequantise((word >> bits) & mask, bits))
+
+
+def unpack_depth(word):
+    """The depth stored by `pack_surface`."""
+    return (word >> (2 * _SURFACE_NORMAL_BITS)) & MAX_DEPTH
+
+
+def unpack_caustic(word):
+    """The kind stored by `pack_surface`: true for caustic photons."""
+    return (word >> 31) != 0
+
+
+class Store:
+    """Arrays that a symbolic loop scatters into. A plain object, so that Dr.Jit does not take them for the loop's state."""
+
+    def __init__(self, **arrays):
+        self.__dict__.update(arrays)

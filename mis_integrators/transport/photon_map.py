@@ -1,0 +1,154 @@
+"""The photon map: photons sorted by the cells of a spatial hash grid, and the query that visits those within a radius.
+
+Cells of one grid row (equal y and z) are neighbours in memory: row (y, z) starts at a hash, x counts up from there. A query
+so reads one contiguous range of photons a row. Rows whose hashes overlap are told apart by the photons' own positions, so that
+no photon is visited twice.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from .light_pass import photon_words
+from .packing import bits_float, unpack_caustic
+
+TABLE_LOAD = 2
+"""Hash slots a photon of capacity."""
+
+
+def table_size(capacity):
+    """Hash slots (a power of two) for `capacity` photons."""
+    return 1 << max(10, min(24, (TABLE_LOAD * max(capacity, 1) - 1).bit_length()))
+
+
+def smallest_cell(bbox, capacity):
+    """The smallest cell size with which a row of cells still fits behind its hash."""
+    extent = float(bbox.max.x - bbox.min.x)
+    return extent / (table_size(capacity) - 8)
+
+
+def _row_hash(y, z, mask):
+    return ((y * mi.UInt32(73856093)) ^ (z * mi.UInt32(19349663))) & mask
+
+
+class PhotonMap:
+    """Sorted photons; build with `build_photon_map`.
+
+    Fields: `origin` (3 floats of width one), `cell` (edge length), `start` (first photon of each slot), `surface` and `power` as
+    in `trace_light_paths`, sorted.
+    """
+
+    DRJIT_STRUCT = None
+
+    def __init__(self, origin, cell, start, surface, power):
+        self.origin, self.cell, self.start, self.surface, self.power = origin, cell, start, surface, power
+        self.mask = mi.UInt32(len(start) // 2 - 1)
+
+    def coordinates(self, p):
+        """Integer cell coordinates of points `p`; two cells of margin keep those of queries outside the box positive in x."""
+        return mi.Vector3i(dr.floor((p - self.origin) / self.cell)) + 2
+
+
+def build_photon_map(surface, power, count, origin, cell, capacity: int, kind: str):
+    """Sorts photons into a grid of cells of edge `cell`.
+
+    `kind`: "all", "caustic" or "indirect" selects the photons. Three passes over the photons: count, prefix sum, scatter.
+    """
+    size = table_size(capacity)
+    index = dr.arange(mi.UInt32, capacity)
+    active = index < dr.gather(mi.UInt32, count, 0)
+    record = dr.gather(mi.Vector4u, surface, index, active)
+    if kind != "all":
+        active &= unpack_caustic(record.w) == (kind == "caustic")
+    p = mi.Point3f(bits_float(record.x), bits_float(record.y), bits_float(record.z))
+    coordinates = mi.Vector3i(dr.floor((p - origin) / cell)) + 2
+    row = _row_hash(mi.UInt32(coordinates.y), mi.UInt32(coordinates.z), size - 1)
+    slot = row + dr.minimum(mi.UInt32(coordinates.x), size - 4)
+    counts = dr.zeros(mi.UInt32, 2 * size)
+    rank = dr.scatter_inc(counts, slot, active)
+    dr.eval(counts, rank, slot)
+    start = dr.prefix_sum(counts)
+    dr.eval(start)
+    target = dr.gather(mi.UInt32, start, slot, active) + rank
+    sorted_surface = dr.empty(mi.UInt32, 4 * capacity)
+    dr.scatter(sorted_surface, record, target, active)
+    words = photon_words()
+    sorted_power = dr.empty(mi.UInt32, words * capacity)
+    packet = mi.Vector2u if words == 2 else mi.Vector4u
+    for part in range(max(words // 4, 1)):
+        parts = max(words // 4, 1)
+        dr.scatter(sorted_power, dr.gather(packet, power, parts * index + part, active), parts * target + part, active)
+    dr.eval(sorted_surface, sorted_power)
+    return PhotonMap(origin, cell, start, sorted_surface, sorted_power)
+
+
+def read_power(photon_map, index, active):
+    """Flux (a `Spectrum`, for one light sub-path) and packed direction of sorted photons `index`."""
+    words = photon_words()
+    if words == 2:
+        record = dr.gather(mi.Vector2u, photon_map.power, index, active)
+        return mi.Spectrum(bits_float(record.x)), record.y
+    if words == 4:
+        record = dr.gather(mi.Vector4u, photon_map.power, index, active)
+        return mi.Spectrum(bits_float(record.x), bits_float(record.y), bits_float(record.z)), record.w
+    record = dr.gather(mi.Vector4u, photon_map.power, 2 * index, active)
+    direction = dr.gather(mi.UInt32, photon_map.power, 8 * index + 4, active)
+    return mi.Spectrum(*[bits_float(record[i]) for i in range(4)]), direction
+
+
+def for_each_photon(photon_map, p, radius, active, visit, state):
+    """Calls `visit(index, record, offset, distance_squared, hit, state) -> state` for photons near `p`.
+
+    One flat loop over (row, photon) pairs, so that lanes need not agree on their rows. `hit` marks the lanes whose photon lies
+    within `radius` of `p` and belongs to the row that is being read; `record` holds the photon's surface words, `offset` is its
+    position minus `p`. `state` is a tuple of Dr.Jit arrays.
+    """
+    cell, origin = photon_map.cell, photon_map.origin
+    inverse = dr.rcp(cell)
+    local = (p - origin) * inverse
+    reach = radius * inverse * 1.0001
+    first_y = mi.Int32(dr.floor(local.y - reach)) + 2
+    first_z = mi.Int32(dr.floor(local.z - reach)) + 2
+    rows_y = mi.UInt32(mi.Int32(dr.floor(local.y + reach)) + 3 - first_y)
+    rows_z = mi.UInt32(mi.Int32(dr.floor(local.z + reach)) + 3 - first_z)
+    rows = dr.select(active, rows_y * rows_z, 0)
+    radius_squared = dr.square(radius)
+    size = len(photon_map.start) // 2
+
+    def enter_row(row, index, end, y, z):
+        y, z = first_y + mi.Int32(row % rows_y), first_z + mi.Int32(row // rows_y)
+        low_y, low_z = mi.Float(y - 2), mi.Float(z - 2)
+        distance_y = dr.maximum(dr.maximum(low_y - local.y, local.y - low_y - 1), 0)
+        distance_z = dr.maximum(dr.maximum(low_z - local.z, local.z - low_z - 1), 0)
+        left = dr.square(reach) - dr.square(distance_y) - dr.square(distance_z)
+        half = dr.safe_sqrt(left) + 1e-3
+        first_x = dr.clip(mi.Int32(dr.floor(local.x - half)) + 2, 0, size - 4)
+        last_x = dr.clip(mi.Int32(dr.floor(local.x + half)) + 2, -1, size - 4)
+        base = _row_hash(mi.UInt32(y), mi.UInt32(z), size - 1)
+        near = (left > -1e-3) & (last_x >= first_x)
+        index = dr.gather(mi.UInt32, photon_map.start, base + mi.UInt32(first_x), near)
+        end = dr.gather(mi.UInt32, photon_map.start, base + mi.UInt32(last_x) + 1, near)
+        return row + 1, index, end, y, z
+
+    def step(row, index, end, y, z, state):
+        row, index, end, y, z = dr.if_stmt((row, index, end, y, z), index >= end, enter_row, lambda *same: same,
+                                           label="next row")
+        inside = index < end
+        record = dr.gather(mi.Vector4u, photon_map.surface, index, inside)
+        position = mi.Point3f(bits_float(record.x), bits_float(record.y), bits_float(record.z))
+        offset = position - p
+        distance_squared = dr.squared_norm(offset)
+        hit = inside & (distance_squared < radius_squared)
+
+        def met(index, record, offset, distance_squared, position, y, z, state):
+            own = photon_map.coordinates(position)
+            return visit(index, record, offset, distance_squared, (own.y == y) & (own.z == z), state)
+
+        state = dr.if_stmt((index, record, offset, distance_squared, position, y, z, state), hit, met,
+                           lambda index, record, offset, distance_squared, position, y, z, state: state, label="photon")
+        index = dr.select(inside, index + 1, index)
+        return row, index, end, y, z, state
+
+    start = (mi.UInt32(0), mi.UInt32(0), mi.UInt32(0), mi.Int32(0), mi.Int32(0), state)
+    return dr.while_loop(start, lambda row, index, end, *_: (index < end) | (row < rows), step, label="photons")[-1]

@@ -1,0 +1,27 @@
+"""Independent streams of random numbers: one generator a path, one seed an iteration and pass."""
+
+import drjit as dr
+import mitsuba as mi
+
+
+def mix(*words):
+    """Hashes non-negative integers to one of 32 bits (splitmix64 finaliser applied word by word)."""
+    state = 0x9e3779b97f4a7c15
+    for word in words:
+        state = (state ^ (int(word) & 0xffffffffffffffff)) & 0xffffffffffffffff
+        state = (state * 0xbf58476d1ce4e5b9) & 0xffffffffffffffff
+        state ^= state >> 27
+        state = (state * 0x94d049bb133111eb) & 0xffffffffffffffff
+        state ^= state >> 31
+    return state & 0xffffffff
+
+
+def streams(index, seed):
+    """A PCG32 generator for every path `index` (uint32 array) under `seed` (uint32, opaque to keep kernels cached)."""
+    low, high = mi.sample_tea_32(index, seed)
+    return mi.PCG32(initstate=mi.UInt64(low) | (mi.UInt64(high) << 32), initseq=mi.UInt64(index))
+
+
+def next_2d(rng, active=True):
+    """Two uniform numbers in [0, 1) as a point; advances `rng`."""
+    return mi.Point2f(rng.next_float32(active), rng.next_float32(active))

@@ -1,0 +1,104 @@
+"""What a scene needs, found once before rendering: nothing that it lacks is traced, stored or gathered."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+
+class UnsupportedScene(ValueError):
+    """A scene that an integrator cannot render; the message names the integrator and the reason."""
+
+
+def scene_objects(root):
+    """Every Mitsuba object below `root` (shapes, nested BSDFs, emitters, media, films, ...), each once."""
+    class Collector(mi.TraversalCallback):
+        def __init__(self):
+            super().__init__()
+            self.found = []
+
+        def put(self, name, value, *flags):
+            if isinstance(value, mi.Object):
+                self.found.append(value)
+
+    pending, seen = [root], {}
+    while pending:
+        collector = Collector()
+        pending.pop().traverse(collector)
+        for child in collector.found:
+            if child.ptr not in seen:
+                seen[child.ptr] = child
+                pending.append(child)
+    return list(seen.values())
+
+
+def registry_table(objects, pointer_type, values, dtype):
+    """A table indexed by Dr.Jit's registry number of `objects`, holding `values`; entry 0 (null pointer) is zero."""
+    numbers = [int(dr.reinterpret_array(mi.UInt32, pointer_type(o))[0]) for o in objects]
+    table = np.zeros(max(numbers, default=0) + 1)
+    table[numbers] = values
+    return dtype(table != 0) if dtype is mi.Bool else dtype(table)
+
+
+def lookup(table, pointer, dtype, active=True):
+    """Reads a `registry_table` at an array of pointers."""
+    return dr.gather(dtype, table, dr.reinterpret_array(mi.UInt32, pointer), active)
+
+
+def is_lambertian(bsdf):
+    """Whether the BSDF's smooth part is constant (one value on each side of the surface) in the unperturbed frame."""
+    name = bsdf.class_name()
+    if name == "SmoothDiffuse":
+        return True
+    if name in ("TwoSidedBRDF", "MaskBSDF", "BlendBSDF"):
+        return all(is_lambertian(child) or not (child.flags() & mi.BSDFFlags.Smooth)
+                   for child in scene_objects(bsdf)
+                   if isinstance(child, mi.BSDF))
+    return False
+
+
+class SceneTraits:
+    """What a scene is made of.
+
+    Attributes: `has_delta` (perfectly specular or null scattering somewhere), `has_mixed` (BSDFs with both a smooth and a
+    delta part), `has_rough` (smooth scattering that is not Lambertian), `has_lambertian`, `has_light_surfaces` (emitters that
+    a ray can meet: area lights, environments), `lambertian` (registry table for BSDF pointers).
+    """
+
+    def __init__(self, scene):
+        objects = scene_objects(scene)
+        flag = mi.BSDFFlags
+        bsdfs = [o for o in objects if isinstance(o, mi.BSDF)]
+        flags = [b.flags() for b in bsdfs]
+        lambertian = [is_lambertian(b) for b in bsdfs]
+        self.has_delta = any(f & flag.Delta for f in flags)
+        self.has_mixed = any((f & flag.Delta) and (f & flag.Smooth) for f in flags)
+        self.has_lambertian = any(lambertian)
+        # Nested BSDFs count on their own, so a perturbed (bump- or normal-mapped) Lambertian shows through its wrapper.
+        self.has_rough = any((f & flag.Smooth) and not l for f, l in zip(flags, lambertian))
+        self.lambertian = registry_table(bsdfs, mi.BSDFPtr, lambertian, mi.Bool)
+        delta = mi.EmitterFlags.DeltaPosition | mi.EmitterFlags.DeltaDirection
+        self.has_light_surfaces = any(not (e.flags() & delta) for e in scene.emitters())
+
+
+def check_scene(scene, sensor, plugin):
+    """Raises `UnsupportedScene` for what the surface integrators cannot render, before any sampling."""
+    if mi.is_polarized:
+        raise UnsupportedScene(f'{plugin}: polarised variants are not supported (active: {mi.variant()}); use an unpolarised '
+                               'one such as "llvm_ad_rgb"')
+    if not isinstance(scene, mi.Scene):
+        raise UnsupportedScene(f'{plugin}: the scene was loaded under another variant than the active one '
+                               f'({mi.variant()}); load it again after mi.set_variant()')
+    objects = scene_objects(scene)
+    if any(isinstance(o, mi.Medium) for o in objects) or any(s.is_medium_transition() for s in scene.shapes()):
+        raise UnsupportedScene(f'{plugin}: participating media are not supported by this surface integrator; use "volpath"')
+    for shape in scene.shapes():
+        if shape.is_emitter() and shape.class_name() in _UNSAMPLED_SHAPES:
+            raise UnsupportedScene(f'{plugin}: Mitsuba cannot sample points on a {shape.class_name()} shape, so it cannot be an '
+                                   'emitter here; use a mesh, sphere, rectangle, disk or cylinder')
+    if mi.has_flag(sensor.film().flags(), mi.FilmFlags.Special):
+        raise UnsupportedScene(f'{plugin}: film "specfilm" is not supported; use "hdrfilm"')
+
+
+_UNSAMPLED_SHAPES = frozenset({"BSplineCurve", "LinearCurve", "CatmullRomCurve", "SDFGrid", "Ellipsoids", "EllipsoidsMesh"})
