@@ -13,6 +13,7 @@ from ..transport.light_pass import trace_light_paths
 from ..transport.lights import Lights
 from ..transport.photon_map import build_photon_map, smallest_cell
 from ..transport.random import mix
+from ..transport.recording import frozen
 from ..transport.traits import SceneTraits
 from .common import IterativeIntegrator, IterativeSession
 
@@ -65,22 +66,21 @@ class BDPMSession(IterativeSession):
 
     def _freeze(self):
         """Records the passes once; later iterations launch their kernels without running Python again."""
-        tables = lambda *_, **__: (self.lights, self.lights.guide, self.traits)
-        self._trace_light = dr.freeze(self._light_pass, state_fn=lambda *a, **k: None)
-        self._trace_light = self._light_pass
-        self._trace_camera = self._camera_pass
+        self._trace_light = frozen(self._light_pass)
+        self._trace_camera = frozen(self._camera_pass)
+        self._tables = [self.traits.lambertian, *self.lights.tables()]
 
     def radius_at(self, iteration):
         """Merge radius of an iteration: R_i^2 = R_0^2 (i + 1)^(alpha - 1), a schedule of the index alone."""
         return self.radius * (iteration + 1) ** (0.5 * (self.integrator.alpha - 1))
 
-    def _light_pass(self, scene, sensor, seed, wavelength_sample):
+    def _light_pass(self, scene, sensor, tables, seed, wavelength_sample):
         wavelengths = sensor.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), wavelength_sample)[0]
         return trace_light_paths(scene, self.lights, seed, self.light_paths, self.photon_capacity, wavelengths,
                                  sensor.shutter_open(), sensor.shutter_open_time(), self.integrator.max_depth,
                                  self.integrator.rr_depth)
 
-    def _camera_pass(self, scene, sensor, photons, seed, first, wavelength_sample, radius):
+    def _camera_pass(self, scene, sensor, tables, photons, seed, first, wavelength_sample, radius):
         integrator = self.integrator
         radiance, alpha, position, vertices, count = trace_camera_paths(
             scene, sensor, integrator, self.lights, self.traits, seed, first, self.chunk, integrator.camera_paths,
@@ -98,7 +98,8 @@ class BDPMSession(IterativeSession):
                     radiance += gathered
                 else:
                     total = dr.zeros(mi.Spectrum, self.chunk)
-                    dr.scatter_reduce(dr.ReduceOp.Add, total, gathered, vertices["path"], dr.max(vertices["throughput"]) > 0)
+                    dr.scatter_reduce(dr.ReduceOp.Add, total, gathered, vertices["path"],
+                                      dr.max(vertices["throughput"]) > 0, dr.ReduceMode.Direct)
                     radiance += total
         active = dr.arange(mi.UInt32, self.chunk) + first < self.path_count
         wavelengths = sensor.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), wavelength_sample)[0]
@@ -113,20 +114,22 @@ class BDPMSession(IterativeSession):
         wavelength_sample = dr.opaque(mi.Float, mix(self.seed, iteration, 2) / 2 ** 32)
         photons = None
         while self.has_photons:
-            photons = self._trace_light(self.scene, self.sensor, self._seed(iteration, 0), wavelength_sample)
+            photons = self._trace_light(self.scene, self.sensor, self._tables, self._seed(iteration, 0), wavelength_sample)
             dr.eval(photons)
             found = int(photons[2][0])
             if found <= self.photon_capacity:
                 break
             self.photon_capacity = found + found // 4
+            self._freeze()
         total = None
         for chunk in range(self.chunks):
             while True:
                 first = dr.opaque(mi.UInt32, chunk * self.chunk)
-                block, count = self._trace_camera(self.scene, self.sensor, photons, self._seed(iteration, 1), first,
+                block, count = self._trace_camera(self.scene, self.sensor, self._tables, photons, self._seed(iteration, 1), first,
                                                   wavelength_sample, radius)
                 if self.one_vertex or int(count[0]) <= self.vertex_capacity:
                     break
                 self.vertex_capacity = int(count[0]) + int(count[0]) // 4
+                self._freeze()
             total = block if total is None else total + block
         return total

@@ -53,17 +53,18 @@ class IterativeIntegrator(mi.AdjointIntegrator):
                 "camera_paths": self.camera_paths, "variance": self.variance}
 
     def session(self, scene, sensor=0, seed=0, spp=0):
-        """Prepares a rendering of `scene`: `spp` camera paths a pixel are planned (0: the sampler's own count)."""
+        """Prepares a rendering of `scene` with `spp` camera paths a pixel, or without a planned end if `spp` is 0."""
         sensor = self._sensor(scene, sensor)
         check_scene(scene, sensor, self.plugin)
-        spp = spp or sensor.sampler().sample_count()
+        if not spp:
+            return self.new_session(scene, sensor, _scalar(seed), None)
         iterations = math.ceil(spp / self.camera_paths)
         if iterations * self.camera_paths != spp:
             mi.Log(mi.LogLevel.Warn, f"{self.plugin}: {spp} samples per pixel rounded up to {iterations} iterations of "
                                      f"camera_paths = {self.camera_paths}")
         if self.variance and iterations < 2:
-            raise ValueError(f'{self.plugin}: parameter "variance" needs at least two iterations; ask for spp >= '
-                             f'{2 * self.camera_paths}')
+            raise ValueError(f'{self.plugin}: parameter "variance" needs at least two iterations; ask for spp > '
+                             f'{self.camera_paths}')
         return self.new_session(scene, sensor, _scalar(seed), iterations)
 
     @staticmethod
@@ -78,7 +79,8 @@ class IterativeIntegrator(mi.AdjointIntegrator):
 
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
         with dr.suspend_grad():
-            session = self.session(scene, sensor, seed, spp)
+            sensor = self._sensor(scene, sensor)
+            session = self.session(scene, sensor, seed, spp or sensor.sampler().sample_count())
             for _ in range(session.iterations_planned):
                 session.iterate()
             session.fill_film()

@@ -19,7 +19,7 @@ class Parameters:
         self.plugin = props.plugin_name()
         self.known = []
         for name, advice in REFUSED.items():
-            if props.has_property(name):
+            if name in props:
                 raise ParameterError(f'{self.plugin}: parameter "{name}" is not supported: {advice}')
 
     def _fail(self, name, value, allowed):
@@ -27,7 +27,7 @@ class Parameters:
 
     def _get(self, name, default):
         self.known.append(name)
-        return self.props.get(name, default) if self.props.has_property(name) else default
+        return self.props.get(name, default) if name in self.props else default
 
     def integer(self, name, default, low, allowed, high=None):
         """An integer in [low, high]; `allowed` is the range in words."""

@@ -78,6 +78,11 @@ class EnvironmentGuide:
         self.center, self.radius = mi.Point3f([float(x) for x in center]), float(radius) * 1.001
         self.focus_center, self.focus_radius = mi.Point3f(self.center), self.radius
 
+    def tables(self):
+        """Every evaluated array that the sampling routines read, for `dr.freeze` to track."""
+        arrays = [self.center, self.focus_center, self._first_row, self._pmf, self._cdf, self._guided]
+        return arrays + ([self._direction_pmf, self._direction_cdf] if self.direction_share < 1 else [])
+
     def row_of_emitter(self, index):
         """First table row of emitter `index`: the only one of a directional emitter."""
         return dr.gather(mi.UInt32, self._first_row, index)
@@ -129,8 +134,8 @@ class EnvironmentGuide:
         smooth_power = smooth * reach * (4 * np.pi / DIRECTION_CELLS)
         ds, weight = emitter.sample_direction(self._point(self.center, mi.Float(0)), next_2d(streams(cell, mi.UInt32(1))))
         drawn = np.array(direction_cell(ds.d))
-        weight = np.nan_to_num(np.array(dr.mean(weight)))
-        total_power = np.bincount(np.broadcast_to(drawn, weight.shape), weights=weight, minlength=DIRECTION_CELLS) / len(weight)
+        weight = np.nan_to_num(np.broadcast_to(np.array(dr.mean(weight)), drawn.shape))
+        total_power = np.bincount(drawn, weights=weight, minlength=DIRECTION_CELLS) / len(drawn)
         if smooth_power.sum() <= 0:
             return
         self.direction_share = float(np.clip(1 - smooth_power.sum() / max((total_power * reach).sum(), 1e-30), 0.25, 0.9))
@@ -154,7 +159,7 @@ class EnvironmentGuide:
         si.wi = -towards
         if mi.is_spectral:
             si.wavelengths = mi.UnpolarizedSpectrum(450, 520, 590, 640)
-        return dr.mean(emitter.eval(si, active))
+        return dr.mean(emitter.eval(si, active)) + dr.zeros(mi.Float, dr.width(towards))
 
     def _pilot(self, sensor):
         """Yields records (p, direction to the light, table row, weight, tested, reached) along camera paths."""
@@ -200,8 +205,8 @@ class EnvironmentGuide:
             dr.eval(ray, reached, pending)
             if not dr.any(pending):
                 break
-        weight = dr.select(reached, weight * response, 0)
         width = dr.width(si)
+        weight = dr.select(reached, weight * response, 0) + dr.zeros(mi.Float, width)
         tested, reached = dr.select(tested, mi.Float(1), 0), dr.select(reached, mi.Float(1), 0)
         row = row + dr.zeros(mi.UInt32, width)
         return si.p, towards + dr.zeros(mi.Vector3f, width), row, weight, tested, reached

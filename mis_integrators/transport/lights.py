@@ -22,8 +22,8 @@ UNIFORM_SHARE = 0.1
 
 def mis_power(pdf_a, pdf_b):
     """Power heuristic weight (beta = 2) of the strategy with density `pdf_a`; zero where both vanish (Veach 1997, eq. 9.13)."""
-    a, b = dr.square(pdf_a), dr.square(pdf_b)
-    return dr.select(a > 0, a * dr.rcp(dr.maximum(a + b, 1e-38)), 0)
+    ratio = dr.minimum(pdf_b / pdf_a, 1e18)          # in ratios: squared densities overflow
+    return dr.select(pdf_a > 0, dr.rcp(1 + dr.square(ratio)), 0)
 
 
 def luminance_of(spectrum):
@@ -99,6 +99,13 @@ class Lights:
         """True where no emitter emits anything."""
         return not self.emitters or self.total_power == 0
 
+    def tables(self):
+        """Every evaluated array that the sampling routines read, for `dr.freeze` to track."""
+        arrays = [getattr(self, name) for name in ("numbers", "kind_table", "_spot_axis", "_spot_cosine") if hasattr(self, name)]
+        if self.emitters and self.choice.count > 1:
+            arrays += [self.choice._pmf, self.choice._cdf]
+        return arrays + (self.guide.tables() if self.guide is not None else [])
+
     def needs_photons_for_direct_light(self):
         """Whether some emitter's direct light is out of reach of next-event estimation (`directionalarea`)."""
         return "directionalarea" in self.kinds
@@ -156,6 +163,7 @@ class Lights:
             ds = dr.select(textured, ds_t, ds)
             weight = dr.select(textured, weight_t, weight)
         valid = active & (ds.pdf > 0) & dr.any(weight != 0)
+        valid &= dr.isfinite(ds.pdf)
         visible = valid & ~self.scene.ray_test(ref.spawn_ray_to(ds.p), valid)
         return ds, dr.select(visible, weight * dr.rcp(probability), 0), ds.pdf * probability
 

@@ -1,0 +1,32 @@
+# make render   set everything up, then render a bundled scene into out/
+# make test     set everything up, then run the tests
+# make bench    set everything up, then measure the throughput
+
+PYTHON ?= python3
+VENV := .venv
+SETUP := tools/setup.sh
+
+.PHONY: render test bench clean
+.DELETE_ON_ERROR:
+
+render: $(VENV)/installed
+	@mkdir -p out
+	$(VENV)/bin/mis-render scenes/cornell_area.xml -i bdpm -o out/cornell_area.exr
+
+test: $(VENV)/installed-test
+	$(VENV)/bin/python -m pytest
+
+bench: $(VENV)/installed
+	$(VENV)/bin/python benchmarks/run.py throughput
+
+$(VENV)/installed: pyproject.toml $(SETUP)
+	@$(SETUP) $(PYTHON) $(VENV)
+	$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check --editable .
+	@touch $@
+
+$(VENV)/installed-test: $(VENV)/installed
+	$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check --editable '.[test]'
+	@touch $@
+
+clean:
+	rm -rf $(VENV) out build *.egg-info

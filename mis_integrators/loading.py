@@ -1,0 +1,153 @@
+"""Load a Mitsuba scene, its integrator replaced (the old one is never built) or its parameters set."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Mapping
+
+import mitsuba as mi
+
+Value = int | float | bool | str
+
+# What a replacement takes over from the scene's integrator, if it knows it.
+INHERITED = ("max_depth", "rr_depth", "hide_emitters")
+
+# What Mitsuba and the integrators raise for a scene or a parameter that is wrong.
+SCENE_ERRORS = (RuntimeError, ValueError, ImportError)
+
+
+@dataclass
+class LoadedScene:
+    """A scene, its integrator, and what the integrator was built from."""
+
+    scene: mi.Scene
+    integrator: mi.Integrator
+    plugin: str
+    parameters: dict[str, Value]
+
+
+def load(
+    path: Path, variables: Mapping[str, str], plugin: str | None, parameters: Mapping[str, Value]
+) -> LoadedScene:
+    """Load the scene of an XML file under the active variant.
+
+    ``variables`` are the values of the scene's ``$variables``. ``plugin`` replaces its integrator, which
+    hands on the parameters ``INHERITED``; ``parameters`` are then set on the integrator, replaced or not.
+    Raises one of ``SCENE_ERRORS`` (see ``one_line``).
+    """
+    config = mi.parser.ParserConfig(mi.variant())
+    state = mi.parser.parse_file(config, str(path), **variables)
+    mi.parser.transform_all(config, state)
+    node = _integrator_node(state) or _add_integrator(state)
+    if plugin:
+        inherited = {
+            name: value
+            for props in [*_nested_integrators(state, node), node.props]
+            for name, value in _plain(props).items()
+            if name in INHERITED
+        }
+        node.props = _properties(plugin, _known_to(plugin, inherited))
+    for name, value in parameters.items():
+        node.props[name] = value
+    name, given = node.props.plugin_name(), _plain(node.props)
+
+    mi.file_resolver().prepend(str(path.parent))
+    scene = mi.parser.instantiate(config, state)
+    if not isinstance(scene, mi.Scene):
+        raise RuntimeError(f'"{path}" is not a scene')
+    return LoadedScene(scene, scene.integrator(), name, given)
+
+
+def parse_value(text: str) -> Value:
+    """The value that a text means: an integer, a float, a boolean (``true``, ``false``), else the text."""
+    if text.lower() in ("true", "false"):
+        return text.lower() == "true"
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            pass
+    return text
+
+
+def one_line(error: BaseException) -> str:
+    """The message of an error in one line, without the Python traceback that Mitsuba includes in its own."""
+    while error.__cause__:
+        error = error.__cause__
+    text = re.sub(r"^\[[\w.]+:\d+\] ", "", str(error))
+    place, traceback, rest = text.partition("Traceback (most recent call last):")
+    if traceback:
+        # The message follows the last frame, which is indented, as its source line is.
+        frames_end = max(
+            match.end() for match in re.finditer(r'^  File ".*\n(?:    .*\n)*', rest, re.MULTILINE)
+        )
+        text = place + re.sub(r"^[\w.]+: ", "", rest[frames_end:])
+    return " ".join(text.split()) or type(error).__name__
+
+
+def _integrator_node(state):
+    """The node of the scene's integrator, which is no part of another integrator; ``None`` if it has none."""
+    nodes = [node for node in state.nodes if node.type == mi.ObjectType.Integrator]
+    inner = {index for node in nodes for index in _children(node)}
+    outer = [
+        node
+        for index, node in enumerate(state.nodes)
+        if node.type == mi.ObjectType.Integrator and index not in inner
+    ]
+    if len(outer) > 1:
+        raise RuntimeError("the scene has more than one integrator")
+    return outer[0] if outer else None
+
+
+def _add_integrator(state):
+    """Add the integrator that Mitsuba would use for a scene without one."""
+    node = mi.parser.SceneNode()
+    node.type, node.props = mi.ObjectType.Integrator, mi.Properties("path")
+    state.nodes.append(node)
+    state.root.props["_integrator"] = mi.Properties.ResolvedReference(len(state.nodes) - 1)
+    return state.nodes[-1]
+
+
+def _nested_integrators(state, node):
+    """Properties of the integrators inside an integrator (``aov``, ``moment``)."""
+    return [
+        state.nodes[index].props
+        for index in _children(node)
+        if state.nodes[index].type == mi.ObjectType.Integrator
+    ]
+
+
+def _children(node):
+    """Indices of the nodes that a node contains."""
+    return [
+        value.index() for _, value in _items(node.props) if isinstance(value, mi.Properties.ResolvedReference)
+    ]
+
+
+def _plain(props) -> dict[str, Value]:
+    """The properties that are numbers or texts, by name."""
+    return {name: value for name, value in _items(props) if isinstance(value, (bool, int, float, str))}
+
+
+def _items(props):
+    """Names and values of properties, from a copy: reading one marks it as known to the plugin."""
+    return list(mi.Properties(props).items())
+
+
+def _properties(plugin: str, values: Mapping[str, Value]) -> mi.Properties:
+    props = mi.Properties(plugin)
+    for name, value in values.items():
+        props[name] = value
+    return props
+
+
+def _known_to(plugin: str, values: Mapping[str, Value]) -> dict[str, Value]:
+    """Those of the values that the integrator asks for when it is built."""
+    props = _properties(plugin, values)
+    try:
+        mi.PluginManager.instance().create_object(props)
+    except SCENE_ERRORS:
+        return dict(values)  # it cannot be built from these alone; building the scene says why
+    return {name: value for name, value in values.items() if name not in props.unqueried()}

@@ -1,0 +1,78 @@
+"""Write a render as an EXR file, with a PNG beside it to look at: whole files or none."""
+
+import os
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Iterator, Mapping, Sequence
+
+import mitsuba as mi
+import numpy as np
+import OpenEXR
+
+# Channels that make a picture, and what Mitsuba calls them.
+_PICTURES = ((("R", "G", "B"), "RGB"), (("X", "Y", "Z"), "XYZ"), (("Y",), "Y"))
+
+
+def make_writable(directory: Path) -> None:
+    """Create the directory if needed, and raise ``OSError`` if no file can be written there."""
+    directory.mkdir(parents=True, exist_ok=True)
+    probe = _temporary(directory / "probe")
+    probe.touch()
+    probe.unlink()
+
+
+def write_exr(
+    path: Path, image: np.ndarray, channels: Sequence[str], metadata: Mapping[str, str | int | float]
+):
+    """Write an image of shape (H, W, C) with named channels as float32, and the metadata as attributes.
+
+    Raises ``OSError`` if it cannot be written; a file that was there before is then still whole.
+    """
+    header = {**metadata, "compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    planes = {name: np.ascontiguousarray(image[..., i], dtype=np.float32) for i, name in enumerate(channels)}
+    with _replacing(path) as temporary:
+        try:
+            OpenEXR.File(header, planes).write(str(temporary))
+        except RuntimeError as error:
+            raise OSError(str(error)) from error
+
+
+def write_png(path: Path, image: np.ndarray, channels: Sequence[str]) -> bool:
+    """Write the colour channels of an image of shape (H, W, C) as sRGB, clipped to [0, 1], without alpha.
+
+    Values that are no numbers become black. Returns ``False``, and writes nothing, if the image has no colour
+    channels (a film of spectral bands). Raises ``OSError`` as ``write_exr`` does.
+    """
+    for names, pixel_format in _PICTURES:
+        if set(names) <= set(channels):
+            break
+    else:
+        return False
+    picture = np.nan_to_num(image[..., [channels.index(name) for name in names]], posinf=1).astype(np.float32)
+    formats = mi.Bitmap.PixelFormat
+    bitmap = mi.Bitmap(picture, getattr(formats, pixel_format)).convert(
+        formats.Y if pixel_format == "Y" else formats.RGB, mi.Struct.Type.UInt8, srgb_gamma=True
+    )
+    with _replacing(path) as temporary:
+        try:
+            bitmap.write(str(temporary), mi.Bitmap.FileFormat.PNG)
+        except RuntimeError as error:
+            raise OSError(str(error)) from error
+    return True
+
+
+@contextmanager
+def _replacing(path: Path) -> Iterator[Path]:
+    """A temporary path beside ``path`` that replaces it at once when the block ends without an error."""
+    temporary = _temporary(path)
+    try:
+        yield temporary
+        with open(temporary, "rb") as file:
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _temporary(path: Path) -> Path:
+    return path.with_name(f".{path.name}.{os.getpid()}.part")

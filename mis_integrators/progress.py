@@ -1,0 +1,58 @@
+"""Show the progress of a render: a bar on a terminal, now and then a line elsewhere."""
+
+import sys
+import time
+
+import rich.console
+import rich.progress
+
+SECONDS_BETWEEN_LINES = 5.0
+
+
+class Progress:
+    """Progress on standard error as a context: iterations, camera paths a second, time left.
+
+    ``paths`` are the camera paths of one iteration. ``planned`` iterations or ``seconds`` of rendering,
+    whichever is given, are the whole. Nothing is shown if ``quiet``.
+    """
+
+    def __init__(self, paths: int, planned: int | None, seconds: float | None, quiet: bool):
+        self._paths, self._planned, self._seconds, self._quiet = paths, planned, seconds, quiet
+        self._last_line = time.monotonic()
+        self._console = rich.console.Console(file=sys.stderr, quiet=quiet, highlight=False)
+        self._bar = rich.progress.Progress(
+            rich.progress.BarColumn(),
+            rich.progress.TextColumn("{task.description}"),
+            console=self._console,
+            disable=quiet or not self._console.is_terminal,
+        )
+
+    def __enter__(self) -> "Progress":
+        self._bar.start()
+        self._task = self._bar.add_task("first iteration, compiling", total=1.0)
+        return self
+
+    def __exit__(self, *_) -> None:
+        self._bar.stop()
+
+    def say(self, text: str) -> None:
+        """Print one line."""
+        self._console.print(text, soft_wrap=True)
+
+    def update(self, iterations: int, rendering: float) -> None:
+        """Show that so many iterations are done, after so many seconds of rendering."""
+        done = rendering / self._seconds if self._seconds else iterations / self._planned
+        left = max(0.0, rendering / done - rendering) if done else 0.0
+        speed = iterations * self._paths / max(rendering, 1e-9) / 1e6
+        of = "" if self._seconds else f"/{self._planned}"
+        text = f"iteration {iterations}{of}, {speed:.2f} M samples/s, {_duration(left)} left"
+        self._bar.update(self._task, completed=min(done, 1.0), description=text)
+        now = time.monotonic()
+        if self._bar.disable and not self._quiet and now - self._last_line >= SECONDS_BETWEEN_LINES:
+            self._last_line = now
+            self.say(text)
+
+
+def _duration(seconds: float) -> str:
+    minutes, seconds = divmod(round(seconds), 60)
+    return f"{minutes}:{seconds:02d}"

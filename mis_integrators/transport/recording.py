@@ -1,0 +1,34 @@
+"""Frozen passes: a pass is recorded once, and its kernels are launched again without running its Python."""
+
+import contextlib
+import gc
+
+import drjit as dr
+
+
+@contextlib.contextmanager
+def _no_garbage_collection():
+    """A scene that Python's collector destroys in the middle of a recording aborts the process (its Embree release cannot be
+    recorded), so the collector waits."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
+
+
+def frozen(function):
+    """`dr.freeze(function)`, safe against garbage collection while it records.
+
+    Evaluated arrays that `function` reads must be among its arguments, and numbers that change from call to call must be
+    opaque arrays. Nothing inside may read an array's value.
+    """
+    recorded = dr.freeze(function)
+
+    def call(*args):
+        with _no_garbage_collection():
+            return recorded(*args)
+
+    return call

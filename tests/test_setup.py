@@ -1,0 +1,237 @@
+"""Set-up: the choice of LLVM, the registration of plugins, and the package."""
+
+import importlib
+import os
+import shutil
+import subprocess
+import sys
+import sysconfig
+import zipfile
+from pathlib import Path
+
+import mitsuba as mi
+import pytest
+
+from mis_integrators import _plugins, llvm
+
+ROOT = Path(__file__).parent.parent
+MULTIARCH = sysconfig.get_config_var("MULTIARCH") or "lib"
+
+
+def run_python(code: str, **environment: str) -> subprocess.CompletedProcess:
+    """Run code in a fresh interpreter that sees this checkout."""
+    inherited = {k: v for k, v in os.environ.items() if k != llvm.VARIABLE}
+    return subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        cwd=ROOT,
+        env={**inherited, **environment},
+    )
+
+
+def library(root: Path, name: str, *links: str) -> Path:
+    """An empty file named like a library, and symbolic links to it from elsewhere below ``root``."""
+    file = root / name
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.touch()
+    for link in links:
+        (root / link).parent.mkdir(parents=True, exist_ok=True)
+        (root / link).symlink_to(file)
+    return file
+
+
+# --- Which LLVM -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "name, version",
+    [
+        ("libLLVM-14.so.1", (14,)),
+        ("libLLVM-14.0.6.so.1", (14, 0, 6)),
+        ("libLLVM-17.so.1", (17,)),
+        ("libLLVM.so.19.1", (19, 1)),
+        ("libLLVM.so.22.1", (22, 1)),
+        ("libLLVM.so", None),
+        ("libfoo.so.19", None),
+        ("Cellar/llvm/20.1.3/lib/libLLVM.dylib", (20, 1, 3)),
+        ("opt/llvm@18/lib/libLLVM.dylib", (18,)),
+        ("usr/lib/llvm-19/lib/libLLVM.so", (19,)),
+    ],
+)
+def test_version_is_read_from_the_name(tmp_path, name, version):
+    assert llvm.version_of(tmp_path / name) == version
+
+
+def test_version_of_a_link_is_that_of_its_target(tmp_path):
+    library(tmp_path, "real/libLLVM.so.19.1", "libLLVM.so")
+    assert llvm.version_of(tmp_path / "libLLVM.so") == (19, 1)
+
+
+def test_newest_working_library_is_chosen(tmp_path):
+    library(tmp_path, f"usr/lib/{MULTIARCH}/libLLVM-15.so.1")
+    library(tmp_path, f"usr/lib/{MULTIARCH}/libLLVM-17.so.1")
+    newest = library(tmp_path, f"usr/lib/{MULTIARCH}/libLLVM.so.20.1", "usr/lib/llvm-20/lib/libLLVM.so.1")
+    library(tmp_path, "usr/lib64/libLLVM.so.19.1")
+    assert llvm.choose({}, tmp_path) == newest
+
+
+def test_versions_are_compared_as_numbers(tmp_path):
+    library(tmp_path, "usr/lib/libLLVM-9.so.1")
+    hundred = library(tmp_path, "usr/lib/libLLVM.so.100.0")
+    library(tmp_path, "usr/lib/libLLVM.so.22.1")
+    assert llvm.choose({}, tmp_path) == hundred
+
+
+def test_only_libraries_that_abort_means_none(tmp_path):
+    for version in (14, 15, 16):
+        library(tmp_path, f"usr/lib/{MULTIARCH}/libLLVM-{version}.so.1")
+    library(tmp_path, "usr/lib/libLLVM.so.19.1-notes.txt")
+    assert llvm.choose({}, tmp_path) is None
+
+
+def test_library_of_a_conda_environment_is_found(tmp_path):
+    found = library(tmp_path, "env/lib/libLLVM-19.so")
+    assert llvm.choose({"CONDA_PREFIX": str(tmp_path / "env")}, tmp_path / "empty") == found
+
+
+def test_linker_cache_is_read_without_foreign_libraries():
+    listing = (
+        "2 libs found in cache `/etc/ld.so.cache'\n"
+        "\tlibLLVM.so.19.1 (libc6,x86-64) => /opt/llvm/libLLVM.so.19.1\n"
+        "\tlibLLVM.so.20.1 (libc6) => /lib32/libLLVM.so.20.1\n"
+        "\tlibLLVMSPIRVLib.so.14 (libc6,x86-64) => /lib/libLLVMSPIRVLib.so.14\n"
+    )
+    assert llvm.libraries_in_linker_cache(listing) == [Path("/opt/llvm/libLLVM.so.19.1")]
+
+
+def test_variable_is_checked(tmp_path):
+    good = library(tmp_path, "libLLVM.so.19.1")
+    bad = library(tmp_path, "libLLVM-15.so.1")
+    assert llvm.problem_with_variable({llvm.VARIABLE: str(good)}) is None
+    assert "LLVM 15" in llvm.problem_with_variable({llvm.VARIABLE: str(bad)})
+    assert "does not exist" in llvm.problem_with_variable({llvm.VARIABLE: str(tmp_path / "none.so")})
+
+
+def test_variable_that_is_set_is_left_alone(tmp_path):
+    result = run_python(
+        "import os, mis_integrators; print(os.environ['DRJIT_LIBLLVM_PATH'])",
+        DRJIT_LIBLLVM_PATH=str(tmp_path / "none.so"),
+    )
+    assert result.stdout.strip() == str(tmp_path / "none.so") and result.returncode == 0
+
+
+def test_missing_llvm_is_an_error_only_when_it_is_needed(tmp_path):
+    result = run_python(
+        "import mis_integrators, mitsuba as mi; mi.set_variant('scalar_rgb'); print('fine')\n"
+        "mis_integrators.llvm.require()",
+        DRJIT_LIBLLVM_PATH=str(tmp_path / "none.so"),
+    )
+    assert result.stdout == "fine\n"
+    assert "does not exist" in result.stderr.splitlines()[-1]
+
+
+@pytest.mark.parametrize(
+    "order",
+    [
+        "import mis_integrators\nmi.set_variant('llvm_ad_rgb')",
+        "mi.set_variant('llvm_ad_rgb')\nimport mis_integrators",
+    ],
+)
+def test_llvm_that_aborts_is_refused(order):
+    """With a library that Dr.Jit would accept, and that would abort the process."""
+    aborting = [
+        file
+        for file in llvm.libraries_in(llvm.library_directories({}))
+        if (llvm.version_of(file) or (0,))[0] in (15, 16)
+    ]
+    if not aborting:
+        pytest.skip("no LLVM 15 or 16 on this machine")
+    result = run_python(f"import mitsuba as mi\n{order}", DRJIT_LIBLLVM_PATH=str(aborting[0]))
+    assert result.returncode == 1
+    assert "aborts the process" in result.stderr.splitlines()[-1]
+
+
+# --- Registration ---------------------------------------------------------------------------------
+
+CHECK = """
+def check(variant):
+    assert mi.variant() == variant
+    for plugin in mis_integrators._plugins.PLUGINS:
+        made = mi.load_dict({"type": plugin})
+        assert isinstance(made, mi.Integrator), made
+"""
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "import mis_integrators, mitsuba as mi; mi.set_variant('llvm_ad_rgb')",
+        "import mitsuba as mi; mi.set_variant('llvm_ad_rgb'); import mis_integrators",
+    ],
+    ids=["before", "after"],
+)
+def test_plugins_are_there_whatever_is_imported_first(code):
+    result = run_python(
+        f"{code}\n{CHECK}\ncheck('llvm_ad_rgb')\n"
+        "mi.set_variant('llvm_ad_spectral'); check('llvm_ad_spectral')\n"
+        "mi.set_variant('scalar_rgb')\n"
+        "mi.set_variant('llvm_ad_rgb'); check('llvm_ad_rgb')"
+    )
+    assert result.returncode == 0, result.stderr
+
+
+def test_scalar_variant_says_what_the_plugins_need():
+    result = run_python(
+        "import mis_integrators, mitsuba as mi; mi.set_variant('scalar_rgb')\nmi.load_dict({'type': 'bdpm'})"
+    )
+    assert "llvm_ad_*" in result.stderr.splitlines()[-1]
+
+
+# --- The package ----------------------------------------------------------------------------------
+
+
+def test_modules_that_define_plugin_classes_are_loaded_anew(rgb):
+    """A class left over from another variant would be registered, and fail when a scene uses it."""
+    for file in (ROOT / "mis_integrators" / "integrators").glob("[!_]*.py"):
+        module = importlib.import_module(f"mis_integrators.integrators.{file.stem}")
+        own = [
+            cls
+            for cls in vars(module).values()
+            if isinstance(cls, type) and cls.__module__ == module.__name__
+        ]
+        if any(issubclass(cls, mi.Object) for cls in own):
+            assert file.stem in _plugins.MODULES
+
+
+def test_wheel_holds_every_module(tmp_path):
+    """Built without isolation: it needs no network, but a recent setuptools, which extra `test` brings."""
+    setuptools = pytest.importorskip("setuptools")
+    if int(setuptools.__version__.split(".")[0]) < 77:
+        pytest.skip("setuptools is older than pyproject.toml asks for")
+    source = tmp_path / "source"
+    shutil.copytree(ROOT / "mis_integrators", source / "mis_integrators")
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, source)
+    subprocess.run(
+        [
+            sys.executable,
+            "-m",
+            "pip",
+            "wheel",
+            "--quiet",
+            "--no-deps",
+            "--no-build-isolation",
+            "--wheel-dir",
+            tmp_path,
+            source,
+        ],
+        check=True,
+        timeout=300,
+    )
+    (wheel,) = tmp_path.glob("*.whl")
+    names = set(zipfile.ZipFile(wheel).namelist())
+    sources = {file.relative_to(ROOT).as_posix() for file in (ROOT / "mis_integrators").rglob("*.py")}
+    assert sources <= names
+    assert any(name.endswith("licenses/LICENSE") for name in names)
