@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..transport.camera_pass import film_sample_count, trace_camera_paths
+from ..transport.coverage import covered_share
 from ..transport.film import splat_samples
 from ..transport.gather import gather_photons
 from ..transport.guide import EnvironmentGuide, infinite_emitters
@@ -16,6 +17,7 @@ from ..transport.random import mix
 from ..transport.recording import frozen
 from ..transport.traits import SceneTraits
 from .common import IterativeIntegrator, IterativeSession
+from .pilot import choose_radii
 
 CAMERA_CHUNK = 1 << 21
 """Camera paths traced at once at most; larger films are traced in parts (bounds memory)."""
@@ -56,80 +58,131 @@ class BDPMSession(IterativeSession):
         self.has_indirect = not self.lights.dark and (depth < 0 or depth >= integrator.bdd + 3)
         self.one_vertex = not self.traits.has_mixed and (integrator.bdd == 0 or not self.has_caustics)
         self.photon_capacity = 4 * self.light_paths
-        self.vertex_capacity = self.chunk * (1 if self.one_vertex else 2) if self.has_photons else 0
-        self.radius = integrator.initial_radius or float(dr.norm(scene.bbox().extents())) * 0.005
+        self.vertex_capacity = self._vertex_room(self.chunk)
+        self.radii = {kind: integrator.initial_radius for kind in self.kinds()} if integrator.initial_radius else None
+        self.corrected = {kind: False for kind in self.kinds()}
+        self.seconds = None
         self._freeze()
 
+    def plan_time(self, seconds):
+        """Rendering will last `seconds`: the automatic radius is chosen for as many iterations as fit."""
+        self.seconds = seconds
+
     @property
-    def has_photons(self):
-        return self.has_caustics or self.has_indirect
-
-    def _freeze(self):
-        """Records the passes once; later iterations launch their kernels without running Python again."""
-        self._trace_light = frozen(self._light_pass)
-        self._trace_camera = frozen(self._camera_pass)
-        self._tables = [self.traits.lambertian, *self.lights.tables()]
-
-    def radius_at(self, iteration):
-        """Merge radius of an iteration: R_i^2 = R_0^2 (i + 1)^(alpha - 1), a schedule of the index alone."""
-        return self.radius * (iteration + 1) ** (0.5 * (self.integrator.alpha - 1))
-
-    def _light_pass(self, scene, sensor, tables, seed, wavelength_sample):
-        wavelengths = sensor.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), wavelength_sample)[0]
-        return trace_light_paths(scene, self.lights, seed, self.light_paths, self.photon_capacity, wavelengths,
-                                 sensor.shutter_open(), sensor.shutter_open_time(), self.integrator.max_depth,
-                                 self.integrator.rr_depth)
-
-    def _camera_pass(self, scene, sensor, tables, photons, seed, first, wavelength_sample, radius):
-        integrator = self.integrator
-        radiance, alpha, position, vertices, count = trace_camera_paths(
-            scene, sensor, integrator, self.lights, self.traits, seed, first, self.chunk, integrator.camera_paths,
-            wavelength_sample, integrator.bdd, integrator.max_depth, integrator.rr_depth, integrator.hide_emitters,
-            self.vertex_capacity, self.has_caustics, self.has_indirect, self.one_vertex)
-        if self.has_photons:
-            dr.eval(radiance, alpha, position, vertices, count)
-            cell = dr.maximum(radius, smallest_cell(scene.bbox(), self.photon_capacity))
-            origin = mi.Point3f(scene.bbox().min)
-            for kind in self.kinds():
-                photon_map = build_photon_map(*photons, origin, cell, self.photon_capacity, kind)
-                gathered = gather_photons(scene, self.traits, photon_map, vertices, radius, self.light_paths, integrator.max_depth,
-                                          only_last=kind == "indirect")
-                if self.one_vertex:
-                    radiance += gathered
-                else:
-                    total = dr.zeros(mi.Spectrum, self.chunk)
-                    dr.scatter_reduce(dr.ReduceOp.Add, total, gathered, vertices["path"],
-                                      dr.max(vertices["throughput"]) > 0, dr.ReduceMode.Direct)
-                    radiance += total
-        active = dr.arange(mi.UInt32, self.chunk) + first < self.path_count
-        wavelengths = sensor.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), wavelength_sample)[0]
-        return splat_samples(sensor.film(), position, radiance, alpha, wavelengths, active), count
+    def settings(self):
+        radii = {f"radius.{kind}": radius for kind, radius in (self.radii or {}).items()}
+        corrected = {f"edge_correction.{kind}": flag for kind, flag in self.corrected.items()}
+        return {**super().settings, "photon_count": self.light_paths, **radii, **corrected}
 
     def kinds(self):
         """Photon maps that the scene needs."""
         return [kind for kind, needed in (("caustic", self.has_caustics), ("indirect", self.has_indirect)) if needed]
 
-    def _iteration(self, iteration):
-        radius = dr.opaque(mi.Float, self.radius_at(iteration))
-        wavelength_sample = dr.opaque(mi.Float, mix(self.seed, iteration, 2) / 2 ** 32)
-        photons = None
-        while self.has_photons:
-            photons = self._trace_light(self.scene, self.sensor, self._tables, self._seed(iteration, 0), wavelength_sample)
+    def radii_at(self, iteration):
+        """Merge radius of each kind of photon: R_i^2 = R_0^2 (i + 1)^(alpha - 1), a schedule of the iteration's index alone."""
+        shrink = (iteration + 1) ** (0.5 * (self.integrator.alpha - 1))
+        return {kind: dr.opaque(mi.Float, radius * shrink) for kind, radius in self.radii.items()}
+
+    def _vertex_room(self, paths):
+        if not self.kinds():
+            return 0
+        return paths if self.one_vertex else 2 * paths
+
+    # ------------------------------------------------------------------ passes
+
+    def _freeze(self):
+        """Records the passes anew; from the second iteration on, their kernels run without their Python."""
+        self._tables = [self.traits.lambertian, *self.lights.tables()]
+        self._light_pass = frozen(self._trace_light)
+        self._camera_pass = frozen(self._render_chunk)
+
+    def _trace_light(self, scene, sensor, tables, seed, wavelength_sample):
+        return trace_light_paths(scene, self.lights, seed, self.light_paths, self.photon_capacity,
+                                 self._wavelengths(sensor, wavelength_sample), sensor.shutter_open(), sensor.shutter_open_time(),
+                                 self.integrator.max_depth, self.integrator.rr_depth)
+
+    def _trace_camera(self, scene, sensor, seed, first, stride, paths, capacity, wavelength_sample):
+        integrator = self.integrator
+        return trace_camera_paths(scene, sensor, integrator, self.lights, self.traits, seed, first, stride, paths,
+                                  integrator.camera_paths, wavelength_sample, integrator.bdd, integrator.max_depth,
+                                  integrator.rr_depth, integrator.hide_emitters, capacity, self.has_caustics, self.has_indirect,
+                                  self.one_vertex)
+
+    def _gather(self, scene, photons, vertices, kind, radii, grey=False):
+        """What photons of one kind bring to each vertex, for each radius."""
+        return gather_photons(scene, self.traits, self._map(scene, photons, kind, radii[-1]), vertices, radii, self.light_paths,
+                              self.integrator.max_depth, only_last=kind == "indirect", grey=grey)
+
+    def _covered(self, scene, vertices, radius, seed):
+        """Share of each vertex' merge disk that holds surface."""
+        return covered_share(scene, vertices, radius, seed, dr.max(vertices["throughput"]) > 0)
+
+    def _per_path(self, values, vertices, paths):
+        """Sums values of the vertices for each of `paths` camera paths."""
+        if self.one_vertex:
+            return values
+        total = dr.zeros(type(values), paths)
+        dr.scatter_reduce(dr.ReduceOp.Add, total, values, vertices["path"], dr.max(vertices["throughput"]) > 0,
+                          dr.ReduceMode.Direct)
+        return total
+
+    def _map(self, scene, photons, kind, radius):
+        cell = dr.maximum(radius, smallest_cell(scene.bbox(), self.photon_capacity))
+        return build_photon_map(*photons, mi.Point3f(scene.bbox().min), cell, self.photon_capacity, kind)
+
+    def _render_chunk(self, scene, sensor, tables, photons, seed, first, wavelength_sample, radii):
+        radiance, alpha, position, vertices, count = self._trace_camera(scene, sensor, seed, first, 1, self.chunk,
+                                                                        self.vertex_capacity, wavelength_sample)
+        if radii:
+            dr.eval(radiance, alpha, position, vertices, count)
+        for kind, radius in radii.items():
+            (gathered,) = self._gather(scene, photons, vertices, kind, [radius])
+            if self.corrected[kind]:
+                gathered *= dr.rcp(self._covered(scene, vertices, radius, seed))
+            radiance += self._per_path(gathered, vertices, self.chunk)
+        active = dr.arange(mi.UInt32, self.chunk) + first < self.path_count
+        return splat_samples(sensor.film(), position, radiance, alpha, self._wavelengths(sensor, wavelength_sample), active), count
+
+    @staticmethod
+    def _wavelengths(sensor, wavelength_sample):
+        """The wavelengths that all sub-paths of an iteration share."""
+        return sensor.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), wavelength_sample)[0]
+
+    # ------------------------------------------------------------------ iterations
+
+    def _photons(self, iteration, wavelength_sample):
+        """An iteration's photons; the buffers grow and the pass runs again where one overflows."""
+        while True:
+            photons = self._light_pass(self.scene, self.sensor, self._tables, self._seed(iteration, LIGHT), wavelength_sample)
             dr.eval(photons)
             found = int(photons[2][0])
             if found <= self.photon_capacity:
-                break
+                return photons
             self.photon_capacity = found + found // 4
             self._freeze()
+
+    def _wavelength_sample(self, iteration):
+        return dr.opaque(mi.Float, mix(self.seed, iteration, WAVELENGTH) / 2 ** 32)
+
+    def _iteration(self, iteration):
+        if self.radii is None:
+            choose_radii(self)
+        radii = self.radii_at(iteration)
+        wavelength_sample = self._wavelength_sample(iteration)
+        photons = self._photons(iteration, wavelength_sample) if radii else None
         total = None
         for chunk in range(self.chunks):
             while True:
                 first = dr.opaque(mi.UInt32, chunk * self.chunk)
-                block, count = self._trace_camera(self.scene, self.sensor, self._tables, photons, self._seed(iteration, 1), first,
-                                                  wavelength_sample, radius)
+                block, count = self._camera_pass(self.scene, self.sensor, self._tables, photons, self._seed(iteration, CAMERA), first,
+                                                 wavelength_sample, radii)
                 if self.one_vertex or int(count[0]) <= self.vertex_capacity:
                     break
                 self.vertex_capacity = int(count[0]) + int(count[0]) // 4
                 self._freeze()
             total = block if total is None else total + block
         return total
+
+
+LIGHT, CAMERA, WAVELENGTH = range(3)
+"""Purposes of an iteration's random seeds."""

@@ -50,10 +50,10 @@ LAST_VERTEX = 1 << 31
 
 
 @dr.syntax
-def trace_camera_paths(scene, sensor, integrator, lights, traits, seed, first, n_paths: int, camera_paths: int, wavelength_sample,
-                       bdd: int, max_depth: int, rr_depth: int, hide_emitters: bool, capacity: int, has_caustics: bool,
+def trace_camera_paths(scene, sensor, integrator, lights, traits, seed, first, stride: int, n_paths: int, camera_paths: int,
+                       wavelength_sample, bdd: int, max_depth: int, rr_depth: int, hide_emitters: bool, capacity: int, has_caustics: bool,
                        has_indirect: bool, one_vertex: bool):
-    """Traces camera paths `first` ... `first + n_paths` (numbered as by `film_samples`) to their `bdd`-th smooth vertex.
+    """Traces `n_paths` camera paths, numbers `first`, `first + stride`, ... of `film_samples`, to their `bdd`-th smooth vertex.
 
     On the way: emission seen directly or through delta surfaces; at every smooth vertex up to the `bdd`-th, direct light by
     next-event estimation combined with BSDF sampling (power heuristic). Light that reaches a smooth vertex through delta
@@ -64,7 +64,7 @@ def trace_camera_paths(scene, sensor, integrator, lights, traits, seed, first, n
     `new_vertex_buffer`, and how many wanted a place in it (width one). With `one_vertex` each path owns the place of its number.
     """
     path = dr.arange(mi.UInt32, n_paths)
-    number = path + first
+    number = path * stride + first
     active = number < film_sample_count(sensor) * camera_paths
     rng = streams(number, seed)
     unit, splat = film_samples(sensor, number, camera_paths, rng)

@@ -17,12 +17,15 @@ SAME_SURFACE_OFFSET = 0.5
 SMALLEST_COSINE = 1e-3
 
 
-def gather_photons(scene, traits, photon_map, vertices, radius, light_paths, max_depth: int, only_last: bool):
-    """Radiance that the photons of `photon_map` add to each camera path, per vertex of `vertices`.
+def gather_photons(scene, traits, photon_map, vertices, radii, light_paths, max_depth: int, only_last: bool,
+                   grey: bool = False):
+    """Radiance that the photons of `photon_map` bring to the camera paths of `vertices`, for each radius of the list `radii`
+    (ascending; each of width one, or one a vertex), from one visit of the photons within the largest.
 
-    Constant kernel on the disk of `radius` (width one, or one a vertex): the sum over photons of f x flux, over
-    (pi radius^2 x light sub-paths). Flux through the surface carries the geometric cosine, `path`'s scattering integral the
-    shading one, hence the ratio of the two at each photon. Returns a `Spectrum` of the vertices' width, throughput included.
+    Constant kernel on a disk: the sum over photons of f x flux, over (pi radius^2 x light sub-paths). Flux through the surface
+    carries the geometric cosine, `path`'s scattering integral the shading one, hence the ratio of the two at each photon.
+    Returns a list with a `Spectrum` of the vertices' width for each radius, throughput included; with `grey` the mean over its
+    channels (fewer sums to keep for many radii).
     """
     ray = mi.Ray3f(vertices["ray_o"], vertices["ray_d"])
     throughput, depth = vertices["throughput"], vertices["depth"]
@@ -38,31 +41,45 @@ def gather_photons(scene, traits, photon_map, vertices, radius, light_paths, max
     if traits.has_rough:
         lambertian = lookup(traits.lambertian, bsdf, mi.Bool, active)
     geometric_side = dr.dot(si.n, -ray.d)
-    largest_offset = SAME_SURFACE_OFFSET * radius
+    factor = mi.Spectrum(throughput)
+    if traits.has_lambertian:
+        upright = mi.Vector3f(0, 0, dr.select(facing > 0, mi.Float(1), mi.Float(-1)))
+        factor *= dr.select(lambertian, bsdf.eval(context, si, upright, active & lambertian), 1)
 
-    def visit(index, record, offset, distance_squared, hit, state):
-        (total,) = state
+    def visit(index, record, offset, distance_squared, hit, totals):
         hit &= dr.dot(unpack_normal(record.w), si.n) > SAME_SURFACE_COSINE
-        hit &= dr.abs(dr.dot(offset, si.n)) < largest_offset
         if max_depth > 0:
             hit &= unpack_depth(record.w) + depth <= max_depth
         flux, packed = read_power(photon_map, index, hit)
         towards = unpack_direction(packed)
         wo = si.to_local(towards)
         cosine = dr.dot(si.n, towards)
-        scale = dr.rcp(dr.maximum(dr.abs(cosine), SMALLEST_COSINE))
         value = mi.Spectrum(0)
         if traits.has_lambertian:
             front = (wo.z * facing > 0) & (cosine * geometric_side > 0)
             value = mi.Spectrum(dr.select(front & lambertian, dr.abs(wo.z), 0))
         if traits.has_rough:
-            rough = hit & ~lambertian
-            value = dr.select(lambertian, value, bsdf.eval(context, si, wo, rough))
-        return (total + dr.select(hit, flux * value * scale, 0),)
+            value = dr.select(lambertian, value, bsdf.eval(context, si, wo, hit & ~lambertian))
+        value *= flux * dr.rcp(dr.maximum(dr.abs(cosine), SMALLEST_COSINE))
+        if grey:
+            value = dr.mean(value * factor)
+        height = dr.abs(dr.dot(offset, si.n))
+        return tuple(total + dr.select(hit & (distance_squared < dr.square(radius)) & (height < SAME_SURFACE_OFFSET * radius),
+                                       value, 0)
+                     for total, radius in zip(totals, radii))
 
-    (total,) = for_each_photon(photon_map, si.p, radius, active, visit, (mi.Spectrum(0),))
-    if traits.has_lambertian:
-        upright = mi.Vector3f(0, 0, dr.select(facing > 0, mi.Float(1), mi.Float(-1)))
-        reflectance = bsdf.eval(context, si, upright, active & lambertian)
-        total = dr.select(lambertian, total * reflectance, total)
-    return dr.select(active, throughput * total / (dr.pi * dr.square(radius) * light_paths), 0)
+    zero = mi.Float(0) if grey else mi.Spectrum(0)
+    totals = for_each_photon(photon_map, si.p, radii[-1], active, visit, tuple(type(zero)(zero) for _ in radii))
+    return [dr.select(active, (total if grey else total * factor) / (dr.pi * dr.square(radius) * light_paths), 0)
+            for total, radius in zip(totals, radii)]
+
+
+def mean_photon_count(photon_map, vertices, radius):
+    """Photons within `radius` of a vertex, on average over the used vertices (a number; what a gather costs)."""
+    active = dr.max(vertices["throughput"]) > 0
+    p = vertices["ray_o"] + vertices["ray_d"] * vertices["hit"].t
+    (count,) = for_each_photon(photon_map, p, radius, active,
+                               lambda index, record, offset, distance_squared, hit, counts:
+                               (counts[0] + dr.select(hit, mi.UInt32(1), 0),), (mi.UInt32(0),))
+    used = int(dr.count(active)[0])
+    return float(dr.sum(mi.Float(count))[0]) / used if used else 0.0

@@ -17,7 +17,7 @@ from .random import next_2d, streams
 POLAR_CELLS = 16
 AZIMUTH_CELLS = 32
 DIRECTION_CELLS = POLAR_CELLS * AZIMUTH_CELLS
-POSITION_CELLS = 32
+POSITION_CELLS = 64
 DEFENSIVE_SHARE = 0.1
 """Share of sub-paths that start anywhere on the scene's disk."""
 PILOT_PATHS = 65536
@@ -25,6 +25,8 @@ PILOT_BOUNCES = 4
 PASS_THROUGH = 8
 """Transmissive surfaces that the pilot's visibility test looks straight through (panes, masks)."""
 FEWEST_RECORDS = 64
+FOCUS_TAIL = 0.01
+"""Share of the records' weight that may lie outside the focus, at each end of each axis."""
 
 
 def infinite_emitters(scene):
@@ -48,6 +50,36 @@ def cell_direction(cell, sample):
     sin_phi, cos_phi = dr.sincos(phi)
     radius = dr.safe_sqrt(1 - z * z)
     return mi.Vector3f(radius * cos_phi, radius * sin_phi, z)
+
+
+def _weighted_box(points, weights, tail):
+    """Low and high corner of the box that leaves the share `tail` of the weight outside at each end of each axis."""
+    corners = []
+    for axis in points:
+        order = np.argsort(axis)
+        share = np.cumsum(weights[order]) / weights.sum()
+        corners.append((axis[order[np.searchsorted(share, tail)]],
+                        axis[order[min(np.searchsorted(share, 1 - tail), len(order) - 1)]]))
+    return np.array(corners).T
+
+
+@dr.syntax
+def _sees_sky(scene, ray, active):
+    """Whether rays escape from the scene, looking straight through panes and masks."""
+    ray = mi.Ray3f(ray)
+    pending = mi.Bool(active)
+    reached = mi.Bool(active)
+    left = mi.UInt32(PASS_THROUGH)
+    while dr.hint(pending, label="sky test"):
+        hit = scene.ray_intersect(ray, mi.RayFlags.Minimal, coherent=False, reorder=False, active=pending)
+        flags = hit.bsdf().flags()
+        through = mi.has_flag(flags, mi.BSDFFlags.Null) | mi.has_flag(flags, mi.BSDFFlags.DeltaTransmission)
+        left -= 1
+        pending &= hit.is_valid()
+        reached &= ~pending | (through & (left > 0))
+        pending &= through & (left > 0)
+        ray = hit.spawn_ray(ray.d)
+    return reached
 
 
 class EnvironmentGuide:
@@ -96,14 +128,14 @@ class EnvironmentGuide:
         cells = POSITION_CELLS ** 2
         pmf = np.zeros((self.row_count, cells))
         if np.count_nonzero(useful) >= FEWEST_RECORDS:
-            low, high = np.percentile(p[:, useful], [0.1, 99.9], axis=1)
+            # Heavy records (a glossy peak, a texel of the sun) guide no better than others.
+            weight = np.where(useful, np.minimum(weight, 20 * np.mean(weight[useful])), 0)
+            low, high = _weighted_box(p[:, useful], weight[useful], FOCUS_TAIL)
             center, radius = (low + high) / 2, max(np.linalg.norm(high - low) / 2, 1e-4 * self.radius)
             self.focus_center, self.focus_radius = mi.Point3f([float(x) for x in center]), float(radius) * 1.05
             cell, inside = self._position_cell(mi.Vector3f(d), mi.Point3f(p))
             cell, inside = np.array(cell), np.array(inside)
             keep = useful & inside
-            # Heavy records (a glossy peak, a texel of the sun) guide no better than others of their row.
-            weight = np.minimum(weight, 20 * np.mean(weight[keep])) if keep.any() else weight
             np.add.at(pmf, (row[keep], cell[keep]), weight[keep])
         grid = pmf.reshape(-1, POSITION_CELLS, POSITION_CELLS)
         padded = np.pad(grid, ((0, 0), (1, 1), (1, 1)))
@@ -162,54 +194,43 @@ class EnvironmentGuide:
         return dr.mean(emitter.eval(si, active)) + dr.zeros(mi.Float, dr.width(towards))
 
     def _pilot(self, sensor):
-        """Yields records (p, direction to the light, table row, weight, tested, reached) along camera paths."""
+        """Yields records (p, direction to the light, table row, weight, tested, reached) along camera paths.
+
+        A record's weight estimates what light from there adds to the image.
+        """
         rng = streams(dr.arange(mi.UInt32, PILOT_PATHS), mi.UInt32(0x67756964))
         wavelength_sample = 0.5
-        ray, _ = sensor.sample_ray(sensor.shutter_open(), wavelength_sample, next_2d(rng), next_2d(rng))
-        active = mi.Bool(True)
+        ray, throughput = sensor.sample_ray(sensor.shutter_open(), wavelength_sample, next_2d(rng), next_2d(rng))
+        throughput = mi.Spectrum(throughput) + dr.zeros(mi.Spectrum, PILOT_PATHS)
+        active = dr.full(mi.Bool, True, PILOT_PATHS)
         context = mi.BSDFContext()
         for _ in range(PILOT_BOUNCES):
             si = self.scene.ray_intersect(ray, active)
             active &= si.is_valid()
             bsdf = si.bsdf()
             smooth = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+            records = []
             for index, emitter in self.infinite:
                 first = int(np.array(self._first_row)[index])
                 ds, weight = emitter.sample_direction(si, next_2d(rng), smooth)
+                tests = [(ds.d, dr.mean(weight), smooth & (ds.pdf > 0))]
                 if emitter.is_environment():
-                    yield self._record(si, bsdf, context, ds.d, direction_cell(ds.d) + first, dr.mean(weight), smooth & (ds.pdf > 0))
                     towards = mi.warp.square_to_uniform_sphere(next_2d(rng))
-                    weight = self._radiance(emitter, towards, smooth) * (4 * dr.pi)
-                    yield self._record(si, bsdf, context, towards, direction_cell(towards) + first, weight, smooth)
-                else:
-                    yield self._record(si, bsdf, context, ds.d, mi.UInt32(first), dr.mean(weight), smooth & (ds.pdf > 0))
+                    tests.append((towards, self._radiance(emitter, towards, smooth) * (4 * dr.pi), smooth))
+                for towards, light, tested in tests:
+                    response = bsdf.eval(context, si, si.to_local(towards), tested)
+                    tested &= dr.mean(response) > 0
+                    reached = _sees_sky(self.scene, si.spawn_ray(towards), tested)
+                    row = first + (direction_cell(towards) if emitter.is_environment() else dr.zeros(mi.UInt32, PILOT_PATHS))
+                    weight = dr.select(reached, light * dr.mean(throughput * dr.minimum(response, 1)), 0)
+                    records.append((si.p, towards + dr.zeros(mi.Vector3f, PILOT_PATHS), row, weight,
+                                    dr.select(tested, mi.Float(1), 0), dr.select(reached, mi.Float(1), 0)))
             bs, value = bsdf.sample(context, si, rng.next_float32(), next_2d(rng), active)
-            active &= dr.mean(value) > 0
+            throughput *= value
+            active &= dr.mean(throughput) > 0
             ray = si.spawn_ray(si.to_world(bs.wo))
-            dr.eval(ray, active, rng)
-
-    def _record(self, si, bsdf, context, towards, row, weight, active):
-        wo = si.to_local(towards)
-        response = dr.minimum(dr.mean(bsdf.eval(context, si, wo, active)), 1)
-        tested = active & (response > 0)
-        reached = mi.Bool(tested)
-        ray = si.spawn_ray(towards)
-        for _ in range(PASS_THROUGH):
-            hit = self.scene.ray_intersect(ray, reached)
-            through = mi.has_flag(hit.bsdf().flags(), mi.BSDFFlags.Null) | \
-                mi.has_flag(hit.bsdf().flags(), mi.BSDFFlags.DeltaTransmission)
-            blocked = reached & hit.is_valid() & ~through
-            reached &= ~blocked
-            pending = reached & hit.is_valid()
-            ray = dr.select(pending, hit.spawn_ray(towards), ray)
-            dr.eval(ray, reached, pending)
-            if not dr.any(pending):
-                break
-        width = dr.width(si)
-        weight = dr.select(reached, weight * response, 0) + dr.zeros(mi.Float, width)
-        tested, reached = dr.select(tested, mi.Float(1), 0), dr.select(reached, mi.Float(1), 0)
-        row = row + dr.zeros(mi.UInt32, width)
-        return si.p, towards + dr.zeros(mi.Vector3f, width), row, weight, tested, reached
+            dr.eval(ray, active, throughput, rng, records)
+            yield from records
 
     # ------------------------------------------------------------------ densities
 

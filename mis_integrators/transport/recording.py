@@ -26,8 +26,13 @@ def frozen(function):
     opaque arrays. Nothing inside may read an array's value.
     """
     recorded = dr.freeze(function)
+    fresh = True
 
     def call(*args):
+        nonlocal fresh
+        if fresh:
+            gc.collect()          # objects of a forgotten scene are still called, but are not among the arguments
+            fresh = False
         with _no_garbage_collection():
             return recorded(*args)
 

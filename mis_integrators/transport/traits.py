@@ -33,6 +33,14 @@ def scene_objects(root):
     return list(seen.values())
 
 
+def used_bsdfs(scene):
+    """Every BSDF that some shape (of a shape group, too) carries, nested ones included, each once."""
+    shapes = [o for o in scene_objects(scene) if isinstance(o, mi.Shape)] + list(scene.shapes())
+    below = {o.ptr: o for shape in shapes for o in scene_objects(shape) if isinstance(o, mi.BSDF)}
+    own = {shape.bsdf().ptr: shape.bsdf() for shape in shapes if shape.bsdf() is not None}
+    return list({**below, **own}.values())
+
+
 def registry_table(objects, pointer_type, values, dtype):
     """A table indexed by Dr.Jit's registry number of `objects`, holding `values`; entry 0 (null pointer) is zero."""
     numbers = [int(dr.reinterpret_array(mi.UInt32, pointer_type(o))[0]) for o in objects]
@@ -67,9 +75,8 @@ class SceneTraits:
     """
 
     def __init__(self, scene):
-        objects = scene_objects(scene)
         flag = mi.BSDFFlags
-        bsdfs = [o for o in objects if isinstance(o, mi.BSDF)]
+        bsdfs = used_bsdfs(scene)
         flags = [b.flags() for b in bsdfs]
         lambertian = [is_lambertian(b) for b in bsdfs]
         self.has_delta = any(f & flag.Delta for f in flags)

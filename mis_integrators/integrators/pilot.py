@@ -1,0 +1,155 @@
+"""The pilot of `bdpm`: a few iterations on a subset of the pixels, from which the merge radii follow."""
+
+from __future__ import annotations
+
+import math
+import time
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..transport.camera_pass import film_sample_count
+from ..transport.gather import mean_photon_count
+from ..transport.radius import best_radius, ladder
+from ..transport.recording import frozen
+
+PILOT_PIXELS = 8192
+FEWEST_ITERATIONS, MOST_ITERATIONS = 5, 16
+PILOT_SHARE = 0.04
+"""Share of the planned iterations that the pilot may have."""
+PILOT_INDEX = 1 << 30
+"""Iteration numbers of the pilot start here, so that its random numbers are its own."""
+UNPLANNED_ITERATIONS = 64
+MOST_PHOTONS = 500
+"""Photons a vertex within the largest radius that is tried."""
+GATHER_COST = 0.055
+"""Cost of one gathered photon a vertex, in units of an iteration's light and camera passes (measured on the Cornell box)."""
+PROBE_COST = 0.7
+"""Cost of the coverage probes, in the same units."""
+USUAL_PHOTONS = 10
+"""Photons a gather at which an iteration counts as one planned iteration: larger gathers must pay for themselves."""
+
+
+def choose_radii(session):
+    """Sets `session.radii` and `session.corrected` for each kind of photon map that the session needs."""
+    session.radii = {}
+    if not session.kinds():
+        return
+    pilot = Pilot(session)
+    count = session.iterations_planned or UNPLANNED_ITERATIONS
+    wanted = PILOT_SHARE * count
+    for done in range(MOST_ITERATIONS):
+        start = time.perf_counter()
+        pilot.iterate(done)
+        seconds = time.perf_counter() - start                  # of the last: the first ones compile
+        if session.seconds is not None:
+            wanted = PILOT_SHARE * session.seconds / seconds
+        if done + 1 >= max(wanted, FEWEST_ITERATIONS) or pilot.ladder is None:
+            break
+    pilot.decide(count)
+    if session.seconds is None:
+        return
+    for _ in range(2):                                         # the first run records the passes
+        start = time.perf_counter()
+        dr.eval(session._iteration(PILOT_INDEX))
+        dr.sync_thread()
+        seconds = time.perf_counter() - start
+    pilot.decide(max((1 - PILOT_SHARE) * session.seconds / seconds * pilot.cost_of_choice(), 1))
+    session._freeze()
+
+
+class Pilot:
+    """Pilot iterations of a session.
+
+    `ladder`: radii (ascending); `samples[kind, corrected]`: gathered values (iterations, radii, pixels), channel mean;
+    `photons[kind]`: mean number of photons within the largest radius.
+    """
+
+    def __init__(self, session):
+        self.session = session
+        pixels = film_sample_count(session.sensor)
+        self.paths = min(pixels, PILOT_PIXELS)
+        stride = pixels // self.paths
+        width = int(session.sensor.film().crop_size()[0])
+        while stride > 1 and math.gcd(stride, width) > 1:      # else the pixels would stand in columns
+            stride -= 1
+        self.stride = stride * session.integrator.camera_paths
+        self.ladder = None
+        # Caustics have edges of their own; only the smooth indirect light gains from knowing the surfaces' edges.
+        self.ways = {kind: [False, True] if kind == "indirect" else [False] for kind in session.kinds()}
+        self.samples = {(kind, way): [] for kind, ways in self.ways.items() for way in ways}
+        self.direct, self.photons = [], {}
+        capacity = session._vertex_room(self.paths) * (1 if session.one_vertex else 4)
+        self._camera = frozen(lambda scene, sensor, tables, seed, wavelength_sample: session._trace_camera(
+            scene, sensor, seed, mi.UInt32(0), self.stride, self.paths, capacity, wavelength_sample))
+        self._gather = frozen(lambda scene, tables, photons, vertices, radii: {
+            kind: session._gather(scene, photons, vertices, kind, radii, grey=True) for kind in self.ways})
+        self._covered = frozen(session._covered)
+
+    def iterate(self, number):
+        """Runs pilot iteration `number`."""
+        session = self.session
+        number += PILOT_INDEX
+        wavelength_sample = session._wavelength_sample(number)
+        photons = session._photons(number, wavelength_sample)
+        seed = session._seed(number, 1)
+        radiance, _, _, vertices, _ = self._camera(session.scene, session.sensor, session._tables, seed, wavelength_sample)
+        if self.ladder is None and not self._prepare(photons, vertices):
+            return
+        radii = [dr.opaque(mi.Float, float(radius)) for radius in self.ladder]
+        gathered = self._gather(session.scene, session._tables, photons, vertices, radii)
+        self.direct.append(self._numpy(dr.mean(radiance)))
+        for (kind, way), store in self.samples.items():
+            values = gathered[kind]
+            if way:
+                values = [v * dr.rcp(self._covered(session.scene, vertices, r, seed)) for v, r in zip(values, radii)]
+            store.append([self._numpy(session._per_path(value, vertices, self.paths)) for value in values])
+
+    def _numpy(self, value):
+        return np.broadcast_to(np.array(value), self.paths)
+
+    def _prepare(self, photons, vertices):
+        """Sets the ladder and counts photons; false if no camera path meets a surface that gathers."""
+        points = vertices["ray_o"] + vertices["ray_d"] * vertices["hit"].t
+        self.ladder = ladder(np.array(points), np.array(dr.max(vertices["throughput"])))
+        if self.ladder is None:
+            return False
+        self._count(photons, vertices)
+        crowd = max(self.photons.values())
+        if crowd > MOST_PHOTONS:
+            self.ladder = self.ladder * (MOST_PHOTONS / crowd) ** 0.5
+            self._count(photons, vertices)
+        return True
+
+    def _count(self, photons, vertices):
+        radius = dr.opaque(mi.Float, float(self.ladder[-1]))
+        for kind in self.ways:
+            photon_map = self.session._map(self.session.scene, photons, kind, radius)
+            self.photons[kind] = mean_photon_count(photon_map, vertices, radius)
+
+    def _cost(self, kind, corrected, radius):
+        photons = self.photons[kind] * (radius / self.ladder[-1]) ** 2
+        return (1 + GATHER_COST * photons + PROBE_COST * corrected) / (1 + GATHER_COST * USUAL_PHOTONS)
+
+    def cost_of_choice(self):
+        """Relative cost of an iteration with the session's radii."""
+        return max((self._cost(kind, self.session.corrected[kind], radius) for kind, radius in self.session.radii.items()
+                    if kind in self.photons), default=1.0)
+
+    def decide(self, count):
+        """Sets the session's radii and corrections for `count` iterations of usual cost."""
+        session = self.session
+        if self.ladder is None:
+            session.radii = {kind: 1e-3 * float(dr.norm(session.scene.bbox().extents())[0]) for kind in self.ways}
+            return
+        samples = {key: np.array(values) for key, values in self.samples.items()}
+        middle = len(self.ladder) * 2 // 3
+        mean = np.mean(self.direct, axis=0) + sum(samples[kind, False][:, middle].mean(axis=0) for kind in self.ways)
+        for kind, ways in self.ways.items():
+            choices = []
+            for way in ways:
+                radius, error = best_radius(self.ladder, samples[kind, way], mean,
+                                            lambda r, way=way: np.maximum(count / self._cost(kind, way, r), 1))
+                choices.append((error, radius, way))
+            _, session.radii[kind], session.corrected[kind] = min(choices)
