@@ -7,7 +7,7 @@ import mitsuba as mi
 
 from ..transport.camera_pass import film_sample_count, trace_camera_paths
 from ..transport.coverage import covered_share
-from ..transport.film import splat_samples
+from ..transport.film import colour_matrix, splat_samples
 from ..transport.gather import gather_photons
 from ..transport.guide import EnvironmentGuide, infinite_emitters
 from ..transport.light_pass import trace_light_paths
@@ -62,6 +62,7 @@ class BDPMSession(IterativeSession):
         self.radii = {kind: integrator.initial_radius for kind in self.kinds()} if integrator.initial_radius else None
         self.corrected = {kind: False for kind in self.kinds()}
         self.seconds = None
+        self._sized = False
         self._freeze()
 
     def plan_time(self, seconds):
@@ -96,22 +97,21 @@ class BDPMSession(IterativeSession):
         self._light_pass = frozen(self._trace_light)
         self._camera_pass = frozen(self._render_chunk)
 
-    def _trace_light(self, scene, sensor, tables, seed, wavelength_sample):
-        return trace_light_paths(scene, self.lights, seed, self.light_paths, self.photon_capacity,
-                                 self._wavelengths(sensor, wavelength_sample), sensor.shutter_open(), sensor.shutter_open_time(),
+    def _trace_light(self, scene, sensor, tables, seed, spectral):
+        return trace_light_paths(scene, self.lights, seed, self.light_paths, self.photon_capacity, spectral["wavelengths"], sensor.shutter_open(), sensor.shutter_open_time(),
                                  self.integrator.max_depth, self.integrator.rr_depth)
 
-    def _trace_camera(self, scene, sensor, seed, first, stride, paths, capacity, wavelength_sample):
+    def _trace_camera(self, scene, sensor, seed, first, stride, paths, capacity, spectral):
         integrator = self.integrator
         return trace_camera_paths(scene, sensor, integrator, self.lights, self.traits, seed, first, stride, paths,
-                                  integrator.camera_paths, wavelength_sample, integrator.bdd, integrator.max_depth,
+                                  integrator.camera_paths, spectral["sample"], integrator.bdd, integrator.max_depth,
                                   integrator.rr_depth, integrator.hide_emitters, capacity, self.has_caustics, self.has_indirect,
                                   self.one_vertex)
 
-    def _gather(self, scene, photons, vertices, kind, radii, grey=False):
+    def _gather(self, scene, photons, vertices, kind, radii, spectral, grey=False):
         """What photons of one kind bring to each vertex, for each radius."""
-        return gather_photons(scene, self.traits, self._map(scene, photons, kind, radii[-1]), vertices, radii, self.light_paths,
-                              self.integrator.max_depth, only_last=kind == "indirect", grey=grey)
+        return gather_photons(self.traits, self._map(photons, kind, radii[-1]), vertices, radii, spectral["wavelengths"],
+                              self.light_paths, self.integrator.max_depth, only_last=kind == "indirect", grey=grey)
 
     def _covered(self, scene, vertices, radius, seed):
         """Share of each vertex' merge disk that holds surface."""
@@ -126,56 +126,59 @@ class BDPMSession(IterativeSession):
                           dr.ReduceMode.Direct)
         return total
 
-    def _map(self, scene, photons, kind, radius):
-        cell = dr.maximum(radius, smallest_cell(scene.bbox(), self.photon_capacity))
-        return build_photon_map(*photons, mi.Point3f(scene.bbox().min), cell, self.photon_capacity, kind)
+    def _map(self, photons, kind, radius):
+        cell = dr.maximum(radius, smallest_cell(self.traits.bounds, self.photon_capacity))
+        return build_photon_map(*photons, self.traits.bounds, cell, self.photon_capacity, kind)
 
-    def _render_chunk(self, scene, sensor, tables, photons, seed, first, wavelength_sample, radii):
+    def _render_chunk(self, scene, sensor, tables, photons, seed, first, spectral, radii):
         radiance, alpha, position, vertices, count = self._trace_camera(scene, sensor, seed, first, 1, self.chunk,
-                                                                        self.vertex_capacity, wavelength_sample)
+                                                                        self.vertex_capacity, spectral)
         if radii:
             dr.eval(radiance, alpha, position, vertices, count)
         for kind, radius in radii.items():
-            (gathered,) = self._gather(scene, photons, vertices, kind, [radius])
+            (gathered,) = self._gather(scene, photons, vertices, kind, [radius], spectral)
             if self.corrected[kind]:
                 gathered *= dr.rcp(self._covered(scene, vertices, radius, seed))
             radiance += self._per_path(gathered, vertices, self.chunk)
         active = dr.arange(mi.UInt32, self.chunk) + first < self.path_count
-        return splat_samples(sensor.film(), position, radiance, alpha, self._wavelengths(sensor, wavelength_sample), active), count
+        return splat_samples(sensor.film(), position, radiance, alpha, spectral["matrix"], active), count
 
-    @staticmethod
-    def _wavelengths(sensor, wavelength_sample):
-        """The wavelengths that all sub-paths of an iteration share."""
-        return sensor.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), wavelength_sample)[0]
+    def _spectral(self, iteration):
+        """The wavelengths that all sub-paths of an iteration share, the sample that makes them, and their conversion to colour."""
+        sample = dr.opaque(mi.Float, mix(self.seed, iteration, WAVELENGTH) / 2 ** 32)
+        wavelengths, _ = self.sensor.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), sample)
+        spectral = {"sample": sample, "wavelengths": wavelengths, "matrix": colour_matrix(wavelengths)}
+        dr.make_opaque(spectral)
+        return spectral
 
     # ------------------------------------------------------------------ iterations
 
-    def _photons(self, iteration, wavelength_sample):
-        """An iteration's photons; the buffers grow and the pass runs again where one overflows."""
+    def _photons(self, iteration, spectral):
+        """An iteration's photons. Where they overflow the buffers, these grow and the pass runs again; after the first pass they
+        take the size that was needed, with some room."""
         while True:
-            photons = self._light_pass(self.scene, self.sensor, self._tables, self._seed(iteration, LIGHT), wavelength_sample)
+            photons = self._light_pass(self.scene, self.sensor, self._tables, self._seed(iteration, LIGHT), spectral)
             dr.eval(photons)
             found = int(photons[2][0])
-            if found <= self.photon_capacity:
+            room = found + found // 8 + 1024
+            if found <= self.photon_capacity and (self._sized or room >= self.photon_capacity):
                 return photons
-            self.photon_capacity = found + found // 4
+            self._sized = True
+            self.photon_capacity = room
             self._freeze()
-
-    def _wavelength_sample(self, iteration):
-        return dr.opaque(mi.Float, mix(self.seed, iteration, WAVELENGTH) / 2 ** 32)
 
     def _iteration(self, iteration):
         if self.radii is None:
             choose_radii(self)
         radii = self.radii_at(iteration)
-        wavelength_sample = self._wavelength_sample(iteration)
-        photons = self._photons(iteration, wavelength_sample) if radii else None
+        spectral = self._spectral(iteration)
+        photons = self._photons(iteration, spectral) if radii else None
         total = None
         for chunk in range(self.chunks):
             while True:
                 first = dr.opaque(mi.UInt32, chunk * self.chunk)
                 block, count = self._camera_pass(self.scene, self.sensor, self._tables, photons, self._seed(iteration, CAMERA), first,
-                                                 wavelength_sample, radii)
+                                                 spectral, radii)
                 if self.one_vertex or int(count[0]) <= self.vertex_capacity:
                     break
                 self.vertex_capacity = int(count[0]) + int(count[0]) // 4

@@ -81,24 +81,24 @@ class Pilot:
         self.samples = {(kind, way): [] for kind, ways in self.ways.items() for way in ways}
         self.direct, self.photons = [], {}
         capacity = session._vertex_room(self.paths) * (1 if session.one_vertex else 4)
-        self._camera = frozen(lambda scene, sensor, tables, seed, wavelength_sample: session._trace_camera(
-            scene, sensor, seed, mi.UInt32(0), self.stride, self.paths, capacity, wavelength_sample))
-        self._gather = frozen(lambda scene, tables, photons, vertices, radii: {
-            kind: session._gather(scene, photons, vertices, kind, radii, grey=True) for kind in self.ways})
+        self._camera = frozen(lambda scene, sensor, tables, seed, spectral: session._trace_camera(
+            scene, sensor, seed, mi.UInt32(0), self.stride, self.paths, capacity, spectral))
+        self._gather = frozen(lambda scene, tables, photons, vertices, radii, spectral: {
+            kind: session._gather(scene, photons, vertices, kind, radii, spectral, grey=True) for kind in self.ways})
         self._covered = frozen(session._covered)
 
     def iterate(self, number):
         """Runs pilot iteration `number`."""
         session = self.session
         number += PILOT_INDEX
-        wavelength_sample = session._wavelength_sample(number)
-        photons = session._photons(number, wavelength_sample)
+        spectral = session._spectral(number)
+        photons = session._photons(number, spectral)
         seed = session._seed(number, 1)
-        radiance, _, _, vertices, _ = self._camera(session.scene, session.sensor, session._tables, seed, wavelength_sample)
+        radiance, _, _, vertices, _ = self._camera(session.scene, session.sensor, session._tables, seed, spectral)
         if self.ladder is None and not self._prepare(photons, vertices):
             return
         radii = [dr.opaque(mi.Float, float(radius)) for radius in self.ladder]
-        gathered = self._gather(session.scene, session._tables, photons, vertices, radii)
+        gathered = self._gather(session.scene, session._tables, photons, vertices, radii, spectral)
         self.direct.append(self._numpy(dr.mean(radiance)))
         for (kind, way), store in self.samples.items():
             values = gathered[kind]
@@ -125,7 +125,7 @@ class Pilot:
     def _count(self, photons, vertices):
         radius = dr.opaque(mi.Float, float(self.ladder[-1]))
         for kind in self.ways:
-            photon_map = self.session._map(self.session.scene, photons, kind, radius)
+            photon_map = self.session._map(photons, kind, radius)
             self.photons[kind] = mean_photon_count(photon_map, vertices, radius)
 
     def _cost(self, kind, corrected, radius):
@@ -141,7 +141,7 @@ class Pilot:
         """Sets the session's radii and corrections for `count` iterations of usual cost."""
         session = self.session
         if self.ladder is None:
-            session.radii = {kind: 1e-3 * float(dr.norm(session.scene.bbox().extents())[0]) for kind in self.ways}
+            session.radii = {kind: 1e-3 * float(dr.norm(session.traits.bounds.extents())) for kind in self.ways}
             return
         samples = {key: np.array(values) for key, values in self.samples.items()}
         middle = len(self.ladder) * 2 // 3

@@ -6,21 +6,31 @@ import drjit as dr
 import mitsuba as mi
 
 
-def colour_channels(radiance, wavelengths):
-    """Three display channels of a `Spectrum` (spectral: CIE to linear sRGB; mono: grey)."""
+def colour_matrix(wavelengths):
+    """Linear sRGB of unit radiance at each of `wavelengths`: the conversion is linear, so an iteration that shares its wavelengths
+    shares this matrix (a list of `Color3f`, empty in rgb and mono variants)."""
+    if not mi.is_spectral:
+        return []
+    count = dr.size_v(mi.Spectrum)
+    units = [mi.Spectrum(*[float(i == j) for j in range(count)]) for i in range(count)]
+    return [mi.Color3f(mi.spectrum_to_srgb(unit, wavelengths)) for unit in units]
+
+
+def colour_channels(radiance, matrix):
+    """Three display channels of a `Spectrum`, with the `colour_matrix` of its wavelengths (mono: grey)."""
     if mi.is_spectral:
-        return mi.spectrum_to_srgb(radiance, wavelengths)
+        return sum((column * radiance[i] for i, column in enumerate(matrix)), mi.Color3f(0))
     if mi.is_monochromatic:
         return mi.Color3f(radiance.x)
     return radiance
 
 
-def splat_samples(film, position, radiance, alpha, wavelengths, active):
+def splat_samples(film, position, radiance, alpha, matrix, active):
     """Reconstructs one pass: an image tensor (height, width, channels), border included, that holds sums of filter weight
-    times (R, G, B, [alpha,] 1)."""
+    times (R, G, B, [alpha,] 1); `matrix` as for `colour_channels`."""
     channels = 5 if mi.has_flag(film.flags(), mi.FilmFlags.Alpha) else 4
     block = mi.ImageBlock(film.crop_size(), film.crop_offset(), channels, film.rfilter(), border=True, coalesce=False)
-    colour = colour_channels(radiance, wavelengths)
+    colour = colour_channels(radiance, matrix)
     values = [colour.x, colour.y, colour.z]
     if mi.has_flag(film.flags(), mi.FilmFlags.Alpha):
         values.append(alpha)

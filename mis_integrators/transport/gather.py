@@ -17,7 +17,7 @@ SAME_SURFACE_OFFSET = 0.5
 SMALLEST_COSINE = 1e-3
 
 
-def gather_photons(scene, traits, photon_map, vertices, radii, light_paths, max_depth: int, only_last: bool,
+def gather_photons(traits, photon_map, vertices, radii, wavelengths, light_paths, max_depth: int, only_last: bool,
                    grey: bool = False):
     """Radiance that the photons of `photon_map` bring to the camera paths of `vertices`, for each radius of the list `radii`
     (ascending; each of width one, or one a vertex), from one visit of the photons within the largest.
@@ -27,7 +27,7 @@ def gather_photons(scene, traits, photon_map, vertices, radii, light_paths, max_
     Returns a list with a `Spectrum` of the vertices' width for each radius, throughput included; with `grey` the mean over its
     channels (fewer sums to keep for many radii).
     """
-    ray = mi.Ray3f(vertices["ray_o"], vertices["ray_d"])
+    ray = mi.Ray3f(vertices["ray_o"], vertices["ray_d"], 0, wavelengths)
     throughput, depth = vertices["throughput"], vertices["depth"]
     active = dr.max(throughput) > 0
     if only_last:
@@ -47,12 +47,16 @@ def gather_photons(scene, traits, photon_map, vertices, radii, light_paths, max_
         factor *= dr.select(lambertian, bsdf.eval(context, si, upright, active & lambertian), 1)
 
     def visit(index, record, offset, distance_squared, hit, totals):
-        hit &= dr.dot(unpack_normal(record.w), si.n) > SAME_SURFACE_COSINE
+        normal = unpack_normal(record.w)
+        alike = dr.dot(normal, si.n)
+        hit &= (alike > 0) & (dr.square(alike) > SAME_SURFACE_COSINE ** 2 * dr.squared_norm(normal))
         if max_depth > 0:
             hit &= unpack_depth(record.w) + depth <= max_depth
         flux, packed = read_power(photon_map, index, hit)
         towards = unpack_direction(packed)
-        wo = si.to_local(towards)
+        if traits.has_rough:
+            towards = dr.normalize(towards)
+        wo = si.to_local(towards)                         # a Lambertian needs only the ratio of its cosines
         cosine = dr.dot(si.n, towards)
         value = mi.Spectrum(0)
         if traits.has_lambertian:

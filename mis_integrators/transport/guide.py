@@ -13,6 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 from .random import next_2d, streams
+from .traits import scene_bounds
 
 POLAR_CELLS = 16
 AZIMUTH_CELLS = 32
@@ -90,10 +91,8 @@ class EnvironmentGuide:
     """
 
     def __init__(self, scene, sensor):
-        box = scene.bbox()
+        box = scene_bounds(scene)
         low, high = np.array(box.min).ravel(), np.array(box.max).ravel()
-        if not np.all(np.isfinite(low) & np.isfinite(high)):
-            low, high = np.full(3, -1.0), np.full(3, 1.0)
         self._set_sphere((low + high) / 2, max(np.linalg.norm(high - low) / 2, 1e-3))
         self.scene = scene
         self.infinite = infinite_emitters(scene)

@@ -93,6 +93,7 @@ class Lights:
         self.numbers = registry_table(self.emitters, mi.EmitterPtr, range(len(self.emitters)), mi.UInt32)
         self.kind_table = mi.UInt32([_KINDS.index(k) for k in self.kinds])
         self._spot_tables(self.emitters)
+        self._sphere_tables(self.emitters)
 
     @property
     def dark(self):
@@ -101,7 +102,8 @@ class Lights:
 
     def tables(self):
         """Every evaluated array that the sampling routines read, for `dr.freeze` to track."""
-        arrays = [getattr(self, name) for name in ("numbers", "kind_table", "_spot_axis", "_spot_cosine") if hasattr(self, name)]
+        arrays = [getattr(self, name) for name in ("numbers", "kind_table", "_spot_axis", "_spot_cosine",
+                                                     "_sphere_center", "_sphere_sign") if hasattr(self, name)]
         if self.emitters and self.choice.count > 1:
             arrays += [self.choice._pmf, self.choice._cdf]
         return arrays + (self.guide.tables() if self.guide is not None else [])
@@ -138,6 +140,25 @@ class Lights:
             self._spot_axis = mi.Float(np.array(axes, dtype=np.float64).ravel())
             self._spot_cosine = mi.Float(cosines)
 
+    def _sphere_tables(self, emitters):
+        shapes = [e.get_shape() for e in emitters]
+        spheres = [s is not None and s.class_name() == "Sphere" for s in shapes]
+        self._has_spheres = any(spheres)
+        if self._has_spheres:
+            centers = [np.array(s.bbox().center()).ravel() if sphere else np.zeros(3) for s, sphere in zip(shapes, spheres)]
+            signs = [(-1.0 if s.has_flipped_normals() else 1.0) if sphere else 0.0 for s, sphere in zip(shapes, spheres)]
+            self._sphere_center = mi.Float(np.array(centers, dtype=np.float64).ravel())
+            self._sphere_sign = mi.Float(signs)
+
+    def _sample_surface(self, emitter, index, time, sample, active):
+        """A uniformly distributed point on an area light. Mitsuba's sampling of a rotated sphere forgets to rotate the normal."""
+        ps = emitter.get_shape().sample_position(mi.Float(time), sample, active)
+        if self._has_spheres:
+            sign = dr.gather(mi.Float, self._sphere_sign, index, active)
+            center = dr.gather(mi.Point3f, self._sphere_center, index, active)
+            ps.n = dr.select(sign != 0, mi.Normal3f(dr.normalize(ps.p - center) * sign), ps.n)
+        return ps
+
     def pointer(self, index):
         """Emitter pointers for an index array (a literal, so that calls need no dispatch, if there is one emitter)."""
         if len(self.emitters) == 1:
@@ -159,12 +180,18 @@ class Lights:
         textured = active & self._textured_mask(emitter) if self.has_textured else mi.Bool(False)
         ds, weight = emitter.sample_direction(ref, sample, active & ~textured)
         if self.has_textured:
-            ds_t, weight_t = self._sample_by_area(ref, emitter, sample, textured)
+            ds_t, weight_t = self._sample_by_area(ref, emitter, index, sample, textured)
             ds = dr.select(textured, ds_t, ds)
             weight = dr.select(textured, weight_t, weight)
         valid = active & (ds.pdf > 0) & dr.any(weight != 0)
         valid &= dr.isfinite(ds.pdf)
-        visible = valid & ~self.scene.ray_test(ref.spawn_ray_to(ds.p), valid)
+        shadow = ref.spawn_ray_to(ds.p)
+        if self.guide is not None:
+            # Infinite emitters place `ds.p` on a sphere that may be too small (see `scene_bounds`).
+            infinite, open_ray = mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite), ref.spawn_ray(ds.d)
+            shadow = mi.Ray3f(dr.select(infinite, open_ray.o, shadow.o), dr.select(infinite, open_ray.d, shadow.d),
+                              dr.select(infinite, open_ray.maxt, shadow.maxt), shadow.time, shadow.wavelengths)
+        visible = valid & ~self.scene.ray_test(shadow, valid)
         return ds, dr.select(visible, weight * dr.rcp(probability), 0), ds.pdf * probability
 
     def pdf_direct(self, ref, ds, active):
@@ -184,9 +211,8 @@ class Lights:
         flags = emitter.flags()
         return mi.has_flag(flags, mi.EmitterFlags.Surface) & mi.has_flag(flags, mi.EmitterFlags.SpatiallyVarying)
 
-    @staticmethod
-    def _sample_by_area(ref, emitter, sample, active):
-        ps = emitter.get_shape().sample_position(ref.time, sample, active)
+    def _sample_by_area(self, ref, emitter, index, sample, active):
+        ps = self._sample_surface(emitter, index, ref.time, sample, active)
         ds = mi.DirectionSample3f(ps)
         ds.d = ds.p - ref.p
         distance_squared = dr.squared_norm(ds.d)
@@ -278,7 +304,7 @@ class Lights:
         return o, -towards, radiance * dr.select(pdf_direction > 0, dr.rcp(pdf_direction * pdf_position), 0)
 
     def _emit_area(self, emitter, index, sample_a, sample_b, extra, time, wavelengths, active):
-        ps = emitter.get_shape().sample_position(mi.Float(time), sample_a, active)
+        ps = self._sample_surface(emitter, index, time, sample_a, active)
         si = mi.SurfaceInteraction3f(ps, wavelengths)
         si.wi = mi.warp.square_to_cosine_hemisphere(sample_b)
         radiance = emitter.eval(si, active)

@@ -31,7 +31,7 @@ def _octahedral(v):
 def _inverse_octahedral(x, y):
     z = 1 - dr.abs(x) - dr.abs(y)
     fold = dr.maximum(-z, 0)
-    return dr.normalize(mi.Vector3f(x - dr.mulsign(fold, x), y - dr.mulsign(fold, y), z))
+    return mi.Vector3f(x - dr.mulsign(fold, x), y - dr.mulsign(fold, y), z)
 
 
 def _quantise(x, bits):
@@ -51,7 +51,7 @@ def pack_direction(v):
 
 
 def unpack_direction(u):
-    """Inverse of `pack_direction`."""
+    """Inverse of `pack_direction`, not normalised (length between 0.57 and 1)."""
     return _inverse_octahedral(_dequantise(u & 0xffff, 16), _dequantise(u >> 16, 16))
 
 
@@ -66,7 +66,7 @@ def pack_surface(normal, depth, caustic):
 
 
 def unpack_normal(word):
-    """The normal stored by `pack_surface`."""
+    """The normal stored by `pack_surface`, not normalised (length between 0.57 and 1)."""
     bits = _SURFACE_NORMAL_BITS
     mask = (1 << bits) - 1
     return _inverse_octahedral(_dequantise(word & mask, bits), _dequantise((word >> bits) & mask, bits))

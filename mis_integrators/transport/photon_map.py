@@ -1,8 +1,8 @@
-"""The photon map: photons sorted by the cells of a spatial hash grid, and the query that visits those within a radius.
+"""The photon map: photons sorted by the cells of a spatial grid, and the query that visits those within a radius.
 
-Cells of one grid row (equal y and z) are neighbours in memory: row (y, z) starts at a hash, x counts up from there. A query
-so reads one contiguous range of photons a row. Rows whose hashes overlap are told apart by the photons' own positions, so that
-no photon is visited twice.
+Cells are numbered along x, then y, then z, modulo the size of a table: small grids fit it, larger ones wrap around. The cells of one
+row (equal y and z) are neighbours in memory, so a query reads one contiguous range of photons a row. Rows that share their place
+with others are told apart by the photons' own positions, so that no photon is visited twice.
 """
 
 from __future__ import annotations
@@ -13,58 +13,60 @@ import mitsuba as mi
 from .light_pass import photon_words
 from .packing import bits_float, unpack_caustic
 
-TABLE_LOAD = 2
-"""Hash slots a photon of capacity."""
-
-
 def table_size(capacity):
-    """Hash slots (a power of two) for `capacity` photons."""
-    return 1 << max(10, min(24, (TABLE_LOAD * max(capacity, 1) - 1).bit_length()))
+    """Table entries (a power of two) for `capacity` photons: four or more each, so that small grids fit."""
+    return 1 << max(10, min(24, (4 * max(capacity, 2) - 1).bit_length()))
 
 
 def smallest_cell(bbox, capacity):
-    """The smallest cell size with which a row of cells still fits behind its hash."""
+    """The smallest cell size with which a row of cells still fits into the table."""
     extent = float(bbox.max.x - bbox.min.x)
     return extent / (table_size(capacity) - 8)
 
 
-def _row_hash(y, z, mask):
-    return ((y * mi.UInt32(73856093)) ^ (z * mi.UInt32(19349663))) & mask
+class Grid:
+    """Cells of edge `cell` (width one) over a bounding box, with two cells of margin.
+
+    Odd numbers of columns and rows keep layers apart when numbers wrap around a table whose size is a power of two.
+    """
+
+    def __init__(self, bbox, cell, size):
+        self.origin, self.cell, self.size = mi.Point3f(bbox.min), cell, size
+        extent = mi.Vector3f(bbox.max - bbox.min)
+        self.columns = (mi.UInt32(dr.floor(extent.x / cell)) + 5) | 1
+        self.lines = (mi.UInt32(dr.floor(extent.y / cell)) + 5) | 1
+
+    def coordinates(self, p):
+        """Integer cell coordinates of points `p`."""
+        return mi.Vector3i(dr.floor((p - self.origin) / self.cell)) + 2
+
+    def row(self, y, z):
+        """Table entry of the cell x = 0 of row (y, z); x counts up from there."""
+        return ((mi.UInt32(z) * self.lines + mi.UInt32(y)) * self.columns) & (self.size - 1)
 
 
 class PhotonMap:
-    """Sorted photons; build with `build_photon_map`.
+    """Sorted photons: a `grid`, `start` (first photon of each table entry), `surface` and `power` as in `trace_light_paths`."""
 
-    Fields: `origin` (3 floats of width one), `cell` (edge length), `start` (first photon of each slot), `surface` and `power` as
-    in `trace_light_paths`, sorted.
-    """
-
-    DRJIT_STRUCT = None
-
-    def __init__(self, origin, cell, start, surface, power):
-        self.origin, self.cell, self.start, self.surface, self.power = origin, cell, start, surface, power
-        self.mask = mi.UInt32(len(start) // 2 - 1)
-
-    def coordinates(self, p):
-        """Integer cell coordinates of points `p`; two cells of margin keep those of queries outside the box positive in x."""
-        return mi.Vector3i(dr.floor((p - self.origin) / self.cell)) + 2
+    def __init__(self, grid, start, surface, power):
+        self.grid, self.start, self.surface, self.power = grid, start, surface, power
 
 
-def build_photon_map(surface, power, count, origin, cell, capacity: int, kind: str):
-    """Sorts photons into a grid of cells of edge `cell`.
+def build_photon_map(surface, power, count, bbox, cell, capacity: int, kind: str):
+    """Sorts photons into a grid of cells of edge `cell` (width one) over `bbox`.
 
     `kind`: "all", "caustic" or "indirect" selects the photons. Three passes over the photons: count, prefix sum, scatter.
     """
     size = table_size(capacity)
+    grid = Grid(bbox, cell, size)
     index = dr.arange(mi.UInt32, capacity)
     active = index < dr.gather(mi.UInt32, count, 0)
     record = dr.gather(mi.Vector4u, surface, index, active)
     if kind != "all":
         active &= unpack_caustic(record.w) == (kind == "caustic")
     p = mi.Point3f(bits_float(record.x), bits_float(record.y), bits_float(record.z))
-    coordinates = mi.Vector3i(dr.floor((p - origin) / cell)) + 2
-    row = _row_hash(mi.UInt32(coordinates.y), mi.UInt32(coordinates.z), size - 1)
-    slot = row + dr.minimum(mi.UInt32(coordinates.x), size - 4)
+    coordinates = grid.coordinates(p)
+    slot = grid.row(coordinates.y, coordinates.z) + dr.minimum(mi.UInt32(coordinates.x), size - 4)
     counts = dr.zeros(mi.UInt32, 2 * size)
     rank = dr.scatter_inc(counts, slot, active)
     dr.eval(counts, rank, slot)
@@ -80,7 +82,7 @@ def build_photon_map(surface, power, count, origin, cell, capacity: int, kind: s
         parts = max(words // 4, 1)
         dr.scatter(sorted_power, dr.gather(packet, power, parts * index + part, active), parts * target + part, active)
     dr.eval(sorted_surface, sorted_power)
-    return PhotonMap(origin, cell, start, sorted_surface, sorted_power)
+    return PhotonMap(grid, start, sorted_surface, sorted_power)
 
 
 def read_power(photon_map, index, active):
@@ -104,9 +106,9 @@ def for_each_photon(photon_map, p, radius, active, visit, state):
     within `radius` of `p` and belongs to the row that is being read; `record` holds the photon's surface words, `offset` is its
     position minus `p`. `state` is a tuple of Dr.Jit arrays.
     """
-    cell, origin = photon_map.cell, photon_map.origin
-    inverse = dr.rcp(cell)
-    local = (p - origin) * inverse
+    grid = photon_map.grid
+    inverse = dr.rcp(grid.cell)
+    local = (p - grid.origin) * inverse
     reach = radius * inverse * 1.0001
     first_y = mi.Int32(dr.floor(local.y - reach)) + 2
     first_z = mi.Int32(dr.floor(local.z - reach)) + 2
@@ -114,7 +116,7 @@ def for_each_photon(photon_map, p, radius, active, visit, state):
     rows_z = mi.UInt32(mi.Int32(dr.floor(local.z + reach)) + 3 - first_z)
     rows = dr.select(active, rows_y * rows_z, 0)
     radius_squared = dr.square(radius)
-    size = len(photon_map.start) // 2
+    size = grid.size
 
     def enter_row(row, index, end, y, z):
         y, z = first_y + mi.Int32(row % rows_y), first_z + mi.Int32(row // rows_y)
@@ -125,7 +127,7 @@ def for_each_photon(photon_map, p, radius, active, visit, state):
         half = dr.safe_sqrt(left) + 1e-3
         first_x = dr.clip(mi.Int32(dr.floor(local.x - half)) + 2, 0, size - 4)
         last_x = dr.clip(mi.Int32(dr.floor(local.x + half)) + 2, -1, size - 4)
-        base = _row_hash(mi.UInt32(y), mi.UInt32(z), size - 1)
+        base = grid.row(y, z)
         near = (left > -1e-3) & (last_x >= first_x)
         index = dr.gather(mi.UInt32, photon_map.start, base + mi.UInt32(first_x), near)
         end = dr.gather(mi.UInt32, photon_map.start, base + mi.UInt32(last_x) + 1, near)
@@ -142,7 +144,7 @@ def for_each_photon(photon_map, p, radius, active, visit, state):
         hit = inside & (distance_squared < radius_squared)
 
         def met(index, record, offset, distance_squared, position, y, z, state):
-            own = photon_map.coordinates(position)
+            own = grid.coordinates(position)
             return visit(index, record, offset, distance_squared, (own.y == y) & (own.z == z), state)
 
         state = dr.if_stmt((index, record, offset, distance_squared, position, y, z, state), hit, met,

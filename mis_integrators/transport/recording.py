@@ -4,6 +4,7 @@ import contextlib
 import gc
 
 import drjit as dr
+import mitsuba as mi
 
 
 @contextlib.contextmanager
@@ -23,17 +24,27 @@ def frozen(function):
     """`dr.freeze(function)`, safe against garbage collection while it records.
 
     Evaluated arrays that `function` reads must be among its arguments, and numbers that change from call to call must be
-    opaque arrays. Nothing inside may read an array's value.
+    opaque arrays. Nothing inside may read an array's value. Where Dr.Jit cannot record (some nested virtual calls of spectral
+    textures) the function runs as it is, with the same result and some more Python.
     """
     recorded = dr.freeze(function)
-    fresh = True
+    fresh, plain = True, False
 
     def call(*args):
-        nonlocal fresh
+        nonlocal fresh, plain
+        if plain:
+            return function(*args)
         if fresh:
             gc.collect()          # objects of a forgotten scene are still called, but are not among the arguments
             fresh = False
-        with _no_garbage_collection():
-            return recorded(*args)
+        try:
+            with _no_garbage_collection():
+                return recorded(*args)
+        except RuntimeError as error:
+            if "while recording a frozen function" not in str(error):
+                raise
+            mi.Log(mi.LogLevel.Debug, f"not recorded: {error.__cause__ or error}")
+            plain = True
+            return function(*args)
 
     return call

@@ -66,15 +66,36 @@ def is_lambertian(bsdf):
     return False
 
 
+def scene_bounds(scene):
+    """Bounding box of the scene's shapes (`mi.ScalarBoundingBox3f`).
+
+    Not `scene.bbox()`: Mitsuba's loader merges shapes into meshes whose boxes it forgets to compute.
+    """
+    box = mi.ScalarBoundingBox3f()
+    for shape in scene.shapes():
+        if isinstance(shape, mi.Mesh):
+            points = np.array(shape.vertex_positions_buffer()).reshape(-1, 3)
+            if len(points):
+                box.expand(mi.ScalarPoint3f([float(x) for x in points.min(axis=0)]))
+                box.expand(mi.ScalarPoint3f([float(x) for x in points.max(axis=0)]))
+        else:
+            box.expand(shape.bbox())
+    if not box.valid():
+        box.expand(mi.ScalarPoint3f(-1, -1, -1))
+        box.expand(mi.ScalarPoint3f(1, 1, 1))
+    return box
+
+
 class SceneTraits:
     """What a scene is made of.
 
-    Attributes: `has_delta` (perfectly specular or null scattering somewhere), `has_mixed` (BSDFs with both a smooth and a
+    Attributes: `bounds` (bounding box), `has_delta` (perfectly specular or null scattering somewhere), `has_mixed` (BSDFs with both a smooth and a
     delta part), `has_rough` (smooth scattering that is not Lambertian), `has_lambertian`, `has_light_surfaces` (emitters that
     a ray can meet: area lights, environments), `lambertian` (registry table for BSDF pointers).
     """
 
     def __init__(self, scene):
+        self.bounds = scene_bounds(scene)
         flag = mi.BSDFFlags
         bsdfs = used_bsdfs(scene)
         flags = [b.flags() for b in bsdfs]
