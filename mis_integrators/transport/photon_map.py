@@ -112,7 +112,8 @@ def for_each_photon(photon_map, p, radius, active, visit, state):
     reach = radius * inverse * 1.0001
     first_y = mi.Int32(dr.floor(local.y - reach)) + 2
     first_z = mi.Int32(dr.floor(local.z - reach)) + 2
-    rows_y = mi.UInt32(mi.Int32(dr.floor(local.y + reach)) + 3 - first_y)
+    # At least one: idle lanes divide by it, too, and an integer division by zero kills the process.
+    rows_y = dr.maximum(mi.UInt32(mi.Int32(dr.floor(local.y + reach)) + 3 - first_y), 1)
     rows_z = mi.UInt32(mi.Int32(dr.floor(local.z + reach)) + 3 - first_z)
     rows = dr.select(active, rows_y * rows_z, 0)
     radius_squared = dr.square(radius)

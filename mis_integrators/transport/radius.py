@@ -55,23 +55,22 @@ def noise_and_difference(samples, weights):
     return variance, difference, error
 
 
-def smooth_difference(radii, difference, error):
-    """Q(R) as a power law a R^q, 1 <= q <= 4: `(a, q)`.
+def expected_difference(radii, difference, error, wanted):
+    """Q at the radii `wanted`, from noisy values at the ladder: the mean over power laws a R^q, each weighted by how well it explains
+    the values (flat in q between 1, edges, and 4, curvature, and in the logarithm of a).
 
-    Fitted in logarithms to the smallest radii at which Q stands out of its noise (larger ones saturate). Where none does, the
-    law goes through what the largest radius may hide, Q plus two standard errors, with q = 3.
+    Radii above the second that stands clearly out of its noise are left out: Q saturates, and small radii are what is asked for.
     """
-    clear = np.flatnonzero((difference > 2.5 * error) & (difference > 0))[:3]
-    if len(clear) == 0:
-        return (max(difference[-1], 0) + 2 * error[-1]) / radii[-1] ** 3, 3.0
-    x, y = np.log(radii[clear]), np.log(difference[clear])
-    q = 3.0
-    if len(clear) > 1:
-        weight = 1 / (0.05 + (error[clear] / difference[clear])) ** 2
-        center = np.average(x, weights=weight)
-        slope = np.sum(weight * (x - center) * (y - np.average(y, weights=weight))) / np.sum(weight * (x - center) ** 2)
-        q = float(np.clip(slope, 1.0, 4.0))
-    return float(np.exp(np.mean(y - q * x))), q
+    clear = np.flatnonzero((difference > 3 * error) & (difference > 0))
+    used = slice(1, clear[1] + 1 if len(clear) > 1 else len(radii))
+    slopes = np.linspace(1, 4, 31)[:, None, None]
+    heights = np.geomspace(1e-9, 10, 200)[None, :, None]                  # Q at the largest radius
+    law = heights * (radii[used] / radii[-1]) ** slopes
+    spread = np.hypot(error[used], 0.15 * law) + 1e-12
+    misfit = np.sum(((difference[used] - law) / spread) ** 2 + 2 * np.log(spread), axis=-1)
+    weight = np.exp(-0.5 * (misfit - misfit.min()))
+    weight /= weight.sum()
+    return np.einsum("qh,qhr->r", weight, heights * (wanted / radii[-1]) ** slopes)
 
 
 def best_radius(radii, samples, mean, iterations):
@@ -82,9 +81,8 @@ def best_radius(radii, samples, mean, iterations):
     Returns `(radius, predicted error at it)`.
     """
     variance, difference, error = noise_and_difference(samples, relative_weights(mean))
-    a, q = smooth_difference(radii, difference, error)
     fine = np.exp(np.linspace(np.log(radii[0]), np.log(radii[-1]), 16 * len(radii)))
     noise = np.exp(np.interp(np.log(fine), np.log(radii), np.log(np.maximum(variance, 1e-30))))
-    predicted = BIAS_FACTOR * a * fine ** q + noise / iterations(fine)
+    predicted = BIAS_FACTOR * expected_difference(radii, difference, error, fine) + noise / iterations(fine)
     best = int(np.argmin(predicted))
     return float(fine[best]), float(predicted[best])
