@@ -16,6 +16,11 @@ def photon_words():
     return {1: 2, 3: 4, 4: 8}[channels]
 
 
+PATHS_PER_LANE = 8
+"""Light sub-paths that a SIMD lane of a CPU traces one after the other: a lane whose path has ended starts the next at once, instead
+of waiting for the longest path beside it. (A GPU needs the paths side by side.)"""
+
+
 @dr.syntax
 def trace_light_paths(scene, lights, seed, n_paths: int, capacity: int, wavelengths, shutter_open: float,
                       shutter_time: float, max_depth: int, rr_depth: int):
@@ -31,27 +36,40 @@ def trace_light_paths(scene, lights, seed, n_paths: int, capacity: int, waveleng
     particular order, and the number of photons, of width one. If it exceeds `capacity` the surplus is missing: repeat the pass
     with more room. Shading normals: Veach 1997, section 5.3 (adjoint factor).
     """
-    index = dr.arange(mi.UInt32, n_paths)
-    rng = streams(index, seed)
+    lanes = n_paths
+    if dr.hint(dr.backend_v(mi.Float) == dr.JitBackend.LLVM, mode='scalar'):
+        lanes = -(-n_paths // PATHS_PER_LANE)
+    lane = dr.arange(mi.UInt32, lanes)
+    rng = streams(lane, seed)
     words = photon_words()
     store = Store(surface=dr.empty(mi.UInt32, 4 * capacity), power=dr.empty(mi.UInt32, words * capacity),
                   count=dr.zeros(mi.UInt32, 1))
-    time = mi.Float(shutter_open)
-    if dr.hint(shutter_time > 0, mode='scalar'):
-        time += rng.next_float32() * shutter_time
-    ray, flux, only_delta = lights.sample_emission(rng, time, wavelengths)
-
-    ray = mi.Ray3f(ray)
-    flux = mi.Spectrum(flux)
-    strength = dr.rcp(dr.maximum(dr.max(flux), 1e-38))          # for roulette: flux relative to its start
-    had_delta = mi.Bool(only_delta)                              # delta chain since the emitter (or unreachable by it)
-    scattered = mi.Bool(False)                                   # met a smooth surface
-    depth = mi.UInt32(0)
-    eta = mi.Float(1)
-    active = dr.max(flux) > 0
+    path = mi.UInt32(lane)                                       # the lane's next path; then this one plus the number of lanes
+    ray = dr.zeros(mi.Ray3f, lanes)
+    flux = dr.zeros(mi.Spectrum, lanes)
+    strength = dr.zeros(mi.Float, lanes)                         # for roulette: one over the flux at the start
+    had_delta = dr.full(mi.Bool, False, lanes)                   # met a delta surface (or is out of next-event estimation's reach)
+    scattered = dr.full(mi.Bool, False, lanes)                   # met a smooth surface
+    depth = dr.zeros(mi.UInt32, lanes)
+    eta = dr.ones(mi.Float, lanes)
+    active = dr.full(mi.Bool, False, lanes)
     context = mi.BSDFContext(mi.TransportMode.Importance)
 
-    while dr.hint(active, label="light sub-paths"):
+    while dr.hint(active | (path < n_paths), label="light sub-paths"):
+        # ---- Start the lane's next path where one has ended
+        begin = ~active & (path < n_paths)
+        if begin:
+            time = mi.Float(shutter_open)
+            if dr.hint(shutter_time > 0, mode='scalar'):
+                time += rng.next_float32() * shutter_time
+            ray, flux, had_delta = lights.sample_emission(rng, time, wavelengths)
+            strength = dr.rcp(dr.maximum(dr.max(flux), 1e-38))
+            scattered = mi.Bool(False)
+            depth = mi.UInt32(0)
+            eta = mi.Float(1)
+            active = dr.max(flux) > 0
+            path += lanes
+
         si = scene.ray_intersect(ray, mi.RayFlags.All, coherent=False, reorder=False, active=active)
         active &= si.is_valid()
         depth += 1
