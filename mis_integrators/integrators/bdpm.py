@@ -24,6 +24,70 @@ CAMERA_CHUNK = 1 << 21
 
 
 class BDPM(IterativeIntegrator):
+    r"""
+    .. _integrator-bdpm:
+
+    Bidirectional ray tracing with photon maps (:monosp:`bdpm`)
+    -----------------------------------------------------------
+
+    .. pluginparameters::
+
+     * - bdd
+       - |int|
+       - Backward diffuse depth: the camera vertex at which photons are gathered, counted over vertices that scatter smoothly, from
+         0. Direct light is estimated at every vertex up to it. (Default: 1)
+     * - photon_count
+       - |int|
+       - Light sub-paths an iteration; 0 stands for as many as the cropped film has pixels. (Default: 0)
+     * - initial_radius
+       - |float|
+       - Merge radius of the first iteration, in scene units; 0 balances noise against blur in a short pilot, apart for caustic and
+         for other photons, and corrects the estimate near edges where that pays. (Default: 0)
+     * - alpha
+       - |float|
+       - Radius reduction of progressive photon mapping, in (0, 1]: iteration i uses R_i^2 = R_0^2 (i + 1)^(alpha - 1). 1 keeps the
+         radius. (Default: 1)
+     * - camera_paths
+       - |int|
+       - Camera paths per pixel and iteration. (Default: 1)
+     * - variance
+       - |bool|
+       - Adds the channels ``var.R``, ``var.G``, ``var.B`` (mono: ``var.Y``): the estimated variance of the pixel mean over the
+         iterations, of which there must be two at least. (Default: no, i.e. |false|)
+     * - max_depth
+       - |int|
+       - Longest path in segments, both halves together (-1: unlimited). A value of 1 shows only directly visible emitters, 2 adds
+         direct light, and so on. (Default: -1)
+     * - rr_depth
+       - |int|
+       - Depth from which Russian roulette may end a sub-path, in each half. (Default: 5)
+     * - hide_emitters
+       - |bool|
+       - Hide directly visible emitters. (Default: no, i.e. |false|)
+
+    Each iteration traces light sub-paths, stores them as photons in a grid, traces camera paths, and estimates the light that photons
+    bring to the camera paths' vertices from their density. Direct light comes from next-event estimation combined with BSDF sampling;
+    photons carry all light of two or more segments, and caustics, which next-event estimation cannot make. The number of iterations
+    is the number of samples per pixel over ``camera_paths``.
+
+    The estimate is consistent: its bias vanishes with the radius. Participating media, polarised variants, gradients and the film
+    ``specfilm`` are refused by name.
+
+    .. tabs::
+        .. code-tab:: xml
+
+            <integrator type="bdpm">
+                <integer name="bdd" value="0"/>
+                <integer name="max_depth" value="10"/>
+            </integrator>
+
+        .. code-tab:: python
+
+            'type': 'bdpm',
+            'bdd': 0,
+            'max_depth': 10
+    """
+
     def read_parameters(self, parameters):
         self.photon_count = parameters.integer("photon_count", 0, 0, "at least 0 (0: as many as pixels)", high=2 ** 31)
         self.initial_radius = parameters.number("initial_radius", 0.0, lambda r: 0 <= r < float("inf"),
@@ -57,7 +121,7 @@ class BDPMSession(IterativeSession):
         self.has_caustics = not self.lights.dark and caustic_sources and (depth < 0 or depth >= 3)
         self.has_indirect = not self.lights.dark and (depth < 0 or depth >= integrator.bdd + 3)
         self.one_vertex = not self.traits.has_mixed and (integrator.bdd == 0 or not self.has_caustics)
-        self.photon_capacity = 4 * self.light_paths
+        self.photon_capacity = 3 * self.light_paths
         self.vertex_capacity = self._vertex_room(self.chunk)
         self.radii = {kind: integrator.initial_radius for kind in self.kinds()} if integrator.initial_radius else None
         self.corrected = {kind: False for kind in self.kinds()}
@@ -154,14 +218,14 @@ class BDPMSession(IterativeSession):
     # ------------------------------------------------------------------ iterations
 
     def _photons(self, iteration, spectral):
-        """An iteration's photons. Where they overflow the buffers, these grow and the pass runs again; after the first pass they
-        take the size that was needed, with some room."""
+        """An iteration's photons. Where they overflow the buffers, these grow and the pass runs again; after a first pass that
+        needs less than half of them, they shrink to what was needed, with some room."""
         while True:
             photons = self._light_pass(self.scene, self.sensor, self._tables, self._seed(iteration, LIGHT), spectral)
             dr.eval(photons)
             found = int(photons[2][0])
             room = found + found // 8 + 1024
-            if found <= self.photon_capacity and (self._sized or room >= self.photon_capacity):
+            if found <= self.photon_capacity and (self._sized or 2 * room > self.photon_capacity):
                 return photons
             self._sized = True
             self.photon_capacity = room

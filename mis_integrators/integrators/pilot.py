@@ -14,14 +14,14 @@ from ..transport.gather import mean_photon_count
 from ..transport.radius import best_radius, ladder
 from ..transport.recording import frozen
 
-PILOT_PIXELS = 8192
-FEWEST_ITERATIONS, MOST_ITERATIONS = 5, 16
+PILOT_PIXELS = 4096
+FEWEST_ITERATIONS, MOST_ITERATIONS = 4, 16
 PILOT_SHARE = 0.04
 """Share of the planned iterations that the pilot may have."""
 PILOT_INDEX = 1 << 30
 """Iteration numbers of the pilot start here, so that its random numbers are its own."""
 UNPLANNED_ITERATIONS = 64
-MOST_PHOTONS = 500
+MOST_PHOTONS = 256
 """Photons a vertex within the largest radius that is tried."""
 GATHER_COST = 0.055
 """Cost of one gathered photon a vertex, in units of an iteration's light and camera passes (measured on the Cornell box)."""
@@ -55,8 +55,10 @@ def choose_radii(session):
         dr.eval(session._iteration(PILOT_INDEX))
         dr.sync_thread()
         seconds = time.perf_counter() - start
+    decided = dict(session.corrected)
     pilot.decide(max((1 - PILOT_SHARE) * session.seconds / seconds * pilot.cost_of_choice(), 1))
-    session._freeze()
+    if session.corrected != decided:
+        session._freeze()
 
 
 class Pilot:

@@ -25,6 +25,8 @@ PILOT_PATHS = 65536
 PILOT_BOUNCES = 4
 PASS_THROUGH = 8
 """Transmissive surfaces that the pilot's visibility test looks straight through (panes, masks)."""
+LEVEL_SHARES = (0.3, 0.3, 0.2, 0.2)
+"""Shares of the position histogram at full, half, quarter and eighth resolution."""
 FEWEST_RECORDS = 64
 FOCUS_TAIL = 0.01
 """Share of the records' weight that may lie outside the focus, at each end of each axis."""
@@ -51,6 +53,22 @@ def cell_direction(cell, sample):
     sin_phi, cos_phi = dr.sincos(phi)
     radius = dr.safe_sqrt(1 - z * z)
     return mi.Vector3f(radius * cos_phi, radius * sin_phi, z)
+
+
+def _smoothed(grids):
+    """Square histograms (rows, n, n) mixed with coarser versions of themselves, so that a cell that the pilot happened to miss
+    beside cells that it met is not left to the plain density (whose few samples would carry huge flux)."""
+    rows, n, _ = grids.shape
+    result = LEVEL_SHARES[0] * grids
+    for level, share in enumerate(LEVEL_SHARES[1:], start=1):
+        size = 1 << level
+        coarse = grids.reshape(rows, n // size, size, n // size, size).sum(axis=(2, 4))
+        padded = np.pad(coarse, ((0, 0), (1, 1), (1, 1)))
+        m = n // size
+        spread = sum(padded[:, i:i + m, j:j + m] for i in range(3) for j in range(3)) / 9
+        mixed = (0.5 * coarse + 0.5 * spread) / size ** 2
+        result = result + share * np.repeat(np.repeat(mixed, size, axis=1), size, axis=2)
+    return result
 
 
 def _weighted_box(points, weights, tail):
@@ -136,10 +154,7 @@ class EnvironmentGuide:
             cell, inside = np.array(cell), np.array(inside)
             keep = useful & inside
             np.add.at(pmf, (row[keep], cell[keep]), weight[keep])
-        grid = pmf.reshape(-1, POSITION_CELLS, POSITION_CELLS)
-        padded = np.pad(grid, ((0, 0), (1, 1), (1, 1)))
-        spread = sum(padded[:, i:i + POSITION_CELLS, j:j + POSITION_CELLS] for i in range(3) for j in range(3))
-        pmf = (grid + 0.25 * spread).reshape(self.row_count, cells)
+        pmf = _smoothed(pmf.reshape(-1, POSITION_CELLS, POSITION_CELLS)).reshape(self.row_count, cells)
         total = pmf.sum(axis=1)
         self._learn_directions(row, tested, reached)
         pmf /= np.maximum(total, 1e-300)[:, None]

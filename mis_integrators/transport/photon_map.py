@@ -14,14 +14,19 @@ from .light_pass import photon_words
 from .packing import bits_float, unpack_caustic
 
 def table_size(capacity):
-    """Table entries (a power of two) for `capacity` photons: four or more each, so that small grids fit."""
-    return 1 << max(10, min(24, (4 * max(capacity, 2) - 1).bit_length()))
+    """Table entries (a power of two) for `capacity` photons: two or more each, so that small grids fit."""
+    return 1 << max(10, min(24, (2 * max(capacity, 2) - 1).bit_length()))
+
+
+def longest_row(size):
+    """Cells that a row may have: the table goes on for as many entries, so that no row wraps around within itself."""
+    return size // 4
 
 
 def smallest_cell(bbox, capacity):
     """The smallest cell size with which a row of cells still fits into the table."""
     extent = float(bbox.max.x - bbox.min.x)
-    return extent / (table_size(capacity) - 8)
+    return extent / (longest_row(table_size(capacity)) - 8)
 
 
 class Grid:
@@ -66,8 +71,8 @@ def build_photon_map(surface, power, count, bbox, cell, capacity: int, kind: str
         active &= unpack_caustic(record.w) == (kind == "caustic")
     p = mi.Point3f(bits_float(record.x), bits_float(record.y), bits_float(record.z))
     coordinates = grid.coordinates(p)
-    slot = grid.row(coordinates.y, coordinates.z) + dr.minimum(mi.UInt32(coordinates.x), size - 4)
-    counts = dr.zeros(mi.UInt32, 2 * size)
+    slot = grid.row(coordinates.y, coordinates.z) + dr.minimum(mi.UInt32(coordinates.x), longest_row(size) - 4)
+    counts = dr.zeros(mi.UInt32, size + longest_row(size))
     rank = dr.scatter_inc(counts, slot, active)
     dr.eval(counts, rank, slot)
     start = dr.prefix_sum(counts)
@@ -117,7 +122,7 @@ def for_each_photon(photon_map, p, radius, active, visit, state):
     rows_z = mi.UInt32(mi.Int32(dr.floor(local.z + reach)) + 3 - first_z)
     rows = dr.select(active, rows_y * rows_z, 0)
     radius_squared = dr.square(radius)
-    size = grid.size
+    longest = longest_row(grid.size)
 
     def enter_row(row, index, end, y, z):
         y, z = first_y + mi.Int32(row % rows_y), first_z + mi.Int32(row // rows_y)
@@ -126,8 +131,8 @@ def for_each_photon(photon_map, p, radius, active, visit, state):
         distance_z = dr.maximum(dr.maximum(low_z - local.z, local.z - low_z - 1), 0)
         left = dr.square(reach) - dr.square(distance_y) - dr.square(distance_z)
         half = dr.safe_sqrt(left) + 1e-3
-        first_x = dr.clip(mi.Int32(dr.floor(local.x - half)) + 2, 0, size - 4)
-        last_x = dr.clip(mi.Int32(dr.floor(local.x + half)) + 2, -1, size - 4)
+        first_x = dr.clip(mi.Int32(dr.floor(local.x - half)) + 2, 0, longest - 4)
+        last_x = dr.clip(mi.Int32(dr.floor(local.x + half)) + 2, -1, longest - 4)
         base = grid.row(y, z)
         near = (left > -1e-3) & (last_x >= first_x)
         index = dr.gather(mi.UInt32, photon_map.start, base + mi.UInt32(first_x), near)
