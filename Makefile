@@ -1,12 +1,13 @@
 # make render   set everything up, then render a bundled scene into out/
 # make test     set everything up, then run the tests
 # make bench    set everything up, then measure the throughput
+# make gallery  set everything up, then render the pictures of docs/ (minutes)
 
 PYTHON ?= python3
 VENV := .venv
 SETUP := tools/setup.sh
 
-.PHONY: render test bench clean
+.PHONY: render test bench gallery clean
 .DELETE_ON_ERROR:
 
 render: $(VENV)/installed
@@ -15,6 +16,11 @@ render: $(VENV)/installed
 
 test: $(VENV)/installed-test
 	$(VENV)/bin/python -m pytest
+
+gallery: $(VENV)/installed
+	@mkdir -p docs/images out
+	@for scene in scenes/*.xml; do name=$$(basename $$scene .xml); \
+	    $(VENV)/bin/mis-render $$scene -i bdpm -P bdd=0 --time 60 -o out/$$name.exr && cp out/$$name.png docs/images/ || exit 1; done
 
 bench: $(VENV)/installed
 	$(VENV)/bin/python benchmarks/run.py throughput

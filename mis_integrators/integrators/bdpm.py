@@ -204,6 +204,8 @@ class BDPMSession(IterativeSession):
             if self.corrected[kind]:
                 gathered *= dr.rcp(self._covered(scene, vertices, radius, seed))
             radiance += self._per_path(gathered, vertices, self.chunk)
+        if self.integrator.hide_emitters:
+            radiance = dr.select(alpha > 0, radiance, 0)       # as `path` does: what is behind nothing but null surfaces is hidden
         active = dr.arange(mi.UInt32, self.chunk) + first < self.path_count
         return splat_samples(sensor.film(), position, radiance, alpha, spectral["matrix"], active), count
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..transport.film import Accumulator, variance_channels
 from ..transport.random import mix
-from ..transport.traits import UnsupportedScene, check_scene
+from ..transport.traits import UnsupportedScene, check_scene, check_variant
 from .parameters import Parameters
 
 
@@ -67,13 +67,12 @@ class IterativeIntegrator(mi.AdjointIntegrator):
                              f'{self.camera_paths}')
         return self.new_session(scene, sensor, _scalar(seed), iterations)
 
-    @staticmethod
-    def _sensor(scene, sensor):
+    def _sensor(self, scene, sensor):
+        check_variant(scene, self.plugin)
         if isinstance(sensor, int):
-            sensors = scene.sensors() if isinstance(scene, mi.Scene) else []
+            sensors = scene.sensors()
             if not 0 <= sensor < len(sensors):
-                raise UnsupportedScene(f"the scene has {len(sensors)} sensors under variant {mi.variant()}; sensor {sensor} "
-                                       "does not exist")
+                raise UnsupportedScene(f"{self.plugin}: the scene has {len(sensors)} sensors; sensor {sensor} does not exist")
             return sensors[sensor]
         return sensor
 

@@ -50,11 +50,10 @@ def choose_radii(session):
     pilot.decide(count)
     if session.seconds is None:
         return
-    for _ in range(2):                                         # the first run records the passes
-        start = time.perf_counter()
-        dr.eval(session._iteration(PILOT_INDEX))
-        dr.sync_thread()
-        seconds = time.perf_counter() - start
+    start = time.perf_counter()
+    dr.eval(session._iteration(PILOT_INDEX))
+    dr.sync_thread()
+    seconds = time.perf_counter() - start
     decided = dict(session.corrected)
     pilot.decide(max((1 - PILOT_SHARE) * session.seconds / seconds * pilot.cost_of_choice(), 1))
     if session.corrected != decided:

@@ -14,7 +14,9 @@ SAME_SURFACE_COSINE = 0.7
 """Photons merge only with vertices whose geometric normals differ by less than 45 degrees."""
 SAME_SURFACE_OFFSET = 0.5
 """... and that lie closer than this share of the radius along the normal (steps, thin objects)."""
-SMALLEST_COSINE = 1e-3
+SAME_PLANE_COSINE_SQUARED = 0.9999
+LARGEST_COSINE_RATIO = 4.0
+"""Bound on shading over geometric cosine of a photon's direction, which grazing light on smoothed meshes would exceed."""
 
 
 def gather_photons(traits, photon_map, vertices, radii, wavelengths, light_paths, max_depth: int, only_last: bool,
@@ -23,7 +25,8 @@ def gather_photons(traits, photon_map, vertices, radii, wavelengths, light_paths
     (ascending; each of width one, or one a vertex), from one visit of the photons within the largest.
 
     Constant kernel on a disk: the sum over photons of f x flux, over (pi radius^2 x light sub-paths). Flux through the surface
-    carries the geometric cosine, `path`'s scattering integral the shading one, hence the ratio of the two at each photon.
+    carries the geometric cosine where the photon landed, `path`'s scattering integral the shading one at the vertex, hence the
+    ratio of the two.
     Returns a list with a `Spectrum` of the vertices' width for each radius, throughput included; with `grey` the mean over its
     channels (fewer sums to keep for many radii).
     """
@@ -58,13 +61,17 @@ def gather_photons(traits, photon_map, vertices, radii, wavelengths, light_paths
             towards = dr.normalize(towards)
         wo = si.to_local(towards)                         # a Lambertian needs only the ratio of its cosines
         cosine = dr.dot(si.n, towards)
+        length_squared = dr.squared_norm(normal)
+        flat = dr.square(alike) > SAME_PLANE_COSINE_SQUARED * length_squared       # then without the stored normal's rounding
+        landing = dr.select(flat, dr.abs(cosine), dr.abs(dr.dot(normal, towards)) * dr.rsqrt(length_squared))
+        landing = dr.maximum(dr.maximum(landing, dr.abs(wo.z) * (1 / LARGEST_COSINE_RATIO)), 1e-6)
         value = mi.Spectrum(0)
         if traits.has_lambertian:
             front = (wo.z * facing > 0) & (cosine * geometric_side > 0)
             value = mi.Spectrum(dr.select(front & lambertian, dr.abs(wo.z), 0))
         if traits.has_rough:
             value = dr.select(lambertian, value, bsdf.eval(context, si, wo, hit & ~lambertian))
-        value *= flux * dr.rcp(dr.maximum(dr.abs(cosine), SMALLEST_COSINE))
+        value *= flux * dr.rcp(landing)
         if grey:
             value = dr.mean(value * factor)
         height = dr.abs(dr.dot(offset, si.n))

@@ -110,14 +110,18 @@ class SceneTraits:
         self.has_light_surfaces = any(not (e.flags() & delta) for e in scene.emitters())
 
 
+def check_variant(scene, plugin):
+    """Raises `UnsupportedScene` if `scene` belongs to another variant than the active one."""
+    if not isinstance(scene, mi.Scene):
+        raise UnsupportedScene(f'{plugin}: the scene was loaded under another variant than the active one '
+                               f'({mi.variant()}); load it again after mi.set_variant()')
+
+
 def check_scene(scene, sensor, plugin):
     """Raises `UnsupportedScene` for what the surface integrators cannot render, before any sampling."""
     if mi.is_polarized:
         raise UnsupportedScene(f'{plugin}: polarised variants are not supported (active: {mi.variant()}); use an unpolarised '
                                'one such as "llvm_ad_rgb"')
-    if not isinstance(scene, mi.Scene):
-        raise UnsupportedScene(f'{plugin}: the scene was loaded under another variant than the active one '
-                               f'({mi.variant()}); load it again after mi.set_variant()')
     objects = scene_objects(scene)
     if any(isinstance(o, mi.Medium) for o in objects) or any(s.is_medium_transition() for s in scene.shapes()):
         raise UnsupportedScene(f'{plugin}: participating media are not supported by this surface integrator; use "volpath"')
