@@ -117,11 +117,12 @@ class BDPMSession(IterativeSession):
         self.chunks = -(-self.path_count // CAMERA_CHUNK)
         self.chunk = -(-self.path_count // self.chunks)
         depth = integrator.max_depth
-        caustic_sources = self.traits.has_delta or self.lights.needs_photons_for_direct_light()
-        self.has_caustics = not self.lights.dark and caustic_sources and (depth < 0 or depth >= 3)
+        unreachable = self.lights.needs_photons_for_direct_light()
+        self.has_caustics = not self.lights.dark and ((unreachable and (depth < 0 or depth >= 2)) or
+                                                      (self.traits.has_delta and (depth < 0 or depth >= 3)))
         self.has_indirect = not self.lights.dark and (depth < 0 or depth >= integrator.bdd + 3)
         self.one_vertex = not self.traits.has_mixed and (integrator.bdd == 0 or not self.has_caustics)
-        self.photon_capacity = 3 * self.light_paths
+        self.photon_capacity = _rounded_up(3 * self.light_paths)
         self.vertex_capacity = self._vertex_room(self.chunk)
         self.radii = {kind: integrator.initial_radius for kind in self.kinds()} if integrator.initial_radius else None
         self.corrected = {kind: False for kind in self.kinds()}
@@ -226,8 +227,8 @@ class BDPMSession(IterativeSession):
             photons = self._light_pass(self.scene, self.sensor, self._tables, self._seed(iteration, LIGHT), spectral)
             dr.eval(photons)
             found = int(photons[2][0])
-            room = found + found // 8 + 1024
-            if found <= self.photon_capacity and (self._sized or 2 * room > self.photon_capacity):
+            room = _rounded_up(found + found // 8 + 1024)
+            if found <= self.photon_capacity and (self._sized or 2 * room >= self.photon_capacity):
                 return photons
             self._sized = True
             self.photon_capacity = room
@@ -247,10 +248,16 @@ class BDPMSession(IterativeSession):
                                                  spectral, radii)
                 if self.one_vertex or int(count[0]) <= self.vertex_capacity:
                     break
-                self.vertex_capacity = int(count[0]) + int(count[0]) // 4
+                self.vertex_capacity = _rounded_up(int(count[0]) + int(count[0]) // 8)
                 self._freeze()
             total = block if total is None else total + block
         return total
+
+
+def _rounded_up(count):
+    """The next of 4, 5, 6, 7, 8, 10, 12, ...: few different buffer sizes, for they are literals of cached kernels."""
+    step = 1 << max(count.bit_length() - 3, 0)
+    return -(-count // step) * step
 
 
 LIGHT, CAMERA, WAVELENGTH = range(3)

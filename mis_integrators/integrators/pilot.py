@@ -15,16 +15,18 @@ from ..transport.radius import best_radius, ladder
 from ..transport.recording import frozen
 
 PILOT_PIXELS = 4096
-FEWEST_ITERATIONS, MOST_ITERATIONS = 4, 16
+FEWEST_ITERATIONS, FEWEST_TIMED_ITERATIONS, MOST_ITERATIONS = 4, 3, 16
 PILOT_SHARE = 0.04
-"""Share of the planned iterations that the pilot may have."""
+"""Share of the planned iterations, or seconds, that the pilot may have once it has the fewest."""
 PILOT_INDEX = 1 << 30
 """Iteration numbers of the pilot start here, so that its random numbers are its own."""
 UNPLANNED_ITERATIONS = 64
-MOST_PHOTONS = 256
+MOST_PHOTONS = 160
 """Photons a vertex within the largest radius that is tried."""
 GATHER_COST = 0.055
 """Cost of one gathered photon a vertex, in units of an iteration's light and camera passes (measured on the Cornell box)."""
+ROUGH_GATHER_COST = 0.15
+"""The same where photons need the BSDF evaluated (measured on the textured scene)."""
 PROBE_COST = 0.7
 """Cost of the coverage probes, in the same units."""
 USUAL_PHOTONS = 10
@@ -38,24 +40,29 @@ def choose_radii(session):
         return
     pilot = Pilot(session)
     count = session.iterations_planned or UNPLANNED_ITERATIONS
-    wanted = PILOT_SHARE * count
+    started = time.perf_counter()
     for done in range(MOST_ITERATIONS):
         start = time.perf_counter()
         pilot.iterate(done)
-        seconds = time.perf_counter() - start                  # of the last: the first ones compile
+        now = time.perf_counter()
         if session.seconds is not None:
-            wanted = PILOT_SHARE * session.seconds / seconds
-        if done + 1 >= max(wanted, FEWEST_ITERATIONS) or pilot.ladder is None:
+            over = now - started > PILOT_SHARE * session.seconds and done + 1 >= FEWEST_TIMED_ITERATIONS
+        else:
+            over = done + 1 >= max(PILOT_SHARE * count, FEWEST_ITERATIONS)
+        if over or pilot.ladder is None:
             break
     pilot.decide(count)
     if session.seconds is None:
         return
-    start = time.perf_counter()
-    dr.eval(session._iteration(PILOT_INDEX))
-    dr.sync_thread()
-    seconds = time.perf_counter() - start
+    seconds = now - start                                      # a pilot iteration takes about as long as one of the render
+    if now - started < 2 * PILOT_SHARE * session.seconds:
+        start = time.perf_counter()
+        dr.eval(session._iteration(PILOT_INDEX))
+        dr.sync_thread()
+        seconds = time.perf_counter() - start
+    left = session.seconds - (time.perf_counter() - started)
     decided = dict(session.corrected)
-    pilot.decide(max((1 - PILOT_SHARE) * session.seconds / seconds * pilot.cost_of_choice(), 1))
+    pilot.decide(max(left / seconds * pilot.cost_of_choice(), 1))
     if session.corrected != decided:
         session._freeze()
 
@@ -131,7 +138,8 @@ class Pilot:
 
     def _cost(self, kind, corrected, radius):
         photons = self.photons[kind] * (radius / self.ladder[-1]) ** 2
-        return (1 + GATHER_COST * photons + PROBE_COST * corrected) / (1 + GATHER_COST * USUAL_PHOTONS)
+        price = ROUGH_GATHER_COST if self.session.traits.has_rough else GATHER_COST
+        return (1 + price * photons + PROBE_COST * corrected) / (1 + price * USUAL_PHOTONS)
 
     def cost_of_choice(self):
         """Relative cost of an iteration with the session's radii."""

@@ -68,6 +68,11 @@ def _mean_power(emitter):
     return float(value) if np.isfinite(value) and value > 0 else 0.0
 
 
+def _invariant_key(emitter):
+    shape = emitter.get_shape()
+    return emitter.class_name(), str(emitter), str(shape.bbox()) if shape is not None else ""
+
+
 class Lights:
     """All emitters of a scene, chosen by power.
 
@@ -76,13 +81,16 @@ class Lights:
 
     def __init__(self, scene, plugin="bdpm", guide=None):
         self.scene = scene
-        self.emitters = scene.emitters()
+        # Mitsuba loads a scene's objects in parallel, in no fixed order; random numbers must not depend on it.
+        order = sorted(range(len(scene.emitters())), key=lambda i: _invariant_key(scene.emitters()[i]))
+        self.emitters = [scene.emitters()[i] for i in order]
+        self.order = mi.UInt32(order)
         self.guide = guide
         self.has_textured = any(_is_textured_area(e) for e in self.emitters)
         self.kinds = [self._kind(e, plugin) for e in self.emitters]
         power = np.array([_mean_power(e) for e in self.emitters])
         if guide is not None:
-            power = guide.useful_power(power)
+            power = guide.useful_power(power[np.argsort(order)])[order]
         self.emission_power = power
         self.total_power = power.sum()
         if not self.emitters:
@@ -102,7 +110,7 @@ class Lights:
 
     def tables(self):
         """Every evaluated array that the sampling routines read, for `dr.freeze` to track."""
-        arrays = [getattr(self, name) for name in ("numbers", "kind_table", "_spot_axis", "_spot_cosine",
+        arrays = [getattr(self, name) for name in ("order", "numbers", "kind_table", "_spot_axis", "_spot_cosine",
                                                      "_sphere_center", "_sphere_sign") if hasattr(self, name)]
         if self.emitters and self.choice.count > 1:
             arrays += [self.choice._pmf, self.choice._cdf]
@@ -159,11 +167,14 @@ class Lights:
             ps.n = dr.select(sign != 0, mi.Normal3f(dr.normalize(ps.p - center) * sign), ps.n)
         return ps
 
+    def _scene_index(self, index):
+        return dr.gather(mi.UInt32, self.order, index)
+
     def pointer(self, index):
         """Emitter pointers for an index array (a literal, so that calls need no dispatch, if there is one emitter)."""
         if len(self.emitters) == 1:
             return mi.EmitterPtr(self.emitters[0])
-        return dr.gather(mi.EmitterPtr, self.scene.emitters_dr(), index)
+        return dr.gather(mi.EmitterPtr, self.scene.emitters_dr(), self._scene_index(index))
 
     # ------------------------------------------------------------------ direct light
 
@@ -289,12 +300,14 @@ class Lights:
     def _emit_directional(self, emitter, index, sample_a, sample_b, extra, time, wavelengths, active):
         it = self._reference(self.guide.center, time, wavelengths)
         ds, irradiance = emitter.sample_direction(it, mi.Point2f(0.5), active)
-        o, pdf = self.guide.sample_position(ds.d, self.guide.row_of_emitter(index), sample_a, sample_b, extra, active)
+        row = self.guide.row_of_emitter(self._scene_index(index))
+        o, pdf = self.guide.sample_position(ds.d, row, sample_a, sample_b, extra, active)
         return o, -ds.d, irradiance * dr.rcp(pdf)
 
     def _emit_environment(self, emitter, index, sample_a, sample_b, extra, time, wavelengths, active):
         it = self._reference(self.guide.center, time, wavelengths)
-        towards, pdf_direction, row, extra = self.guide.sample_direction(emitter, index, it, sample_a, extra, active)
+        towards, pdf_direction, row, extra = self.guide.sample_direction(
+            emitter, self._scene_index(index), it, sample_a, extra, active)
         o, pdf_position = self.guide.sample_position(towards, row, sample_b, None, extra, active)
         si = dr.zeros(mi.SurfaceInteraction3f)
         si.wi = -towards

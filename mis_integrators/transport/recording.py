@@ -25,7 +25,7 @@ def frozen(function):
 
     Evaluated arrays that `function` reads must be among its arguments, and numbers that change from call to call must be
     opaque arrays. Nothing inside may read an array's value. Where Dr.Jit cannot record (some nested virtual calls of spectral
-    textures) the function runs as it is, with the same result and some more Python.
+    textures, sensors with a response function) the function runs as it is, with the same result and some more Python.
     """
     recorded = dr.freeze(function)
     fresh, plain = True, False
@@ -41,10 +41,8 @@ def frozen(function):
             with _no_garbage_collection():
                 return recorded(*args)
         except RuntimeError as error:
-            if "while recording a frozen function" not in str(error):
-                raise
             mi.Log(mi.LogLevel.Debug, f"not recorded: {error.__cause__ or error}")
             plain = True
-            return function(*args)
+            return function(*args)        # raises again what is not the recording's fault
 
     return call
