@@ -28,3 +28,15 @@ def _activate(variant: str) -> str:
             pytest.skip(f"no CUDA here: {error}")
     mi.set_variant(variant)
     return variant
+
+
+def pytest_configure(config):
+    config.addinivalue_line("markers", "full: the full product of cases, hours of it; left out unless asked for with -m full")
+
+
+def pytest_collection_modifyitems(config, items):
+    if config.option.markexpr:
+        return
+    left_out = [item for item in items if item.get_closest_marker("full")]
+    config.hook.pytest_deselected(items=left_out)
+    items[:] = [item for item in items if not item.get_closest_marker("full")]

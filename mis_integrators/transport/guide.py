@@ -25,7 +25,7 @@ PILOT_PATHS = 65536
 PILOT_BOUNCES = 4
 PASS_THROUGH = 8
 """Transmissive surfaces that the pilot's visibility test looks straight through (panes, masks)."""
-LEVEL_SHARES = (0.3, 0.3, 0.2, 0.2)
+LEVEL_SHARES = (0.55, 0.25, 0.1, 0.1)
 """Shares of the position histogram at full, half, quarter and eighth resolution."""
 FEWEST_RECORDS = 64
 FOCUS_TAIL = 0.01

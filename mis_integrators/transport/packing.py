@@ -56,7 +56,7 @@ def unpack_direction(u):
 
 
 def pack_surface(normal, depth, caustic):
-    """A surface normal (11 bits an axis, error below 0.002 radians), a path depth (9 bits, saturated at `MAX_DEPTH`) and the
+    """A surface normal (11 bits an axis, error below 0.0025 radians), a path depth (9 bits, saturated at `MAX_DEPTH`) and the
     photon's kind (1 bit: caustic or not) in one uint32."""
     bits = _SURFACE_NORMAL_BITS
     x, y = _octahedral(normal)

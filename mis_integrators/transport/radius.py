@@ -33,8 +33,10 @@ def ladder(points, weights):
 
 
 def relative_weights(mean):
-    """Weights 1 / (mean^2 + 0.1 <mean>^2) of squared errors: relative error, without letting dark pixels rule."""
-    return 1 / (mean ** 2 + 0.1 * np.mean(mean) ** 2 + 1e-30)
+    """Weights 1 / (mean^2 + 0.1 <mean>^2) of squared errors: relative error, without letting dark pixels rule. The overall mean <mean>
+    leaves out the brightest twentieth (visible lamps)."""
+    usual = np.mean(np.minimum(mean, np.quantile(mean, 0.95)))
+    return 1 / (mean ** 2 + 0.1 * usual ** 2 + 1e-30)
 
 
 def noise_and_difference(samples, weights):
@@ -44,6 +46,7 @@ def noise_and_difference(samples, weights):
     """
     m = samples.shape[0]
     variance = np.mean(weights * samples.var(axis=0, ddof=1), axis=1)
+    variance = np.maximum.accumulate(variance[::-1])[::-1]               # a larger disk is never noisier; rare bright photons say so
     steps = np.diff(samples, axis=1)                                      # (m, radii - 1, pixels)
     pairs = weights * (steps.sum(axis=0) ** 2 - (steps ** 2).sum(axis=0)) / (m * (m - 1))
     difference = np.concatenate([[0.0], pairs.mean(axis=1)])

@@ -1,0 +1,115 @@
+"""Pairs of independent reference images: beside the scene, or made once by long runs and kept for later."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from pathlib import Path
+from typing import Callable
+
+import numpy as np
+import OpenEXR
+
+import mis_integrators
+from mis_integrators.output import write_exr
+from errors import References
+from methods import Method, SessionMaker, parse_method
+from scene_files import OpenScene, fingerprint
+
+COLOURS = ("R", "G", "B")
+
+BEYOND_PATH = {
+    "caustics": "bdpm:bdd=0,initial_radius=0.005,photon_count=200000",
+    "sds": "bdpm:bdd=0,initial_radius=0.005,photon_count=200000",
+}
+"""Bundled scenes that path cannot render in reasonable time, and what makes their references: the blur of
+that radius is smaller than a pixel's image on the surfaces."""
+
+
+def add_options(command: argparse.ArgumentParser) -> None:
+    """The options that ``find_references`` reads."""
+    command.add_argument("--references", type=Path, default=Path("out/references"), metavar="DIR",
+                         help="where references are kept that do not lie beside the scene "
+                         "(default: out/references)")
+    command.add_argument("--reference-time", type=float, default=60, metavar="SECONDS",
+                         help="rendering seconds of each of the two references (default: 60)")
+    command.add_argument("--reference-method", type=parse_method, metavar="PLUGIN[:...]",
+                         help="what renders them (default: path, or for the scenes that it cannot do bdpm "
+                         "with a radius below the pixels' size)")
+
+
+def find_references(
+    opened: OpenScene, options: argparse.Namespace, tell: Callable[[str], None]
+) -> References:
+    """References beside the scene (``NAME.exr`` and ``NAME_2.exr``, if of the film's size), else those kept
+    from an earlier run, else new ones, which are then kept. ``options``: see ``add_options``."""
+    method = options.reference_method or parse_method(BEYOND_PATH.get(opened.name, "path"))
+    directory, seconds = options.references, options.reference_time
+    beside = _paths(opened.path.parent, opened.path.stem)
+    if all(path.exists() for path in beside):
+        images = [read_colours(path) for path in beside]
+        if all(image.shape[1::-1] == opened.size for image in images):
+            return References(*images, origin="beside the scene", noisy=False)
+    width, height = opened.size
+    kept = _paths(directory, f"{opened.name}_{width}x{height}")
+    record = kept[0].with_suffix(".json")
+    made_with = {
+        "scene": opened.name,
+        "fingerprint": fingerprint(opened.path),
+        "size": [width, height],
+        "method": method.label,
+        "inherited": opened.inherited,
+        "seconds_at_least": seconds,
+    }
+    if not _usable(record, made_with):
+        directory.mkdir(parents=True, exist_ok=True)
+        iterations = _make(opened, method, seconds, kept, tell)
+        made_with |= {"iterations": iterations, "version": mis_integrators.__version__}
+        record.write_text(json.dumps(made_with, indent=1) + "\n")
+    return References(*(read_colours(path) for path in kept), origin=method.label, noisy=True)
+
+
+def read_colours(path: Path) -> np.ndarray:
+    """The colour channels of an EXR file as (H, W, 3)."""
+    with OpenEXR.File(str(path), separate_channels=True) as file:
+        channels = file.channels()
+        return np.stack([channels[name].pixels for name in COLOURS], axis=-1).astype(np.float32)
+
+
+def colours(session) -> np.ndarray:
+    """The colour channels of a session's image so far as (H, W, 3)."""
+    image = session.image()
+    return image[..., [session.channels.index(name) for name in COLOURS]]
+
+
+def _paths(directory: Path, name: str) -> list[Path]:
+    return [directory / f"{name}.exr", directory / f"{name}_2.exr"]
+
+
+def _usable(record: Path, made_with: dict) -> bool:
+    """Whether kept references were made in this way, or in a longer run."""
+    if not record.exists():
+        return False
+    kept = json.loads(record.read_text())
+    long_enough = kept["seconds_at_least"] >= made_with["seconds_at_least"]
+    same = {**kept, **made_with, "seconds_at_least": kept["seconds_at_least"]} == kept
+    return long_enough and same
+
+
+def _make(
+    opened: OpenScene, method: Method, seconds: float, paths: list[Path], tell: Callable[[str], None]
+) -> list[int]:
+    """Render the references; returns the iterations of each."""
+    maker = SessionMaker(method, opened, seconds)
+    counts = []
+    for number, path in enumerate(paths):
+        session = maker.make(seed=1_000_003 + number)
+        start = time.perf_counter()
+        while session.iterations == 0 or time.perf_counter() - start < seconds:
+            session.iterate()
+            spent = time.perf_counter() - start
+            tell(f"reference {number + 1} of {opened.name}: {spent:.0f} of {seconds:g} s")
+        write_exr(path, colours(session), COLOURS, {"method": method.label})
+        counts.append(session.iterations)
+    return counts

@@ -1,0 +1,83 @@
+"""What a benchmark leaves: a table in the terminal, and the rows as CSV and JSON with the machine."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import platform
+import time
+from pathlib import Path
+from typing import Mapping, Sequence
+
+import drjit as dr
+import mitsuba as mi
+from rich.console import Console
+from rich.table import Table
+
+import mis_integrators
+
+Row = Mapping[str, str | int | float | None]
+
+console = Console(highlight=False)
+
+
+def show(title: str, rows: Sequence[Row], columns: Sequence[str] | None = None) -> None:
+    """Print rows as a table; ``columns`` picks some (default: all)."""
+    if not rows:
+        return
+    names = list(columns or rows[0])
+    table = Table(title=title, title_justify="left")
+    for name in names:
+        table.add_column(name, justify="left" if isinstance(rows[0][name], str) else "right")
+    for row in rows:
+        table.add_row(*(_text(row[name]) for name in names))
+    console.print(table)
+
+
+def save(directory: Path, name: str, rows: Sequence[Row], settings: Mapping) -> None:
+    """Write ``NAME.csv`` and ``NAME.json``, the latter with the settings and the machine."""
+    directory.mkdir(parents=True, exist_ok=True)
+    with open(directory / f"{name}.csv", "w", newline="") as file:
+        writer = csv.DictWriter(file, fieldnames=list(rows[0]) if rows else [])
+        writer.writeheader()
+        writer.writerows(rows)
+    document = {"settings": settings, "machine": machine(), "rows": rows}
+    (directory / f"{name}.json").write_text(json.dumps(document, indent=1, default=str) + "\n")
+
+
+def machine() -> dict[str, str | int]:
+    """What the figures depend on besides the code."""
+    return {
+        "date": time.strftime("%Y-%m-%d %H:%M"),
+        "processor": _processor(),
+        "threads": dr.thread_count(),
+        "cores": os.cpu_count() or 0,
+        "python": platform.python_version(),
+        "mitsuba": mi.__version__,
+        "drjit": dr.__version__,
+        "variant": mi.variant(),
+        "mis_integrators": mis_integrators.__version__,
+    }
+
+
+def tell(text: str) -> None:
+    """Show progress: over the last line on a terminal, nothing elsewhere."""
+    if console.is_terminal:
+        console.print(f"{text:<100}", end="\r")
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor()
+    return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), "")
+
+
+def _text(value: str | int | float | None) -> str:
+    if value is None:
+        return "-"
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    return str(value)
