@@ -188,7 +188,7 @@ def sensor(kind="perspective", **film_options):
         result.update(aperture_radius=0.1, focus_distance=5.8)
     if mi.is_spectral:
         # One iteration has one set of wavelengths; a narrow response takes their noise away, and nothing else.
-        result["srf"] = {"type": "spectrum", "value": [(548, 0.0), (550, 1.0), (560, 1.0), (562, 0.0)]}
+        result["srf"] = {"type": "spectrum", "value": [(554, 0.0), (555, 1.0), (556, 0.0)]}
     return result
 
 

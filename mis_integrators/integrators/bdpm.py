@@ -163,7 +163,7 @@ class BDPMSession(IterativeSession):
         self._camera_pass = frozen(self._render_chunk)
 
     def _trace_light(self, scene, sensor, tables, seed, spectral):
-        return trace_light_paths(scene, self.lights, seed, self.light_paths, self.photon_capacity, spectral["wavelengths"], sensor.shutter_open(), sensor.shutter_open_time(),
+        return trace_light_paths(scene, self.lights, self.traits, seed, self.light_paths, self.photon_capacity, spectral["wavelengths"], sensor.shutter_open(), sensor.shutter_open_time(),
                                  self.integrator.max_depth, self.integrator.rr_depth)
 
     def _trace_camera(self, scene, sensor, seed, first, stride, paths, capacity, spectral):

@@ -33,12 +33,11 @@ class IterativeIntegrator(mi.AdjointIntegrator):
         super().__init__(props)
 
     def read_parameters(self, parameters):
-        """Reads the subclass's own parameters."""
-        raise NotImplementedError
+        """Reads the subclass's own parameters (there need not be any)."""
 
     def new_session(self, scene, sensor, seed, iterations):
-        """The object that runs iterations; see `mis_integrators.session.Session`."""
-        raise NotImplementedError
+        """The object that runs iterations; see `mis_integrators.session.Session`. Every subclass has its own."""
+        raise TypeError(f"{type(self).__name__} does not define new_session")
 
     def aov_names(self):
         return variance_channels() if self.variance else []
@@ -91,10 +90,10 @@ class IterativeIntegrator(mi.AdjointIntegrator):
             return image
 
     def render_forward(self, scene, params, sensor=0, seed=0, spp=0):
-        raise NotImplementedError(f"{self.plugin}: gradients are not supported; use Mitsuba's prb")
+        raise RuntimeError(f"{self.plugin}: gradients are not supported; use Mitsuba's prb")
 
     def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0):
-        raise NotImplementedError(f"{self.plugin}: gradients are not supported; use Mitsuba's prb")
+        raise RuntimeError(f"{self.plugin}: gradients are not supported; use Mitsuba's prb")
 
 
 class IterativeSession:

@@ -21,8 +21,41 @@ PATHS_PER_LANE = 8
 of waiting for the longest path beside it. (A GPU needs the paths side by side.)"""
 
 
+def delta_adjoint(wi, wo, eta):
+    """Ratio of the cosines of `wi` and `wo` to the normal at which a delta function scattered, which a bump or normal map keeps to
+    itself: it lies along wi + eta wo (reflection: eta = 1). One where nothing was deflected."""
+    half = wi + wo * eta
+    ratio = dr.abs(dr.dot(wi, half) / dr.dot(wo, half))
+    return dr.select((dr.squared_norm(half) > 1e-6) & dr.isfinite(ratio), ratio, 1)
+
+
+def sample_perturbed(bsdf, si, bs, delta, weight, rng, active):
+    """Replaces a light sub-path's BSDF sample in scenes whose bump or normal maps perturb normals inside BSDFs.
+
+    The adjoint factor of shading normals is then out of sight, so smooth scattering is evaluated from the camera's side, where
+    light may even leave below the perturbed horizon: half of the directions come from the geometric hemisphere instead.
+    Returns `(bs, delta, weight)`, the weight without the geometric cosines' ratio.
+    """
+    smooth = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+    aside = smooth & (rng.next_float32(active) < 0.5)
+    facing = mi.Vector3f(dr.mulsign(si.n, dr.dot(si.n, si.to_world(si.wi))))
+    towards = mi.Frame3f(facing).to_world(mi.warp.square_to_cosine_hemisphere(next_2d(rng, active)))
+    bs.wo = dr.select(aside, si.to_local(towards), bs.wo)
+    bs.eta = dr.select(aside, 1, bs.eta)
+    delta = delta & ~aside
+    view = mi.SurfaceInteraction3f(si)
+    view.wi = mi.Vector3f(bs.wo)
+    scattered = smooth & ~delta
+    response = bsdf.eval(mi.BSDFContext(), view, si.wi, scattered)
+    own_pdf = bsdf.pdf(mi.BSDFContext(mi.TransportMode.Importance), si, bs.wo, scattered)
+    pdf = 0.5 * (own_pdf + dr.maximum(dr.dot(facing, si.to_world(bs.wo)), 0) * dr.inv_pi)
+    once = dr.select(smooth, 2, mi.Float(1))                     # a delta event of a BSDF with a smooth part too
+    weight = dr.select(delta, weight * (once * delta_adjoint(si.wi, bs.wo, bs.eta)), dr.select(pdf > 1e-9, response / pdf, 0))
+    return bs, delta, weight
+
+
 @dr.syntax
-def trace_light_paths(scene, lights, seed, n_paths: int, capacity: int, wavelengths, shutter_open: float,
+def trace_light_paths(scene, lights, traits, seed, n_paths: int, capacity: int, wavelengths, shutter_open: float,
                       shutter_time: float, max_depth: int, rr_depth: int):
     """Traces `n_paths` light sub-paths and stores photons on surfaces that scatter smoothly.
 
@@ -34,7 +67,8 @@ def trace_light_paths(scene, lights, seed, n_paths: int, capacity: int, waveleng
     Returns `(surface, power, count)`: uint32 arrays with four words a photon (position's bits; normal, depth and kind packed) and
     `photon_words()` words a photon (bits of the flux that one sub-path carries, packed direction to where it came from), in no
     particular order, and the number of photons, of width one. If it exceeds `capacity` the surplus is missing: repeat the pass
-    with more room. Shading normals: Veach 1997, section 5.3 (adjoint factor).
+    with more room. Shading normals: Veach 1997, section 5.3 (adjoint factor); where maps perturb normals inside BSDFs, these are
+    evaluated from the camera's side instead.
     """
     lanes = n_paths
     if dr.hint(dr.backend_v(mi.Float) == dr.JitBackend.LLVM, mode='scalar'):
@@ -96,12 +130,17 @@ def trace_light_paths(scene, lights, seed, n_paths: int, capacity: int, waveleng
         if dr.hint(max_depth > 0, mode='scalar'):
             active &= depth + 2 <= max_depth
         bs, weight = bsdf.sample(context, si, rng.next_float32(active), next_2d(rng, active), active)
+        delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+        if dr.hint(traits.has_perturbed, mode='scalar'):
+            bs, delta, weight = sample_perturbed(bsdf, si, bs, delta, weight, rng, active)
         wo = si.to_world(bs.wo)
         wi_geometric, wo_geometric = dr.dot(si.n, -ray.d), dr.dot(si.n, wo)
         wi_shading, wo_shading = mi.Frame3f.cos_theta(si.wi), mi.Frame3f.cos_theta(bs.wo)
         active &= (wi_geometric * wi_shading > 0) & (wo_geometric * wo_shading > 0)
-        flux *= weight * dr.abs(wi_shading * wo_geometric / (wo_shading * wi_geometric))
-        delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+        adjoint = wo_geometric / wi_geometric
+        if dr.hint(not traits.has_perturbed, mode='scalar'):
+            adjoint *= wi_shading / wo_shading
+        flux *= weight * dr.abs(adjoint)
         had_delta |= delta
         scattered |= ~delta
         eta *= bs.eta

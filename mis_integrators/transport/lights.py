@@ -110,9 +110,11 @@ class Lights:
 
     def tables(self):
         """Every evaluated array that the sampling routines read, for `dr.freeze` to track."""
+        if not self.emitters:
+            return []                  # an empty array among a recording's arguments aborts the process
         arrays = [getattr(self, name) for name in ("order", "numbers", "kind_table", "_spot_axis", "_spot_cosine",
                                                      "_sphere_center", "_sphere_sign") if hasattr(self, name)]
-        if self.emitters and self.choice.count > 1:
+        if self.choice.count > 1:
             arrays += [self.choice._pmf, self.choice._cdf]
         return arrays + (self.guide.tables() if self.guide is not None else [])
 
