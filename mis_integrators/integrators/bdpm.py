@@ -14,7 +14,7 @@ from ..transport.light_pass import trace_light_paths
 from ..transport.lights import Lights
 from ..transport.photon_map import build_photon_map, smallest_cell
 from ..transport.random import mix
-from ..transport.recording import frozen
+from ..transport.recording import recorder
 from ..transport.traits import SceneTraits
 from .common import IterativeIntegrator, IterativeSession
 from .pilot import choose_radii
@@ -128,6 +128,7 @@ class BDPMSession(IterativeSession):
         self.corrected = {kind: False for kind in self.kinds()}
         self.seconds = None
         self._sized = False
+        self.recorded = recorder()
         self._freeze()
 
     def plan_time(self, seconds):
@@ -159,8 +160,8 @@ class BDPMSession(IterativeSession):
     def _freeze(self):
         """Records the passes anew; from the second iteration on, their kernels run without their Python."""
         self._tables = [self.traits.lambertian, *self.lights.tables()]
-        self._light_pass = frozen(self._trace_light)
-        self._camera_pass = frozen(self._render_chunk)
+        self._light_pass = self.recorded(self._trace_light)
+        self._camera_pass = self.recorded(self._render_chunk)
 
     def _trace_light(self, scene, sensor, tables, seed, spectral):
         return trace_light_paths(scene, self.lights, self.traits, seed, self.light_paths, self.photon_capacity, spectral["wavelengths"], sensor.shutter_open(), sensor.shutter_open_time(),

@@ -12,7 +12,6 @@ import numpy as np
 from ..transport.camera_pass import film_sample_count
 from ..transport.gather import mean_photon_count
 from ..transport.radius import best_radius, ladder
-from ..transport.recording import frozen
 
 PILOT_PIXELS = 4096
 FEWEST_ITERATIONS, FEWEST_TIMED_ITERATIONS, MOST_ITERATIONS = 4, 3, 16
@@ -89,11 +88,11 @@ class Pilot:
         self.samples = {(kind, way): [] for kind, ways in self.ways.items() for way in ways}
         self.direct, self.photons = [], {}
         capacity = session._vertex_room(self.paths) * (1 if session.one_vertex else 4)
-        self._camera = frozen(lambda scene, sensor, tables, seed, spectral: session._trace_camera(
+        self._camera = session.recorded(lambda scene, sensor, tables, seed, spectral: session._trace_camera(
             scene, sensor, seed, mi.UInt32(0), self.stride, self.paths, capacity, spectral))
-        self._gather = frozen(lambda scene, tables, photons, vertices, radii, spectral: {
+        self._gather = session.recorded(lambda scene, tables, photons, vertices, radii, spectral: {
             kind: session._gather(scene, photons, vertices, kind, radii, spectral, grey=True) for kind in self.ways})
-        self._covered = frozen(session._covered)
+        self._covered = session.recorded(session._covered)
 
     def iterate(self, number):
         """Runs pilot iteration `number`."""

@@ -20,12 +20,18 @@ def _no_garbage_collection():
             gc.enable()
 
 
+def recorder():
+    """`frozen`, or what leaves a function as it is in spectral variants: Dr.Jit 1.5 records sensors with a response function wrongly
+    (and leaves them corrupted), and cannot record some spectral textures."""
+    return (lambda function: function) if mi.is_spectral else frozen
+
+
 def frozen(function):
     """`dr.freeze(function)`, safe against garbage collection while it records.
 
     Evaluated arrays that `function` reads must be among its arguments, and numbers that change from call to call must be
-    opaque arrays. Nothing inside may read an array's value. Where Dr.Jit cannot record (some nested virtual calls of spectral
-    textures, sensors with a response function) the function runs as it is, with the same result and some more Python.
+    opaque arrays. Nothing inside may read an array's value. Where Dr.Jit refuses to record, the function runs as it is, with the same
+    result and some more Python.
     """
     recorded = dr.freeze(function)
     fresh, plain = True, False
