@@ -159,7 +159,7 @@ class BDPMSession(IterativeSession):
 
     def _freeze(self):
         """Records the passes anew; from the second iteration on, their kernels run without their Python."""
-        self._tables = [self.traits.lambertian, *self.lights.tables()]
+        self._tables = [self.traits.lambertian, self.traits.perturbed, *self.lights.tables()]
         self._light_pass = self.recorded(self._trace_light)
         self._camera_pass = self.recorded(self._render_chunk)
 

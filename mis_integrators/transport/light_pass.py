@@ -7,6 +7,7 @@ import mitsuba as mi
 
 from .packing import Store, float_bits, pack_direction, pack_surface
 from .random import next_2d, streams
+from .traits import lookup
 
 
 def photon_words():
@@ -29,14 +30,14 @@ def delta_adjoint(wi, wo, eta):
     return dr.select((dr.squared_norm(half) > 1e-6) & dr.isfinite(ratio), ratio, 1)
 
 
-def sample_perturbed(bsdf, si, bs, delta, weight, rng, active):
-    """Replaces a light sub-path's BSDF sample in scenes whose bump or normal maps perturb normals inside BSDFs.
+def sample_perturbed(bsdf, si, bs, delta, weight, rng, active, perturbed):
+    """Replaces a light sub-path's BSDF sample where bump or normal maps perturb normals inside BSDFs (lanes `perturbed`).
 
     The adjoint factor of shading normals is then out of sight, so smooth scattering is evaluated from the camera's side, where
     light may even leave below the perturbed horizon: half of the directions come from the geometric hemisphere instead.
-    Returns `(bs, delta, weight)`, the weight without the geometric cosines' ratio.
+    Returns `(bs, delta, weight)`, on those lanes with the weight that lacks only the ratio of the geometric cosines.
     """
-    smooth = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+    smooth = active & perturbed & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
     aside = smooth & (rng.next_float32(active) < 0.5)
     facing = mi.Vector3f(dr.mulsign(si.n, dr.dot(si.n, si.to_world(si.wi))))
     towards = mi.Frame3f(facing).to_world(mi.warp.square_to_cosine_hemisphere(next_2d(rng, active)))
@@ -50,8 +51,8 @@ def sample_perturbed(bsdf, si, bs, delta, weight, rng, active):
     own_pdf = bsdf.pdf(mi.BSDFContext(mi.TransportMode.Importance), si, bs.wo, scattered)
     pdf = 0.5 * (own_pdf + dr.maximum(dr.dot(facing, si.to_world(bs.wo)), 0) * dr.inv_pi)
     once = dr.select(smooth, 2, mi.Float(1))                     # a delta event of a BSDF with a smooth part too
-    weight = dr.select(delta, weight * (once * delta_adjoint(si.wi, bs.wo, bs.eta)), dr.select(pdf > 1e-9, response / pdf, 0))
-    return bs, delta, weight
+    special = dr.select(delta, weight * (once * delta_adjoint(si.wi, bs.wo, bs.eta)), dr.select(pdf > 1e-9, response / pdf, 0))
+    return bs, delta, dr.select(perturbed, special, weight)
 
 
 @dr.syntax
@@ -132,15 +133,16 @@ def trace_light_paths(scene, lights, traits, seed, n_paths: int, capacity: int, 
         bs, weight = bsdf.sample(context, si, rng.next_float32(active), next_2d(rng, active), active)
         delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         if dr.hint(traits.has_perturbed, mode='scalar'):
-            bs, delta, weight = sample_perturbed(bsdf, si, bs, delta, weight, rng, active)
+            perturbed = lookup(traits.perturbed, bsdf, mi.Bool, active)
+            bs, delta, weight = sample_perturbed(bsdf, si, bs, delta, weight, rng, active, perturbed)
         wo = si.to_world(bs.wo)
         wi_geometric, wo_geometric = dr.dot(si.n, -ray.d), dr.dot(si.n, wo)
         wi_shading, wo_shading = mi.Frame3f.cos_theta(si.wi), mi.Frame3f.cos_theta(bs.wo)
         active &= (wi_geometric * wi_shading > 0) & (wo_geometric * wo_shading > 0)
-        adjoint = wo_geometric / wi_geometric
-        if dr.hint(not traits.has_perturbed, mode='scalar'):
-            adjoint *= wi_shading / wo_shading
-        flux *= weight * dr.abs(adjoint)
+        adjoint = dr.abs(wi_shading * wo_geometric / (wo_shading * wi_geometric))
+        if dr.hint(traits.has_perturbed, mode='scalar'):
+            adjoint = dr.select(perturbed, dr.abs(wo_geometric / wi_geometric), adjoint)
+        flux *= weight * adjoint
         had_delta |= delta
         scattered |= ~delta
         eta *= bs.eta

@@ -91,7 +91,7 @@ class SceneTraits:
 
     Attributes: `bounds` (bounding box), `has_delta` (perfectly specular or null scattering somewhere), `has_mixed` (BSDFs with both a smooth and a
     delta part), `has_rough` (smooth scattering that is not Lambertian), `has_lambertian`, `has_perturbed` (bump or normal maps), `has_light_surfaces` (emitters that
-    a ray can meet: area lights, environments), `lambertian` (registry table for BSDF pointers).
+    a ray can meet: area lights, environments), `lambertian`, `perturbed` (registry tables for BSDF pointers).
     """
 
     def __init__(self, scene):
@@ -103,7 +103,9 @@ class SceneTraits:
         self.has_delta = any(f & flag.Delta for f in flags)
         self.has_mixed = any((f & flag.Delta) and (f & flag.Smooth) for f in flags)
         self.has_lambertian = any(lambertian)
-        self.has_perturbed = any(b.class_name() in ("BumpMap", "NormalMap") for b in bsdfs)
+        perturbed = [any(b.class_name() in ("BumpMap", "NormalMap") for b in (bsdf, *scene_objects(bsdf))) for bsdf in bsdfs]
+        self.has_perturbed = any(perturbed)
+        self.perturbed = registry_table(bsdfs, mi.BSDFPtr, perturbed, mi.Bool)
         # Nested BSDFs count on their own, so a perturbed (bump- or normal-mapped) Lambertian shows through its wrapper.
         self.has_rough = any((f & flag.Smooth) and not l for f, l in zip(flags, lambertian))
         self.lambertian = registry_table(bsdfs, mi.BSDFPtr, lambertian, mi.Bool)
