@@ -14,7 +14,7 @@ from . import llvm
 _PACKAGE = "mis_integrators.integrators"
 
 # Modules to load anew for a variant, those that others import first.
-MODULES: tuple[str, ...] = ("parameters", "pilot", "common", "bdpm")
+MODULES: tuple[str, ...] = ("common", "bdpm")
 
 # Plugin name -> (module, class)
 PLUGINS: dict[str, tuple[str, str]] = {"bdpm": ("bdpm", "BDPM")}

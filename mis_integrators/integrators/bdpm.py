@@ -164,7 +164,8 @@ class BDPMSession(IterativeSession):
         self._camera_pass = self.recorded(self._render_chunk)
 
     def _trace_light(self, scene, sensor, tables, seed, spectral):
-        return trace_light_paths(scene, self.lights, self.traits, seed, self.light_paths, self.photon_capacity, spectral["wavelengths"], sensor.shutter_open(), sensor.shutter_open_time(),
+        return trace_light_paths(scene, self.lights, self.traits, seed, self.light_paths, self.photon_capacity,
+                                 spectral["wavelengths"], sensor.shutter_open(), sensor.shutter_open_time(),
                                  self.integrator.max_depth, self.integrator.rr_depth)
 
     def _trace_camera(self, scene, sensor, seed, first, stride, paths, capacity, spectral):
@@ -174,7 +175,7 @@ class BDPMSession(IterativeSession):
                                   integrator.rr_depth, integrator.hide_emitters, capacity, self.has_caustics, self.has_indirect,
                                   self.one_vertex)
 
-    def _gather(self, scene, photons, vertices, kind, radii, spectral, grey=False):
+    def _gather(self, photons, vertices, kind, radii, spectral, grey=False):
         """What photons of one kind bring to each vertex, for each radius."""
         return gather_photons(self.traits, self._map(photons, kind, radii[-1]), vertices, radii, spectral["wavelengths"],
                               self.light_paths, self.integrator.max_depth, only_last=kind == "indirect", grey=grey)
@@ -202,7 +203,7 @@ class BDPMSession(IterativeSession):
         if radii:
             dr.eval(radiance, alpha, position, vertices, count)
         for kind, radius in radii.items():
-            (gathered,) = self._gather(scene, photons, vertices, kind, [radius], spectral)
+            (gathered,) = self._gather(photons, vertices, kind, [radius], spectral)
             if self.corrected[kind]:
                 gathered *= dr.rcp(self._covered(scene, vertices, radius, seed))
             radiance += self._per_path(gathered, vertices, self.chunk)

@@ -94,7 +94,7 @@ class Pilot:
         self._camera = session.recorded(lambda scene, sensor, tables, seed, spectral: session._trace_camera(
             scene, sensor, seed, mi.UInt32(0), self.stride, self.paths, capacity, spectral))
         self._gather = session.recorded(lambda scene, tables, photons, vertices, radii, spectral: {
-            kind: session._gather(scene, photons, vertices, kind, radii, spectral, grey=True) for kind in self.ways})
+            kind: session._gather(photons, vertices, kind, radii, spectral, grey=True) for kind in self.ways})
         self._covered = session.recorded(session._covered)
 
     def iterate(self, number):

@@ -19,6 +19,8 @@ HEIGHT = 0.25
 SMALLEST_SHARE = 0.4
 """Right at a wall half of the disk is left. Smaller estimates come from clutter that the probes meet as often as from corners,
 and would brighten more than they mend."""
+OWN_STREAM = 0x70726f62
+"""Keeps the probes' random numbers apart from those of the camera paths, which share their seed."""
 GOLDEN_ANGLE = 2.399963229728653
 
 
@@ -30,7 +32,7 @@ def covered_share(scene, vertices, radius, seed, active):
     si = vertices["hit"].compute_surface_interaction(ray, mi.RayFlags.Minimal, active)
     normal = mi.Vector3f(dr.mulsign(si.n, -dr.dot(si.n, ray.d)))
     frame = mi.Frame3f(normal)
-    rng = streams(dr.arange(mi.UInt32, dr.width(vertices["depth"])), seed)
+    rng = streams(dr.arange(mi.UInt32, dr.width(vertices["depth"])), seed ^ OWN_STREAM)
     turn, shift = rng.next_float32() * dr.two_pi, rng.next_float32()
     start = si.p + normal * (HEIGHT * radius)
     covered = mi.Float(0)

@@ -91,7 +91,6 @@ class Lights:
         power = np.array([_mean_power(e) for e in self.emitters])
         if guide is not None:
             power = guide.useful_power(power[np.argsort(order)])[order]
-        self.emission_power = power
         self.total_power = power.sum()
         if not self.emitters:
             return

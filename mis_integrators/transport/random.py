@@ -1,6 +1,5 @@
 """Independent streams of random numbers: one generator a path, one seed an iteration and pass."""
 
-import drjit as dr
 import mitsuba as mi
 
 

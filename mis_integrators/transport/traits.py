@@ -89,9 +89,10 @@ def scene_bounds(scene):
 class SceneTraits:
     """What a scene is made of.
 
-    Attributes: `bounds` (bounding box), `has_delta` (perfectly specular or null scattering somewhere), `has_mixed` (BSDFs with both a smooth and a
-    delta part), `has_rough` (smooth scattering that is not Lambertian), `has_lambertian`, `has_perturbed` (bump or normal maps), `has_light_surfaces` (emitters that
-    a ray can meet: area lights, environments), `lambertian`, `perturbed` (registry tables for BSDF pointers).
+    Attributes: `bounds` (bounding box), `has_delta` (perfectly specular or null scattering somewhere), `has_mixed` (BSDFs with both a
+    smooth and a delta part), `has_rough` (smooth scattering that is not Lambertian), `has_lambertian`, `has_perturbed` (bump or
+    normal maps), `has_light_surfaces` (emitters that a ray can meet: area lights, environments), `lambertian`, `perturbed`
+    (registry tables for BSDF pointers).
     """
 
     def __init__(self, scene):
