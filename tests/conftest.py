@@ -30,6 +30,10 @@ def _activate(variant: str) -> str:
     return variant
 
 
+def pytest_addoption(parser):
+    parser.addoption("--vectors", metavar="DIR", help="folder with test vectors (optimal_weights.json), used instead of generated worlds")
+
+
 def pytest_configure(config):
     config.addinivalue_line("markers", "full: the full product of cases, hours of it; left out unless asked for with -m full")
 

@@ -39,7 +39,7 @@ def query_counts(photons, queries, radii, cell, capacity=None, low=None, high=No
 
     def visit(index, record, offset, distance_squared, hit, state):
         number, total = state
-        flux, _ = photon_map.read_power(built, index, hit)
+        flux, _ = photon_map.read_power(built.power, index, hit)
         return number + dr.select(hit, mi.UInt32(1), 0), total + dr.select(hit, flux[0], 0)
 
     m = len(queries)

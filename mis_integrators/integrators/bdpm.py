@@ -89,11 +89,15 @@ class BDPM(IterativeIntegrator):
     """
 
     def read_parameters(self, parameters):
+        self.read_photon_parameters(parameters)
+        self.bdd = parameters.integer("bdd", 1, 0, "at least 0")
+
+    def read_photon_parameters(self, parameters):
+        """Reads what concerns the photon map."""
         self.photon_count = parameters.integer("photon_count", 0, 0, "at least 0 (0: as many as pixels)", high=2 ** 31)
         self.initial_radius = parameters.number("initial_radius", 0.0, lambda r: 0 <= r < float("inf"),
                                                 "finite and at least 0 (0: automatic)")
         self.alpha = parameters.number("alpha", 1.0, lambda a: 0 < a <= 1, "in (0, 1]")
-        self.bdd = parameters.integer("bdd", 1, 0, "at least 0")
 
     def settings(self):
         return {**super().settings(), "photon_count": self.photon_count, "initial_radius": self.initial_radius,
@@ -195,7 +199,8 @@ class BDPMSession(IterativeSession):
 
     def _map(self, photons, kind, radius):
         cell = dr.maximum(radius, smallest_cell(self.traits.bounds, self.photon_capacity))
-        return build_photon_map(*photons, self.traits.bounds, cell, self.photon_capacity, kind)
+        notes = photons[3] if kind == "indirect" and len(photons) > 3 else None
+        return build_photon_map(*photons[:3], self.traits.bounds, cell, self.photon_capacity, kind, notes)
 
     def _render_chunk(self, scene, sensor, tables, photons, seed, first, spectral, radii):
         radiance, alpha, position, vertices, count = self._trace_camera(scene, sensor, seed, first, 1, self.chunk,
@@ -236,9 +241,13 @@ class BDPMSession(IterativeSession):
             self.photon_capacity = room
             self._freeze()
 
-    def _iteration(self, iteration):
+    def _start(self):
+        """What must be known before the first iteration."""
         if self.radii is None:
             choose_radii(self)
+
+    def _iteration(self, iteration):
+        self._start()
         radii = self.radii_at(iteration)
         spectral = self._spectral(iteration)
         photons = self._photons(iteration, spectral) if radii else None
@@ -248,9 +257,10 @@ class BDPMSession(IterativeSession):
                 first = dr.opaque(mi.UInt32, chunk * self.chunk)
                 block, count = self._camera_pass(self.scene, self.sensor, self._tables, photons, self._seed(iteration, CAMERA), first,
                                                  spectral, radii)
-                if self.one_vertex or int(count[0]) <= self.vertex_capacity:
+                wanted = 0 if self.one_vertex else int(dr.max(count)[0])
+                if wanted <= self.vertex_capacity or not radii:
                     break
-                self.vertex_capacity = _rounded_up(int(count[0]) + int(count[0]) // 8)
+                self.vertex_capacity = _rounded_up(wanted + wanted // 8)
                 self._freeze()
             total = block if total is None else total + block
         return total

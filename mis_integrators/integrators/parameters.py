@@ -50,6 +50,13 @@ class Parameters:
             self._fail(name, value, "true or false")
         return value
 
+    def choice(self, name, default, allowed):
+        """One of the words `allowed`."""
+        value = self._get(name, default)
+        if value not in allowed:
+            self._fail(name, value, " or ".join(f'"{word}"' for word in allowed))
+        return value
+
     def finish(self):
         """Refuses whatever was given but not asked for."""
         unknown = [name for name in self.props.unqueried() if name not in self.known]

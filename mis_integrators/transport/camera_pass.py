@@ -37,22 +37,25 @@ def film_sample_count(sensor):
     return (int(size[0]) + border) * (int(size[1]) + border)
 
 
-def new_vertex_buffer(capacity):
+def new_vertex_buffer(capacity, weighted=False):
     """Room for `capacity` camera vertices that wait for photons: what rebuilds the surface interaction there, the path's
     throughput up to it, its path's number, and its depth in segments with the top bit set where all photons are wanted (else
-    only caustic ones). Unused places have throughput zero."""
-    return {"ray_o": dr.empty(mi.Point3f, capacity), "ray_d": dr.empty(mi.Vector3f, capacity),
+    only caustic ones); if `weighted`, the state of the weights there. Unused places have throughput zero."""
+    extra = {name: dr.empty(mi.Spectrum, capacity) for name in (*STATE, "share")} if weighted else {}
+    return extra | {"ray_o": dr.empty(mi.Point3f, capacity), "ray_d": dr.empty(mi.Vector3f, capacity),
             "hit": dr.empty(mi.PreliminaryIntersection3f, capacity), "throughput": dr.zeros(mi.Spectrum, capacity),
             "path": dr.empty(mi.UInt32, capacity), "depth": dr.empty(mi.UInt32, capacity)}
 
 
 LAST_VERTEX = 1 << 31
+STATE = ("weights.0", "weights.1", "weights.2")
+"""What a vertex buffer calls the state of the weights."""
 
 
 @dr.syntax
 def trace_camera_paths(scene, sensor, integrator, lights, traits, seed, first, stride: int, n_paths: int, camera_paths: int,
                        wavelength_sample, bdd: int, max_depth: int, rr_depth: int, hide_emitters: bool, capacity: int, has_caustics: bool,
-                       has_indirect: bool, one_vertex: bool):
+                       has_indirect: bool, one_vertex: bool, weights=None):
     """Traces `n_paths` camera paths, numbers `first`, `first + stride`, ... of `film_samples`, to their `bdd`-th smooth vertex.
 
     On the way: emission seen directly or through delta surfaces; at every smooth vertex up to the `bdd`-th, direct light by
@@ -62,6 +65,12 @@ def trace_camera_paths(scene, sensor, integrator, lights, traits, seed, first, s
 
     Returns `(radiance, alpha, splat position, vertices, count)`: the vertices at which photons are to be gathered, as made by
     `new_vertex_buffer`, and how many wanted a place in it (width one). With `one_vertex` each path owns the place of its number.
+
+    With `weights` all photons are wanted at every smooth vertex, and direct light at each is weighted: `begin(width)` gives a path's state,
+    `arrived(state, si, bsdf, vertex, mask)` the state at a smooth vertex and its weight of direct light (a spectrum), `leaving(state, si,
+    bsdf, bs, vertex, mask)` the state after a smooth scattering, `stored(state)` three spectra to keep with the vertex, `worth_merging(state,
+    share, vertex)` and `worth_going_on(state, vertex)` probabilities with which to gather at the vertex and to leave it. The vertex buffer is
+    then one section for each smooth vertex of the path, of `capacity` each, and `count` has one entry for each.
     """
     path = dr.arange(mi.UInt32, n_paths)
     number = path * stride + first
@@ -86,7 +95,13 @@ def trace_camera_paths(scene, sensor, integrator, lights, traits, seed, first, s
     scatter_pdf = mi.Float(1)                        # of the last smooth vertex
     origin = dr.zeros(mi.Interaction3f)              # the last smooth vertex
     context = mi.BSDFContext()
-    store = Store(vertices=new_vertex_buffer(capacity), count=dr.zeros(mi.UInt32, 1))
+    sections = 1
+    state = []
+    if dr.hint(weights is not None, mode='scalar'):
+        sections = bdd + 1
+        state = weights.begin(n_paths)
+    share_here = mi.Spectrum(1)                      # weight of the direct light at the last smooth vertex
+    store = Store(vertices=new_vertex_buffer(capacity * sections, weights is not None), count=dr.zeros(mi.UInt32, sections))
     environment_shows = (scene.environment() is not None) and not hide_emitters
     visible = mi.Bool(environment_shows)
     if dr.hint(max_depth == 0, mode='scalar'):
@@ -111,7 +126,7 @@ def trace_camera_paths(scene, sensor, integrator, lights, traits, seed, first, s
             if dr.hint(hide_emitters, mode='scalar'):
                 shown &= (depth > 1) | si.is_valid()
             light_pdf = lights.pdf_direct(origin, ds, shown & (vertex > 0))
-            share = dr.select(vertex == 0, 1, mis_power(scatter_pdf, light_pdf))
+            share = dr.select(vertex == 0, mi.Spectrum(1), mis_power(scatter_pdf, light_pdf) * share_here)
             radiance[shown] += throughput * share * ds.emitter.eval(si, shown)
 
         active &= si.is_valid() & (vertex <= bdd)
@@ -120,36 +135,59 @@ def trace_camera_paths(scene, sensor, integrator, lights, traits, seed, first, s
         bsdf = si.bsdf(ray)
         smooth = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
 
+        if dr.hint(weights is not None, mode='scalar'):
+            state, arrived_share = weights.arrived(state, si, bsdf, vertex, smooth)
+            share_here = dr.select(smooth, arrived_share, share_here)
+
         # ---- Direct light
         if dr.hint(not lights.dark, mode='scalar'):
             ds, light, light_pdf = lights.sample_direct(si, rng, smooth)
             response, response_pdf = bsdf.eval_pdf(context, si, si.to_local(ds.d), smooth)
-            share = dr.select(ds.delta, 1, mis_power(light_pdf, response_pdf))
+            share = dr.select(ds.delta, 1, mis_power(light_pdf, response_pdf)) * share_here
             radiance[smooth] += throughput * share * response * light
 
         # ---- Ask for photons
         last = vertex == bdd
         wants = smooth & (dr.max(throughput) > 0)
+        kept = mi.Float(1)
+        if dr.hint(weights is not None, mode='scalar'):
+            last |= True
+            kept = weights.worth_merging(state, share_here, vertex)
+            wants &= rng.next_float32(wants) < kept
         if dr.hint(not has_caustics, mode='scalar'):
             wants &= last & has_indirect
         slot = mi.UInt32(path)
         if dr.hint(not one_vertex, mode='scalar'):
-            slot = dr.scatter_inc(store.count, mi.UInt32(0), wants)
+            section = mi.UInt32(0)
+            if dr.hint(weights is not None, mode='scalar'):
+                section = dr.minimum(vertex, bdd)
+            slot = dr.scatter_inc(store.count, section, wants)
             wants &= slot < capacity
+            slot += section * capacity
+        merged = throughput * dr.rcp(dr.select(wants, kept, 1))
         if dr.hint(capacity > 0, mode='scalar'):
             dr.scatter(store.vertices["ray_o"], ray.o, slot, wants)
             dr.scatter(store.vertices["ray_d"], ray.d, slot, wants)
             dr.scatter(store.vertices["hit"], hit, slot, wants)
-            dr.scatter(store.vertices["throughput"], throughput, slot, wants)
+            dr.scatter(store.vertices["throughput"], merged, slot, wants)
             dr.scatter(store.vertices["path"], path, slot, wants)
             dr.scatter(store.vertices["depth"], depth | dr.select(last, mi.UInt32(LAST_VERTEX), mi.UInt32(0)), slot, wants)
+            if dr.hint(weights is not None, mode='scalar'):
+                for name, value in dr.hint(list(zip(STATE, weights.stored(state))), mode='scalar'):
+                    dr.scatter(store.vertices[name], value, slot, wants)
+                dr.scatter(store.vertices["share"], share_here, slot, wants)
 
         # ---- Go on
         bs, weight = bsdf.sample(context, si, rng.next_float32(active), next_2d(rng, active), active)
         delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         visible |= active & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
         if dr.hint(not traits.has_light_surfaces, mode='scalar'):
-            active &= delta | ~last
+            active &= delta | (vertex < bdd)
+        if dr.hint(weights is not None, mode='scalar'):
+            state = weights.leaving(state, si, bsdf, bs, vertex, active & ~delta)
+            kept_on = dr.select(active & ~delta, weights.worth_going_on(state, vertex), 1)
+            active &= rng.next_float32(active) < kept_on
+            weight *= dr.rcp(dr.select(active, kept_on, 1))
         throughput *= weight
         eta *= bs.eta
         ray = si.spawn_ray(si.to_world(bs.wo))

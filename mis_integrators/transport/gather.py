@@ -20,13 +20,15 @@ LARGEST_COSINE_RATIO = 4.0
 
 
 def gather_photons(traits, photon_map, vertices, radii, wavelengths, light_paths, max_depth: int, only_last: bool,
-                   grey: bool = False):
+                   grey: bool = False, weigh=None):
     """Radiance that the photons of `photon_map` bring to the camera paths of `vertices`, for each radius of the list `radii`
     (ascending; each of width one, or one a vertex), from one visit of the photons within the largest.
 
     Constant kernel on a disk: the sum over photons of f x flux, over (pi radius^2 x light sub-paths). Flux through the surface
     carries the geometric cosine where the photon landed, `path`'s scattering integral the shading one at the vertex, hence the
     ratio of the two.
+    `weigh(index, f, p, active)`, if given, is the weight (a spectrum) of photon `index` of the map where the vertex scatters it with value f (a spectrum,
+    without cosine) and a camera path would go there with density p per projected solid angle.
     Returns a list with a `Spectrum` of the vertices' width for each radius, throughput included; with `grey` the mean over its
     channels (fewer sums to keep for many radii).
     """
@@ -44,10 +46,16 @@ def gather_photons(traits, photon_map, vertices, radii, wavelengths, light_paths
     if traits.has_rough:
         lambertian = lookup(traits.lambertian, bsdf, mi.Bool, active)
     geometric_side = dr.dot(si.n, -ray.d)
-    factor = mi.Spectrum(throughput)
+    factor = mi.Spectrum(throughput) * vertices.get("scale", 1)
+    lambert_f, lambert_p = mi.Spectrum(0), mi.Float(0)
     if traits.has_lambertian:
         upright = mi.Vector3f(0, 0, dr.select(facing > 0, mi.Float(1), mi.Float(-1)))
-        factor *= dr.select(lambertian, bsdf.eval(context, si, upright, active & lambertian), 1)
+        if weigh is None:
+            constant = bsdf.eval(context, si, upright, active & lambertian)
+        else:
+            constant, lambert_p = bsdf.eval_pdf(context, si, upright, active & lambertian)
+            lambert_f = mi.Spectrum(constant)
+        factor *= dr.select(lambertian, constant, 1)
 
     def visit(index, record, offset, distance_squared, hit, totals):
         normal = unpack_normal(record.w)
@@ -55,7 +63,7 @@ def gather_photons(traits, photon_map, vertices, radii, wavelengths, light_paths
         hit &= (alike > 0) & (dr.square(alike) > SAME_SURFACE_COSINE ** 2 * dr.squared_norm(normal))
         if max_depth > 0:
             hit &= unpack_depth(record.w) + depth <= max_depth
-        flux, packed = read_power(photon_map, index, hit)
+        flux, packed = read_power(photon_map.power, index, hit)
         towards = unpack_direction(packed)
         if traits.has_rough:
             towards = dr.normalize(towards)
@@ -69,8 +77,16 @@ def gather_photons(traits, photon_map, vertices, radii, wavelengths, light_paths
         if traits.has_lambertian:
             front = (wo.z * facing > 0) & (cosine * geometric_side > 0)
             value = mi.Spectrum(dr.select(front & lambertian, dr.abs(wo.z), 0))
-        if traits.has_rough:
+        if traits.has_rough and weigh is None:
             value = dr.select(lambertian, value, bsdf.eval(context, si, wo, hit & ~lambertian))
+        if weigh is not None:
+            f, p = lambert_f, lambert_p
+            if traits.has_rough:
+                rough, pdf = bsdf.eval_pdf(context, si, wo, hit & ~lambertian)
+                scale = dr.rcp(dr.maximum(dr.abs(wo.z), 1e-6))
+                value = dr.select(lambertian, value, rough)
+                f, p = dr.select(lambertian, lambert_f, rough * scale), dr.select(lambertian, lambert_p, pdf * scale)
+            value *= dr.select(dr.max(value) > 0, weigh(index, f, p, hit), 0)
         value *= flux * dr.rcp(landing)
         if grey:
             value = dr.mean(value * factor)
@@ -83,6 +99,12 @@ def gather_photons(traits, photon_map, vertices, radii, wavelengths, light_paths
     totals = for_each_photon(photon_map, si.p, radii[-1], active, visit, tuple(type(zero)(zero) for _ in radii))
     return [dr.select(active, (total if grey else total * factor) / (dr.pi * dr.square(radius) * light_paths), 0)
             for total, radius in zip(totals, radii)]
+
+
+def vertex_section(vertices, first, count: int):
+    """`count` vertices of a buffer, those from place `first` on."""
+    index = dr.arange(mi.UInt32, count) + first
+    return {name: dr.gather(type(values), values, index) for name, values in vertices.items()}
 
 
 def mean_photon_count(photon_map, vertices, radius):

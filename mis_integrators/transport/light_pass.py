@@ -57,12 +57,12 @@ def sample_perturbed(bsdf, si, bs, delta, weight, rng, active, perturbed):
 
 @dr.syntax
 def trace_light_paths(scene, lights, traits, seed, n_paths: int, capacity: int, wavelengths, shutter_open: float,
-                      shutter_time: float, max_depth: int, rr_depth: int):
+                      shutter_time: float, max_depth: int, rr_depth: int, keep_direct: bool = False, notebook=None):
     """Traces `n_paths` light sub-paths and stores photons on surfaces that scatter smoothly.
 
     Stored are photons of two or more segments that have scattered smoothly at least once ("indirect"), and photons that have
     met only delta surfaces on the way from the emitter ("caustic"); a photon's first smooth vertex straight from the emitter is
-    next-event estimation's business and is not stored. `max_depth` counts the segments of a whole path (0 or less:
+    next-event estimation's business and is stored with `keep_direct` only (of kind "caustic"). `max_depth` counts the segments of a whole path (0 or less:
     unlimited); a photon's own depth is its number of segments from the emitter.
 
     Returns `(surface, power, count)`: uint32 arrays with four words a photon (position's bits; normal, depth and kind packed) and
@@ -70,6 +70,10 @@ def trace_light_paths(scene, lights, traits, seed, n_paths: int, capacity: int, 
     particular order, and the number of photons, of width one. If it exceeds `capacity` the surplus is missing: repeat the pass
     with more room. Shading normals: Veach 1997, section 5.3 (adjoint factor); where maps perturb normals inside BSDFs, these are
     evaluated from the camera's side instead.
+
+    A `notebook` writes down what weights must know of the vertices that a photon has passed: `begin()` gives a sub-path's state (a list
+    of arrays), `scattered(state, si, bsdf, wo, mask)` the state after a smooth scattering into local direction `wo`, `words(state)` a list of
+    uint32 words to store with a photon. The result then has a fourth array, these words.
     """
     lanes = n_paths
     if dr.hint(dr.backend_v(mi.Float) == dr.JitBackend.LLVM, mode='scalar'):
@@ -79,6 +83,10 @@ def trace_light_paths(scene, lights, traits, seed, n_paths: int, capacity: int, 
     words = photon_words()
     store = Store(surface=dr.empty(mi.UInt32, 4 * capacity), power=dr.empty(mi.UInt32, words * capacity),
                   count=dr.zeros(mi.UInt32, 1))
+    notes = []
+    if dr.hint(notebook is not None, mode='scalar'):
+        notes = notebook.begin()
+        store.notes = dr.empty(mi.UInt32, len(notebook.words(notes)) * capacity)
     path = mi.UInt32(lane)                                       # the lane's next path; then this one plus the number of lanes
     ray = dr.zeros(mi.Ray3f, lanes)
     flux = dr.zeros(mi.Spectrum, lanes)
@@ -104,6 +112,8 @@ def trace_light_paths(scene, lights, traits, seed, n_paths: int, capacity: int, 
             eta = mi.Float(1)
             active = dr.max(flux) > 0
             path += lanes
+            if dr.hint(notebook is not None, mode='scalar'):
+                notes = notebook.begin()
 
         si = scene.ray_intersect(ray, mi.RayFlags.All, coherent=False, reorder=False, active=active)
         active &= si.is_valid()
@@ -111,7 +121,7 @@ def trace_light_paths(scene, lights, traits, seed, n_paths: int, capacity: int, 
         bsdf = si.bsdf(ray)
 
         # ---- Store a photon
-        keep = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth) & (scattered | had_delta)
+        keep = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth) & (scattered | had_delta | keep_direct)
         slot = dr.scatter_inc(store.count, mi.UInt32(0), keep)
         keep &= slot < capacity
         dr.scatter(store.surface, mi.Vector4u(float_bits(si.p.x), float_bits(si.p.y), float_bits(si.p.z),
@@ -126,6 +136,14 @@ def trace_light_paths(scene, lights, traits, seed, n_paths: int, capacity: int, 
             dr.scatter(store.power, mi.Vector4u(float_bits(flux[0]), float_bits(flux[1]), float_bits(flux[2]),
                                                 float_bits(flux[3])), 2 * slot, keep)
             dr.scatter(store.power, mi.Vector4u(from_where, 0, 0, 0), 2 * slot + 1, keep)
+        if dr.hint(notebook is not None, mode='scalar'):
+            words_of_notes = notebook.words(notes)
+            parts = len(words_of_notes) // 4
+            for part in dr.hint(range(max(parts, 1)), mode='scalar'):
+                if dr.hint(parts == 0, mode='scalar'):
+                    dr.scatter(store.notes, mi.Vector2u(words_of_notes), slot, keep)
+                else:
+                    dr.scatter(store.notes, mi.Vector4u(words_of_notes[4 * part:4 * part + 4]), parts * slot + part, keep)
 
         # ---- Go on: a photon on the next surface needs one more segment, and the camera one after it
         if dr.hint(max_depth > 0, mode='scalar'):
@@ -142,6 +160,8 @@ def trace_light_paths(scene, lights, traits, seed, n_paths: int, capacity: int, 
         adjoint = dr.abs(wi_shading * wo_geometric / (wo_shading * wi_geometric))
         if dr.hint(traits.has_perturbed, mode='scalar'):
             adjoint = dr.select(perturbed, dr.abs(wo_geometric / wi_geometric), adjoint)
+        if dr.hint(notebook is not None, mode='scalar'):
+            notes = notebook.scattered(notes, si, bsdf, bs.wo, active & ~delta)
         flux *= weight * adjoint
         had_delta |= delta
         scattered |= ~delta
@@ -156,4 +176,6 @@ def trace_light_paths(scene, lights, traits, seed, n_paths: int, capacity: int, 
         active &= ~roulette | (rng.next_float32(roulette) < survival)
         flux = dr.select(roulette, flux * dr.rcp(survival), flux)
 
+    if dr.hint(notebook is not None, mode='scalar'):
+        return store.surface, store.power, store.count, store.notes
     return store.surface, store.power, store.count

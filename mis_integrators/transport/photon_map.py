@@ -51,16 +51,17 @@ class Grid:
 
 
 class PhotonMap:
-    """Sorted photons: a `grid`, `start` (first photon of each table entry), `surface` and `power` as in `trace_light_paths`."""
+    """Sorted photons: a `grid`, `start` (first photon of each table entry), `surface`, `power` and `notes` as in `trace_light_paths`."""
 
-    def __init__(self, grid, start, surface, power):
-        self.grid, self.start, self.surface, self.power = grid, start, surface, power
+    def __init__(self, grid, start, surface, power, notes=None):
+        self.grid, self.start, self.surface, self.power, self.notes = grid, start, surface, power, notes
 
 
-def build_photon_map(surface, power, count, bbox, cell, capacity: int, kind: str):
+def build_photon_map(surface, power, count, bbox, cell, capacity: int, kind: str, notes=None):
     """Sorts photons into a grid of cells of edge `cell` (width one) over `bbox`.
 
-    `kind`: "all", "caustic" or "indirect" selects the photons. Three passes over the photons: count, prefix sum, scatter.
+    `kind`: "all", "caustic" or "indirect" selects the photons; `notes` (None: there are none) goes along. Three passes over the
+    photons: count, prefix sum, scatter.
     """
     size = table_size(capacity)
     grid = Grid(bbox, cell, size)
@@ -81,26 +82,33 @@ def build_photon_map(surface, power, count, bbox, cell, capacity: int, kind: str
     sorted_surface = dr.empty(mi.UInt32, 4 * capacity)
     dr.scatter(sorted_surface, record, target, active)
     words = photon_words()
-    sorted_power = dr.empty(mi.UInt32, words * capacity)
+    sorted_power = _moved(power, words, capacity, index, target, active)
+    sorted_notes = None if notes is None else _moved(notes, dr.width(notes) // capacity, capacity, index, target, active)
+    dr.eval(sorted_surface, sorted_power, sorted_notes)
+    return PhotonMap(grid, start, sorted_surface, sorted_power, sorted_notes)
+
+
+def _moved(source, words, capacity, index, target, active):
+    """Records of `words` words (2, or a multiple of 4) copied from places `index` to places `target`."""
+    result = dr.empty(mi.UInt32, words * capacity)
     packet = mi.Vector2u if words == 2 else mi.Vector4u
-    for part in range(max(words // 4, 1)):
-        parts = max(words // 4, 1)
-        dr.scatter(sorted_power, dr.gather(packet, power, parts * index + part, active), parts * target + part, active)
-    dr.eval(sorted_surface, sorted_power)
-    return PhotonMap(grid, start, sorted_surface, sorted_power)
+    parts = max(words // 4, 1)
+    for part in range(parts):
+        dr.scatter(result, dr.gather(packet, source, parts * index + part, active), parts * target + part, active)
+    return result
 
 
-def read_power(photon_map, index, active):
-    """Flux (a `Spectrum`, for one light sub-path) and packed direction of sorted photons `index`."""
+def read_power(power, index, active):
+    """Flux (a `Spectrum`, for one light sub-path) and packed direction of the photons `index` of an array of power records."""
     words = photon_words()
     if words == 2:
-        record = dr.gather(mi.Vector2u, photon_map.power, index, active)
+        record = dr.gather(mi.Vector2u, power, index, active)
         return mi.Spectrum(bits_float(record.x)), record.y
     if words == 4:
-        record = dr.gather(mi.Vector4u, photon_map.power, index, active)
+        record = dr.gather(mi.Vector4u, power, index, active)
         return mi.Spectrum(bits_float(record.x), bits_float(record.y), bits_float(record.z)), record.w
-    record = dr.gather(mi.Vector4u, photon_map.power, 2 * index, active)
-    direction = dr.gather(mi.UInt32, photon_map.power, 8 * index + 4, active)
+    record = dr.gather(mi.Vector4u, power, 2 * index, active)
+    direction = dr.gather(mi.UInt32, power, 8 * index + 4, active)
     return mi.Spectrum(*[bits_float(record[i]) for i in range(4)]), direction
 
 

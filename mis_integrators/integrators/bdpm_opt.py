@@ -1,0 +1,133 @@
+"""Plugins `bdpm_opt`, `bdpm_opt2`, `bdpm_opt3`: merging at several camera vertices, under optimal weights."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from ..transport.irradiance_cache import IrradianceCache
+from ..transport.light_pass import trace_light_paths
+from .optimal import OptimalWeights
+from .surroundings import Surroundings
+from .weighted import WeightedBDPM, WeightedSession
+
+USUAL_FROZEN_PATHS = 1 << 18
+PHOTONS_A_PATH = 5
+"""Room for photons of the frozen pass; it grows where that is not enough."""
+
+
+class BDPMOpt(WeightedBDPM):
+    r"""
+    .. _integrator-bdpm_opt:
+
+    Bidirectional ray tracing with photon maps, optimal weights (:monosp:`bdpm_opt`)
+    --------------------------------------------------------------------------------
+
+    .. pluginparameters::
+
+     * - strategies
+       - |int|
+       - How many strategies are mixed: photons are merged at the camera vertices ``first_vertex``, ``first_vertex`` + 1, ... (vertices
+         that scatter smoothly, counted from 0). (Default: 3)
+     * - first_vertex
+       - |int|
+       - The first camera vertex at which photons are merged. (Default: 0)
+     * - weights
+       - |string|
+       - ``full`` keeps the means over directions in the optimal weights, estimated from typical neighbours; ``local`` drops them, which
+         is cheaper and on diffuse scenes as good. (Default: ``local``)
+     * - frozen_photons
+       - |int|
+       - Light sub-paths of the pass from which the weights learn where light is; they do not contribute to the image. 0 stands for
+         262144. (Default: 0)
+     * - photon_count, initial_radius, alpha, camera_paths, variance, max_depth, rr_depth, hide_emitters
+       -
+       - As of :monosp:`bdpm`.
+
+    Each light path that several strategies can make, because its photon may be merged at one camera vertex or the next, is shared among
+    them with weights that minimise the noise of the pixel (Ershov, Kopylov and Voloboy 2021, here for any number of strategies by a scalar
+    recursion). What the weights must know of the light around a path comes from a cache of irradiance; an inexact cache costs noise, but
+    leaves the mean as it is. Weights may be negative or exceed one; those of a path sum to one.
+
+    ``bdpm_opt2`` and ``bdpm_opt3`` are the same with ``strategies`` fixed to 2 and 3.
+
+    .. tabs::
+        .. code-tab:: xml
+
+            <integrator type="bdpm_opt">
+                <integer name="strategies" value="2"/>
+            </integrator>
+
+        .. code-tab:: python
+
+            'type': 'bdpm_opt',
+            'strategies': 2
+    """
+
+    fixed_strategies = None
+
+    def read_parameters(self, parameters):
+        self.read_photon_parameters(parameters)
+        self.strategies = self.fixed_strategies or parameters.integer("strategies", 3, 1, "from 1 to 6", high=6)
+        self.first_vertex = self.bdd = parameters.integer("first_vertex", 0, 0, "at least 0")
+        self.weights = parameters.choice("weights", "local", ("full", "local"))
+        self.frozen_photons = parameters.integer("frozen_photons", 0, 0, "at least 0 (0: 262144)", high=2 ** 28)
+
+    def settings(self):
+        return {**super().settings(), "first_vertex": self.first_vertex, "weights": self.weights, "frozen_photons": self.frozen_photons}
+
+    def new_session(self, scene, sensor, seed, iterations):
+        return BDPMOptSession(self, scene, sensor, seed, iterations)
+
+
+class BDPMOpt2(BDPMOpt):
+    r"""``bdpm_opt`` with two strategies; see there."""
+
+    fixed_strategies = 2
+
+
+class BDPMOpt3(BDPMOpt):
+    r"""``bdpm_opt`` with three strategies; see there."""
+
+    fixed_strategies = 3
+
+
+class BDPMOptSession(WeightedSession):
+    """Iterations of `bdpm_opt`."""
+
+    def prepare(self, spectral):
+        """One dense light pass, frozen: for the weights only."""
+        self.cache = self.surroundings = None
+        if not self.kinds():
+            return
+        integrator = self.integrator
+        paths = integrator.frozen_photons or USUAL_FROZEN_PATHS
+        capacity, found = 0, PHOTONS_A_PATH * paths
+        while found > capacity:
+            capacity = found
+            photons = trace_light_paths(self.scene, self.lights, self.traits, self._seed(0, FROZEN), paths, capacity, spectral["wavelengths"],
+                                        self.sensor.shutter_open(), self.sensor.shutter_open_time(), integrator.max_depth,
+                                        integrator.rr_depth, keep_direct=True)
+            dr.eval(photons)
+            found = int(photons[2][0])
+        self.cache = IrradianceCache(self.scene, self.lights, *photons, paths, self.traits.bounds)
+        if integrator.weights == "full":
+            self.surroundings = Surroundings(self.scene, self.weights(mi.Spectrum(0)))
+
+    def _freeze(self):
+        super()._freeze()
+        if self._weighted and self.cache:
+            self._tables += self.cache.tables() + ([self.surroundings.table] if self.surroundings else [])
+
+    def weights(self, n):
+        integrator = self.integrator
+        return OptimalWeights(self.lights, self.traits, self.cache, self.surroundings, n, integrator.strategies, integrator.first_vertex,
+                              integrator.camera_paths, integrator.weights == "full")
+
+    def photons_per_irradiance(self, radius):
+        inverse = [self.light_paths / flux if flux > 0 else 0.0 for flux in self.cache.photon_flux]
+        return dr.pi * dr.square(radius) * mi.Spectrum(inverse if len(inverse) > 1 else inverse[0])
+
+
+FROZEN = 3
+"""Purpose of the frozen pass's random seed."""

@@ -1,0 +1,216 @@
+"""Irradiance on the scene's surfaces, kept in cells: a crude, deterministic picture of where light is.
+
+Made once from the photons of a dense light pass. Each cell of a grid keeps what lands around the mean position of its photons; what
+asks for the irradiance of a point reads the point's cell and no photons.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from .gather import SAME_SURFACE_COSINE
+from .packing import bits_float, float_bits, unpack_caustic, unpack_depth, unpack_direction, unpack_normal
+from .photon_map import build_photon_map, for_each_photon, read_power, smallest_cell
+from .random import streams
+
+PHOTONS_A_CELL = 32
+TRIAL_SHARE = 1 / 64
+"""Edge of the first, trial cells as a share of the scene's diagonal."""
+SMALLEST_SHARE, LARGEST_SHARE = 1e-3, 0.2
+"""Bounds of the cells' edge, in the same unit."""
+INDEX_BITS = 22
+MOST_LIGHTS = 64
+"""Emitters tried as the strongest of a cell."""
+DIRECT_SAMPLES = 16
+OWN_STREAM = 0x64697265
+
+
+class Irradiance:
+    """What a cell knows. Spectra: `direct` (irradiance by direct light and caustics), `second` (by light scattered once), `later` (more
+    often). `direction`: mean direction from which the direct part comes. `slot`: the cell's number. `light`: number of the
+    emitter that brings most of the direct part, `visible_share`: how much of that emitter's unoccluded light the direct part is (0: none
+    is known). `noise`: relative variance of next-event estimation with one sample."""
+
+    def __init__(self, direct, second, later, direction, slot, light, visible_share, noise):
+        self.direct, self.second, self.later, self.direction = direct, second, later, direction
+        self.slot, self.light, self.visible_share, self.noise = slot, light, visible_share, noise
+
+
+def colours():
+    """Channels that are kept apart: those of rgb; in spectral variants, whose wavelengths change, the mean stands for all."""
+    return 1 if mi.is_spectral else dr.size_v(mi.Spectrum)
+
+
+class IrradianceCache:
+    """Irradiance by cell.
+
+    Attributes: `cell` (edge of the cells, width one), `photon_flux` (flux of a typical stored photon for one light sub-path, a list of one
+    number a channel), `mean` (irradiance of a typical lit point), `center` and `facing` (mean position and normal of the photons of each cell,
+    from cell number 1 on).
+    """
+
+    def __init__(self, scene, lights, surface, power, count, light_paths, bounds):
+        """`surface`, `power`, `count`: photons as `trace_light_paths` stores them, direct light's included; `light_paths`: how many
+        sub-paths made them."""
+        self.origin = mi.Point3f(bounds.min)
+        self.words = 8 if colours() == 1 else 16
+        capacity = dr.width(surface) // 4
+        stored = dr.arange(mi.UInt32, capacity) < count
+        index = dr.arange(mi.UInt32, capacity)
+        record = dr.gather(mi.Vector4u, surface, index, stored)
+        position = mi.Point3f(bits_float(record.x), bits_float(record.y), bits_float(record.z))
+        flux, packed = read_power(power, index, stored)
+        normal = unpack_normal(record.w)
+        normal = mi.Normal3f(dr.normalize(dr.mulsign(normal, dr.dot(normal, unpack_direction(packed)))))
+        self.photon_flux = [_typical(dr.select(stored, value, 0)) for value in self._channels(flux)]
+        place = self._choose_cells(position, normal, stored, int(count[0]), bounds)
+        self._sum_cells(position, normal, place, stored)
+        self.table = dr.zeros(mi.Float, self.words * (dr.width(self.center) + 1))
+        self.mean = 0.0
+        if dr.width(self.center):
+            reach = dr.maximum(self.cell, smallest_cell(bounds, capacity))
+            self._gather(scene, lights, build_photon_map(surface, power, count, bounds, reach, capacity, "all"), light_paths)
+
+    @staticmethod
+    def _channels(flux):
+        return [dr.mean(flux)] if colours() == 1 else [flux[i] for i in range(colours())]
+
+    def _choose_cells(self, position, normal, stored, count, bounds):
+        """Sets the cells' size so that those which hold photons hold `PHOTONS_A_CELL` on average; returns each photon's place."""
+        diagonal = max(float(dr.norm(bounds.extents())), 1e-30)
+        cell = TRIAL_SHARE * diagonal
+        for trial in range(3):
+            cell = min(max(cell, SMALLEST_SHARE * diagonal), LARGEST_SHARE * diagonal)
+            self.cell = dr.opaque(mi.Float, cell)
+            self.columns, self.lines = (int((bounds.max[i] - bounds.min[i]) / cell) + 3 | 1 for i in (0, 1))
+            place = self._place(position, normal)
+            counts = dr.zeros(mi.UInt32, 1 << INDEX_BITS)
+            dr.scatter_inc(counts, place, stored)
+            self._occupied = dr.compress(counts > 0)
+            cell *= (PHOTONS_A_CELL * dr.width(self._occupied) / max(count, 1)) ** 0.5
+        return place
+
+    def _sum_cells(self, position, normal, place, stored):
+        cells = dr.width(self._occupied)
+        number = dr.arange(mi.UInt32, cells) + 1                            # cell 0 is the empty one
+        self.index = dr.zeros(mi.UInt32, 1 << INDEX_BITS)
+        dr.scatter(self.index, number, self._occupied)
+        del self._occupied
+        slot = dr.gather(mi.UInt32, self.index, place, stored)
+        sums = dr.zeros(mi.Float, 8 * (cells + 1))
+        for offset, value in enumerate((1, *position, *normal)):
+            dr.scatter_add(sums, mi.Float(value), 8 * slot + offset, stored)
+        dr.eval(sums)
+        scale = dr.rcp(dr.gather(mi.Float, sums, 8 * number))
+        self.center = mi.Point3f(*[dr.gather(mi.Float, sums, 8 * number + i) * scale for i in (1, 2, 3)])
+        facing = mi.Vector3f(*[dr.gather(mi.Float, sums, 8 * number + i) for i in (4, 5, 6)])
+        self.facing = dr.select(dr.squared_norm(facing) > 0, dr.normalize(facing), mi.Vector3f(0, 0, 1))
+        dr.eval(self.center, self.facing)
+
+    def _gather(self, scene, lights, photon_map, light_paths):
+        """Fills the table: density estimates at the cells' centers."""
+        facing = self.facing
+        channels = colours()
+
+        def visit(index, record, offset, distance_squared, hit, totals):
+            flux, packed = read_power(photon_map.power, index, hit)
+            towards = dr.normalize(unpack_direction(packed))
+            normal = unpack_normal(record.w)
+            hit &= (dr.dot(towards, facing) > 0) & (dr.square(dr.dot(normal, facing)) > SAME_SURFACE_COSINE ** 2 * dr.squared_norm(normal))
+            straight = hit & unpack_caustic(record.w)
+            soon = hit & ~straight & (unpack_depth(record.w) <= 2)
+            added = [dr.select(kind, value, 0) for kind in (straight, soon, hit & ~straight & ~soon) for value in self._channels(flux)]
+            added += [dr.select(straight, dr.mean(flux) * x, 0) for x in towards]
+            return tuple(old + new for old, new in zip(totals, added))
+
+        totals = for_each_photon(photon_map, self.center, self.cell, mi.Bool(True), visit,
+                                 tuple(mi.Float(0) for _ in range(3 * channels + 3)))
+        area = dr.rcp(dr.pi * dr.square(self.cell) * light_paths)
+        irradiance = [total * area for total in totals[:3 * channels]]
+        direction = mi.Vector3f(*totals[3 * channels:])
+        direction *= dr.rsqrt(dr.maximum(dr.squared_norm(direction), 1e-30))
+        dr.eval(irradiance, direction)
+        light, visible_share = self._strongest_light(scene, lights, sum(irradiance[:channels]) / channels)
+        number = dr.arange(mi.UInt32, dr.width(self.center)) + 1
+        for offset, value in enumerate((*irradiance, *direction, _pack_light(light, visible_share), self._direct_noise(lights))):
+            dr.scatter(self.table, mi.Float(value), self.words * number + offset)
+        dr.eval(self.table)
+        self.mean = float(dr.mean(sum(irradiance) / channels)[0])
+
+    def _strongest_light(self, scene, lights, direct):
+        """The emitter that brings most direct light to each cell's center, and the share of its unoccluded light that the cell has."""
+        best, light = mi.Float(0), mi.UInt32(0)
+        near = [i for i, kind in enumerate(lights.kinds) if kind in ("point", "spot", "area", "directional")]
+        si = dr.zeros(mi.SurfaceInteraction3f, dr.width(self.center))
+        si.p, si.n = self.center, mi.Normal3f(self.facing)
+        for index in near[:MOST_LIGHTS]:
+            ds, value = lights.unoccluded(si, mi.UInt32(index), mi.Bool(True))
+            value *= dr.maximum(dr.dot(ds.d, self.facing), 0)
+            value = dr.select((value > 0) & ~scene.ray_test(si.spawn_ray_to(ds.p), value > 0), value, 0)
+            light = dr.select(value > best, mi.UInt32(index), light)
+            best = dr.maximum(best, value)
+            dr.eval(best, light)
+        return light, dr.select(best > 0, dr.minimum(direct / dr.maximum(best, 1e-30), 2), 0)
+
+    def _direct_noise(self, lights):
+        """Relative variance of next-event estimation at each cell's center, from `DIRECT_SAMPLES` samples."""
+        cells = dr.width(self.center)
+        number = dr.arange(mi.UInt32, cells * DIRECT_SAMPLES)
+        facing = dr.gather(mi.Vector3f, self.facing, number // DIRECT_SAMPLES)
+        si = dr.zeros(mi.SurfaceInteraction3f, cells * DIRECT_SAMPLES)
+        si.p, si.n = dr.gather(mi.Point3f, self.center, number // DIRECT_SAMPLES), mi.Normal3f(facing)
+        ds, weight, _ = lights.sample_direct(si, streams(number, mi.UInt32(OWN_STREAM)), mi.Bool(True))
+        value = dr.mean(weight) * dr.maximum(dr.dot(ds.d, facing), 0)
+        mean, square = dr.block_sum(value, DIRECT_SAMPLES) / DIRECT_SAMPLES, dr.block_sum(dr.square(value), DIRECT_SAMPLES) / DIRECT_SAMPLES
+        noise = (square / dr.maximum(dr.square(mean), 1e-30) - 1) * (DIRECT_SAMPLES / (DIRECT_SAMPLES - 1))
+        return dr.select(mean > 0, dr.maximum(noise, 0), DIRECT_SAMPLES)
+
+    def tables(self):
+        """Every evaluated array that `lookup` reads, for `dr.freeze` to track."""
+        return [self.index, self.table, self.cell]
+
+    def _place(self, p, n):
+        """Entry of the index for point `p` on a surface with unit normal `n`: cells along x, y, z times six directions, modulo the
+        index's size (where that is too small for the scene, far cells share entries)."""
+        q = mi.Vector3u(mi.Vector3i(dr.floor((p - self.origin) / self.cell)) + 1)
+        axis = dr.select((dr.abs(n.x) > dr.abs(n.y)) & (dr.abs(n.x) > dr.abs(n.z)), mi.UInt32(0),
+                         dr.select(dr.abs(n.y) > dr.abs(n.z), mi.UInt32(1), mi.UInt32(2)))
+        along = dr.select(axis == 0, n.x, dr.select(axis == 1, n.y, n.z))
+        side = 2 * axis + dr.select(along > 0, mi.UInt32(0), mi.UInt32(1))
+        return (((q.z * self.lines + q.y) * self.columns + q.x) * 6 + side) & ((1 << INDEX_BITS) - 1)
+
+    def slot(self, p, n, active=True):
+        """Number of the cell of point `p` on the side to which the unit normal `n` points; 0 if nothing is known of it."""
+        return dr.gather(mi.UInt32, self.index, self._place(p, n), active)
+
+    def lookup(self, p, n, active=True):
+        """The `Irradiance` at point `p` on the side to which the unit normal `n` points."""
+        slot = self.slot(p, n, active)
+        words = []
+        for part in range(self.words // 4):
+            words += list(dr.gather(mi.Vector4f, self.table, self.words // 4 * slot + part, active))
+        channels = colours()
+        spectra = [mi.Spectrum(words[i * channels]) if channels == 1 else mi.Spectrum(words[i * channels:(i + 1) * channels])
+                   for i in range(3)]
+        rest = words[3 * channels:]
+        light, visible_share = _unpack_light(rest[3])
+        return Irradiance(*spectra, mi.Vector3f(*rest[:3]), slot, light, visible_share, rest[4])
+
+
+def _typical(flux):
+    """Mean of a photon's flux, weighted by itself: what the variance of a sum of photons over their sum is."""
+    flux = np.array(flux, dtype=np.float64)
+    total = flux.sum()
+    return float((flux ** 2).sum() / total) if total > 0 else 0.0
+
+
+def _pack_light(light, visible_share):
+    """An emitter's number (14 bits) and a number in [0, 2] in the bits of an ordinary float32."""
+    return bits_float(mi.UInt32(1 << 30) | (light << 16) | mi.UInt32(dr.round(visible_share * 32767)))
+
+
+def _unpack_light(word):
+    bits = float_bits(word)
+    return (bits >> 16) & 0x3fff, mi.Float(bits & 0xffff) / 32767
