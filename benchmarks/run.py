@@ -16,6 +16,7 @@ import freezing  # noqa: E402
 import radius  # noqa: E402
 import references  # noqa: E402
 import throughput  # noqa: E402
+import variance  # noqa: E402
 from methods import parse_method  # noqa: E402
 from scene_files import bundled  # noqa: E402
 
@@ -50,6 +51,18 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument("--time", type=float, default=10, metavar="SECONDS",
                          help="rendering seconds of each (default: 10)")
     _compares_with_references(command)
+
+    command = _measuring(commands, "variance", variance)
+    command.add_argument("--integrators", nargs="+", type=parse_method, metavar="PLUGIN[:name=value,...]",
+                         default=[parse_method(text) for text in ("bdpm:bdd=0", "bdpm:bdd=1", "bdpm:bdd=2", "bdpm_balance",
+                                                                  "bdpm_opt2", "bdpm_opt3", "bdpm_opt3:weights=full")],
+                         help="methods, some of them bdpm: ratios are to the best of these (default: bdpm with bdd 0, 1, 2, "
+                         "bdpm_balance, bdpm_opt2, bdpm_opt3 with local and with full weights)")
+    command.add_argument("--iterations", type=int, default=24, help="(default: 24)")
+    command.add_argument("--camera-paths", type=int, nargs="+", default=[1], metavar="N", help="N_B (default: 1)")
+    command.add_argument("--radius", type=float, metavar="R", help="merge radius (default: a share of the scene's diagonal)")
+    command.add_argument("--radius-share", type=float, default=0.005, metavar="SHARE", help="(default: 0.005)")
+    command.add_argument("--scale", type=float, default=1, help="film size, scene's own = 1 (default: 1)")
 
     command = _measuring(commands, "radius", radius)
     command.add_argument("--bdd", type=int, nargs="+", default=[0, 1], help="(default: 0 1)")

@@ -208,7 +208,7 @@ def emission(scene, count=1 << 18, seed=7):
     """Rays (origins, directions) and flux of `count` light sub-paths."""
     guide = EnvironmentGuide(scene, scene.sensors()[0]) if any(e.flags() & mi.EmitterFlags.Infinite for e in scene.emitters()) else None
     lights = Lights(scene, guide=guide)
-    ray, flux, _ = lights.sample_emission(streams(dr.arange(mi.UInt32, count), mi.UInt32(seed)), mi.Float(0), [])
+    ray, flux, *_ = lights.sample_emission(streams(dr.arange(mi.UInt32, count), mi.UInt32(seed)), mi.Float(0), [])
     grey = np.array(dr.mean(flux) + dr.zeros(mi.Float, count))
     return lights, ray, grey
 

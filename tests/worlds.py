@@ -158,7 +158,7 @@ EMITTERS = {
                                                              "irradiance": grey(0.5)}})},
     "projector": lambda f: {"e": {"type": "projector", "to_world": look(*LAMP), "fov": 70,
                                   "irradiance": bitmap(np.stack([12 + 8 * waves(1, 2)] * 3, axis=-1))}},
-    "directionalarea": lambda f: {"e": {"type": "rectangle", "to_world": look((0.8, 0.4, 4.5), (0, 0, 0)) @ T().scale(2.2),
+    "directionalarea": lambda f: {"e": {"type": "rectangle", "to_world": look((0.8, 0.4, 8.0), (0, 0, 0)) @ T().scale(2.2),
                                         "emitter": {"type": "directionalarea", "radiance": grey(3.0)}}},
 }
 

@@ -19,6 +19,8 @@ from ..transport.traits import SceneTraits
 from .common import IterativeIntegrator, IterativeSession
 from .pilot import choose_radii
 
+SPARE_PHOTONS = 1 << 20
+"""Unused room beyond half of a photon buffer that is worth the time to record the passes anew."""
 CAMERA_CHUNK = 1 << 21
 """Camera paths traced at once at most; larger films are traced in parts (bounds memory)."""
 
@@ -235,7 +237,8 @@ class BDPMSession(IterativeSession):
             dr.eval(photons)
             found = int(photons[2][0])
             room = _rounded_up(found + found // 8 + 1024)
-            if found <= self.photon_capacity and (self._sized or 2 * room >= self.photon_capacity):
+            spare = self.photon_capacity - 2 * room
+            if found <= self.photon_capacity and (self._sized or spare < SPARE_PHOTONS):
                 return photons
             self._sized = True
             self.photon_capacity = room

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import drjit as dr
 import mitsuba as mi
 
@@ -11,7 +13,8 @@ from .optimal import OptimalWeights
 from .surroundings import Surroundings
 from .weighted import WeightedBDPM, WeightedSession
 
-USUAL_FROZEN_PATHS = 1 << 18
+USUAL_FROZEN_PATHS = 1 << 17
+USUAL_PHOTONS = 10
 PHOTONS_A_PATH = 5
 """Room for photons of the frozen pass; it grows where that is not enough."""
 
@@ -36,10 +39,14 @@ class BDPMOpt(WeightedBDPM):
        - |string|
        - ``full`` keeps the means over directions in the optimal weights, estimated from typical neighbours; ``local`` drops them, which
          is cheaper and on diffuse scenes as good. (Default: ``local``)
+     * - mix_diffuse
+       - |bool|
+       - Whether strategies go on beyond vertices that scatter as Lambertians do. They gain little there, and cost as much as elsewhere; by
+         default a path's first Lambertian vertex is its last strategy. (Default: no, i.e. |false|)
      * - frozen_photons
        - |int|
        - Light sub-paths of the pass from which the weights learn where light is; they do not contribute to the image. 0 stands for
-         262144. (Default: 0)
+         131072. (Default: 0)
      * - photon_count, initial_radius, alpha, camera_paths, variance, max_depth, rr_depth, hide_emitters
        -
        - As of :monosp:`bdpm`.
@@ -71,10 +78,12 @@ class BDPMOpt(WeightedBDPM):
         self.strategies = self.fixed_strategies or parameters.integer("strategies", 3, 1, "from 1 to 6", high=6)
         self.first_vertex = self.bdd = parameters.integer("first_vertex", 0, 0, "at least 0")
         self.weights = parameters.choice("weights", "local", ("full", "local"))
-        self.frozen_photons = parameters.integer("frozen_photons", 0, 0, "at least 0 (0: 262144)", high=2 ** 28)
+        self.mix_diffuse = parameters.boolean("mix_diffuse", False)
+        self.frozen_photons = parameters.integer("frozen_photons", 0, 0, "at least 0 (0: 131072)", high=2 ** 28)
 
     def settings(self):
-        return {**super().settings(), "first_vertex": self.first_vertex, "weights": self.weights, "frozen_photons": self.frozen_photons}
+        return {**super().settings(), "first_vertex": self.first_vertex, "weights": self.weights, "mix_diffuse": self.mix_diffuse,
+                "frozen_photons": self.frozen_photons}
 
     def new_session(self, scene, sensor, seed, iterations):
         return BDPMOptSession(self, scene, sensor, seed, iterations)
@@ -95,11 +104,20 @@ class BDPMOpt3(BDPMOpt):
 class BDPMOptSession(WeightedSession):
     """Iterations of `bdpm_opt`."""
 
+    weighted_pilot = True
+
+    def usual_radius(self):
+        """The radius at which a typical lit point has `USUAL_PHOTONS` photons within its merge disk."""
+        flux = sum(self.cache.photon_flux) / len(self.cache.photon_flux)
+        area = USUAL_PHOTONS * flux / (self.light_paths * max(self.cache.mean, 1e-30))
+        return dr.opaque(mi.Float, math.sqrt(area / math.pi))
+
+    def mixes(self):
+        return self.traits.has_rough or self.integrator.mix_diffuse
+
     def prepare(self, spectral):
         """One dense light pass, frozen: for the weights only."""
-        self.cache = self.surroundings = None
-        if not self.kinds():
-            return
+        self.surroundings = None
         integrator = self.integrator
         paths = integrator.frozen_photons or USUAL_FROZEN_PATHS
         capacity, found = 0, PHOTONS_A_PATH * paths
@@ -116,13 +134,13 @@ class BDPMOptSession(WeightedSession):
 
     def _freeze(self):
         super()._freeze()
-        if self._weighted and self.cache:
+        if self._weighted:
             self._tables += self.cache.tables() + ([self.surroundings.table] if self.surroundings else [])
 
     def weights(self, n):
         integrator = self.integrator
         return OptimalWeights(self.lights, self.traits, self.cache, self.surroundings, n, integrator.strategies, integrator.first_vertex,
-                              integrator.camera_paths, integrator.weights == "full")
+                              integrator.camera_paths, integrator.weights == "full", integrator.mix_diffuse)
 
     def photons_per_irradiance(self, radius):
         inverse = [self.light_paths / flux if flux > 0 else 0.0 for flux in self.cache.photon_flux]

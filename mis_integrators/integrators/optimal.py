@@ -32,13 +32,13 @@ class Node:
     """What is known of a vertex seen from its predecessor.
 
     `f` (spectrum), `p`: BSDF value and camera density of the joint path there; `direct`, `indirect` (spectra): radiance by direct and other
-    light; `lobe_f` (spectrum), `lobe_p`: value and density in a typical direction; `noise`: relative variance of its direct light's estimate; `around`: what it sees, as shares of its directions and
-    the nodes that are typical of them.
+    light; `lobe_f` (spectrum), `lobe_p`: value and density in a typical direction; `noise`: relative variance of its
+    direct light's estimate; `last` (mask): strategies end here, whatever their number.
     """
 
-    def __init__(self, f, p, direct, indirect, lobe_f, lobe_p, noise, around):
+    def __init__(self, f, p, direct, indirect, lobe_f, lobe_p, noise, last):
         self.f, self.p, self.direct, self.indirect, self.lobe_f, self.lobe_p = f, p, direct, indirect, lobe_f, lobe_p
-        self.noise, self.around = noise, around
+        self.noise, self.last = noise, last
 
     def radiance(self, n):
         """L and b / L. b is the lobe's f times the indirect light, and n times the variance of the direct light's estimate: the noise law takes
@@ -53,40 +53,42 @@ class Node:
 
 
 def typical_node(direct, indirect):
-    """A grey Lambertian of the given radiance, which sees its like."""
-    return Node(None, None, direct, indirect, TYPICAL_ALBEDO / dr.pi, 1 / dr.pi, 0,
-                lambda: [(1, typical_node(0.5 * indirect / TYPICAL_ALBEDO, 0.5 * indirect / TYPICAL_ALBEDO))])
+    """A grey Lambertian of the given radiance, at which strategies end."""
+    return Node(None, None, direct, indirect, TYPICAL_ALBEDO / dr.pi, 1 / dr.pi, 0, True)
 
 
 def response(level, strategies, full, n, r, node):
     """Remainder e and carry tau of the node at z_level, 0 < level < strategies (`weights.recursion`; means over directions are those
-    of typical neighbours, whose own come from theirs)."""
-    if level == strategies - 1:
-        radiance, c = node.radiance(n)
-        return recursion.remainder(recursion.deepest_response(n, radiance, c, r)), mi.Spectrum(0)
-    if not full:
-        return recursion.remainder(recursion.inner_response(n, node.direct, node.direct_r(n, r), 0, 0, 0, 0)), mi.Spectrum(0)
-    theta, rest = recursion.kernel_share(r, node.lobe_f), recursion.kernel_rest(r, node.lobe_f)
-    next_r = recursion.next_ratio(theta, node.lobe_p)
-    around = node.around()
-    e_next = sum(share * response(level + 1, strategies, full, n, next_r, neighbour)[0] for share, neighbour in around)
-    first = rest * (1 - e_next)
-    tau = recursion.carry(first, e_next)
-    incident = sum(share * neighbour.radiance(n)[0] for share, neighbour in around)
-    photon_sum = incident * rest / node.lobe_p                   # a lobe of projected solid angle 1 / p
-    return recursion.remainder(recursion.inner_response(n, node.direct, node.direct_r(n, r), photon_sum, rest * first, first, tau)), tau
+    of one typical neighbour)."""
+    radiance, c = node.radiance(n)
+    e_deepest = recursion.remainder(recursion.deepest_response(n, radiance, c, r))
+    if level == strategies - 1 or node.last is True:
+        return e_deepest, mi.Spectrum(0)
+    tau = mi.Spectrum(0)
+    gamma = recursion.inner_response(n, node.direct, node.direct_r(n, r), 0, 0, 0, 0)
+    if full:
+        theta, rest = recursion.kernel_share(r, node.lobe_f), recursion.kernel_rest(r, node.lobe_f)
+        next_r = recursion.next_ratio(theta, node.lobe_p)
+        incident = node.indirect * node.lobe_p / recursion.at_least(node.lobe_f, recursion.SMALLEST)
+        e_next, _ = response(level + 1, strategies, full, n, next_r, typical_node(0.5 * incident, 0.5 * incident))
+        first = rest * (1 - e_next)
+        tau = dr.select(node.last, 0, recursion.carry(first, e_next))
+        photon_sum = incident * rest / node.lobe_p                   # a lobe of projected solid angle 1 / p
+        gamma = recursion.inner_response(n, node.direct, node.direct_r(n, r), photon_sum, rest * first, first, tau)
+    return dr.select(node.last, e_deepest, recursion.remainder(gamma)), tau
 
 
 class OptimalWeights:
     """Weights of `strategies` merging strategies, the first at camera vertex `first`.
 
     `full`: keep the recursion's integrals, else drop them (local weights). `cache`: an `IrradianceCache`; `surroundings`: a `Surroundings`
-    of its cells (full weights only). `n`: photons per unit of irradiance in the merge disk (a spectrum of width one).
+    of its cells (full weights only). `n`: photons per unit of irradiance in the merge disk (a spectrum of width one). `mix_diffuse`: whether
+    strategies go on beyond Lambertian vertices; else the first of these is a path's last strategy.
     """
 
-    def __init__(self, lights, traits, cache, surroundings, n, strategies, first, camera_paths, full):
+    def __init__(self, lights, traits, cache, surroundings, n, strategies, first, camera_paths, full, mix_diffuse):
         self.lights, self.traits, self.cache, self.surroundings, self.n = lights, traits, cache, surroundings, n
-        self.strategies, self.first, self.full = strategies, first, full
+        self.strategies, self.first, self.full, self.mix_diffuse = strategies, first, full, mix_diffuse
         self.camera_paths = camera_paths if first == 0 else 1
         self.context = mi.BSDFContext()
         self.smooth = mi.BSDFContext()
@@ -114,6 +116,12 @@ class OptimalWeights:
         f = dr.select(lambertian, f, dr.select(valid, weight, 0) * density)
         return f, dr.maximum(dr.select(lambertian, p, density), SMALLEST_DENSITY)
 
+    def is_last(self, bsdf, mask):
+        """Whether strategies end at a vertex of this BSDF: photons merged there are little noisier than what a path further on would bring."""
+        if self.mix_diffuse or not self.traits.has_lambertian:
+            return mi.Bool(False)
+        return lookup(self.traits.lambertian, bsdf, mi.Bool, mask) if self.traits.has_rough else mi.Bool(True)
+
     def side(self, si):
         """The geometric normal on the side of `si.wi`."""
         return mi.Vector3f(dr.mulsign(si.n, dr.dot(si.n, si.to_world(si.wi))))
@@ -134,18 +142,18 @@ class OptimalWeights:
             value = dr.select(lit, towards_light, lobe_f)
         ambient = AMBIENT_SHARE * self.cache.mean * lobe_f / (lobe_p * dr.pi)
         indirect = (known.second + known.later) * dr.inv_pi * lobe_f / lobe_p
-        return Node(f, p, value * known.direct * scale + ambient, indirect, lobe_f, lobe_p, known.noise, self.around(known.slot, mask))
+        return Node(f, p, value * known.direct * scale + ambient, indirect, lobe_f, lobe_p, known.noise, self.is_last(bsdf, mask))
 
-    def around(self, slot, mask):
-        """A function that makes the list of typical neighbours of a cell."""
-        return lambda: [(share, typical_node(*radiance)) for share, radiance in zip(SHARES, self.surroundings.lookup(slot, mask))]
+    def last_weight(self, drive, e, r, node):
+        """Weight of direct light at an inner vertex."""
+        return recursion.direct_weight(drive, e) * r / recursion.at_least(node.direct_r(self.n, r), recursion.SMALLEST)
 
     def offset(self, si, bsdf, mask):
         """G = n F / N_B at the first strategy's vertex, its means those of the typical neighbours of its cell."""
         f, p = self.lobe(si, bsdf, mask)
         r = recursion.first_ratio(p, self.camera_paths)
-        around = self.around(self.cache.slot(si.p, self.side(si), mask), mask)()
-        e = sum(share * response(1, self.strategies, True, self.n, r, neighbour)[0] for share, neighbour in around)
+        around = self.surroundings.lookup(self.cache.slot(si.p, self.side(si), mask), mask)
+        e = sum(share * response(1, self.strategies, True, self.n, r, typical_node(*radiance))[0] for share, radiance in zip(SHARES, around))
         return recursion.root_offset(f * (1 - e), e)
 
     # ------------------------------------------------------------------ camera paths (hooks of `trace_camera_paths`)
@@ -163,15 +171,14 @@ class OptimalWeights:
             at_root = mask & (vertex == self.first)
             u = dr.select(at_root, self.offset(si, bsdf, at_root) if self.full else mi.Spectrum(0), u)
             node = self.node(si, bsdf, mask & (vertex > self.first))
+            c = node.radiance(self.n)[1]
+            deepest = node.last | (vertex == self.first + self.strategies - 1)
             for level in range(1, self.strategies):
                 here = mask & (vertex == self.first + level)
                 e, carried = response(level, self.strategies, self.full, self.n, r, node)
                 u = dr.select(here, recursion.direct_weight(drive, e), u)
                 tau = dr.select(here, carried, tau)
-                if level == self.strategies - 1:
-                    weight = recursion.deepest_weight(drive, e, r, node.radiance(self.n)[1])
-                else:
-                    weight = recursion.direct_weight(drive, e) * r / recursion.at_least(node.direct_r(self.n, r), recursion.SMALLEST)
+                weight = dr.select(deepest, recursion.deepest_weight(drive, e, r, c), self.last_weight(drive, e, r, node))
                 share = dr.select(here, weight, share)
         return [drive, r, u, tau], share
 
@@ -199,10 +206,13 @@ class OptimalWeights:
         drive = dr.minimum(recursion.next_drive(1, u, tau, recursion.kernel_rest(r, f)), STEEPEST_DRIVE * dr.abs(u))
         return recursion.bounded_drive(drive, next_r), next_r
 
-    def worth_merging(self, state, share, vertex):
+    def ends(self, bsdf, vertex, mask):
+        """Whether the vertex is the path's last strategy though there are more."""
+        return (vertex >= self.first) & self.is_last(bsdf, mask)
+
+    def worth_merging(self, state, share, vertex, last):
         """Probability with which photons are gathered: where the weights are small, seldom."""
         _, _, u, _ = state
-        last = vertex >= self.first + self.strategies - 1
         weight = dr.max(dr.abs(dr.select(last, share, u)))
         return dr.select(vertex > self.first, dr.clip(weight / WEIGHT_KEPT, SELDOM, 1), 1)
 
@@ -234,18 +244,22 @@ class OptimalWeights:
         """Sum of the weights of the strategies at z_level and beyond."""
         (node, _), beyond = passed[0], passed[1:]
         e, tau = response(level, self.strategies, self.full, self.n, r, node)
+        deepest = recursion.deepest_weight(drive, e, r, node.radiance(self.n)[1])
         if level == self.strategies - 1:
-            return recursion.deepest_weight(drive, e, r, node.radiance(self.n)[1])
+            return deepest
         u = recursion.direct_weight(drive, e)
         deeper = self.deeper_sum(level + 1, *self.step(u, tau, r, node.f, node.p), beyond)
         here = recursion.inner_weight(drive, e, recursion.kernel_share(r, node.f), deeper)
-        return dr.select(beyond[0][1], here + deeper, u * r / recursion.at_least(node.direct_r(self.n, r), recursion.SMALLEST))
+        return dr.select(node.last, deepest, dr.select(beyond[0][1], here + deeper, self.last_weight(drive, e, r, node)))
 
 
-class SeenFromAbove:
-    """A noted vertex at the depth where only its radiance and b / L matter."""
+class NotedNode(Node):
+    """A node read from a photon's notes. Of a path's deepest vertex only the radiance and b / L are noted, and nothing else is asked."""
 
-    def __init__(self, radiance, c):
+    def __init__(self, radiance, c, direct=None, f=None, p=None, noise=None, lobe_f=None, lobe_p=None):
+        last = True if noise is None else noise < 0
+        indirect = None if direct is None else radiance - direct
+        super().__init__(f, p, direct, indirect, lobe_f, lobe_p, None if noise is None else dr.select(last, -1 - noise, noise), last)
         self._known = radiance, c
 
     def radiance(self, n):
@@ -260,26 +274,25 @@ class Notebook:
         self.weights = weights
         self.whole = weights.strategies - 2
 
-    def _fields(self, node, slot):
+    def _fields(self, node):
         radiance, c = node.radiance(self.weights.n)
         fields = [mi.Spectrum(radiance), mi.Spectrum(c)]
         if self.whole:
-            fields += [node.direct, node.f, node.p, node.noise]
+            fields += [node.direct, node.f, node.p, dr.select(node.last, -1 - node.noise, node.noise)]     # negative: the last
             if self.weights.full:
-                fields += [node.lobe_f, node.lobe_p, mi.UInt32(slot)]
+                fields += [node.lobe_f, node.lobe_p]
         return fields
 
     def begin(self):
         none, zero = mi.Spectrum(-1), mi.Spectrum(0)              # a vertex that does not exist has negative radiance
-        node = Node(mi.Spectrum(0), mi.Float(0), mi.Spectrum(0), mi.Spectrum(0), mi.Spectrum(0), mi.Float(1), mi.Float(0), None)
-        return [[mi.Spectrum(none), *[type(x)(x) for x in self._fields(node, 0)[1:]]] for _ in range(self.whole)] + [[none, zero]]
+        node = Node(mi.Spectrum(0), mi.Float(0), mi.Spectrum(0), mi.Spectrum(0), mi.Spectrum(0), mi.Float(1), mi.Float(0), mi.Bool(False))
+        return [[mi.Spectrum(none), *[type(x)(x) for x in self._fields(node)[1:]]] for _ in range(self.whole)] + [[none, zero]]
 
     def scattered(self, state, si, bsdf, wo, mask):
         view = mi.SurfaceInteraction3f(si)
         view.wi = mi.Vector3f(wo)
-        f, p = self.weights.scattering(view, bsdf, si.wi, mask)
-        slot = self.weights.cache.slot(si.p, self.weights.side(view), mask)
-        new = self._fields(self.weights.node(view, bsdf, mask, f, p), slot)
+        f, p = self.weights.scattering(view, bsdf, si.wi, mask) if self.whole else (None, None)
+        new = self._fields(self.weights.node(view, bsdf, mask, f, p))
         result = []
         for old in state:
             result.append([dr.select(mask, a, b) for a, b in zip(new, old)])
@@ -290,7 +303,7 @@ class Notebook:
         words = []
         for fields in state:
             for field in fields:
-                words += [x if isinstance(x, mi.UInt32) else float_bits(x) for x in (field if dr.depth_v(field) > 1 else [field])]
+                words += [float_bits(x) for x in (field if dr.depth_v(field) > 1 else [field])]
         return words + [mi.UInt32(0)] * ((2 - len(words)) if len(words) <= 2 else -len(words) % 4)
 
     def read(self, level, notes, index, active):
@@ -310,15 +323,6 @@ class Notebook:
             for field in fields:
                 size = dr.size_v(mi.Spectrum) if dr.depth_v(field) > 1 else 1
                 mine, words = words[:size], words[size:]
-                values.append(mine[0] if isinstance(field, mi.UInt32) else mi.Spectrum([bits_float(w) for w in mine])
-                              if dr.depth_v(field) > 1 else bits_float(mine[0]))
-            passed.append((self._node(values, active), dr.max(values[0]) >= 0))
+                values.append(mi.Spectrum([bits_float(w) for w in mine]) if dr.depth_v(field) > 1 else bits_float(mine[0]))
+            passed.append((NotedNode(*values), dr.max(values[0]) >= 0))
         return passed
-
-    def _node(self, values, active):
-        radiance, c, *rest = values
-        if not rest:
-            return SeenFromAbove(radiance, c)
-        direct, f, p, noise, *rest = rest
-        lobe_f, lobe_p, slot = rest or (None, None, None)
-        return Node(f, p, direct, radiance - direct, lobe_f, lobe_p, noise, self.weights.around(slot, active) if rest else None)

@@ -86,8 +86,10 @@ class Pilot:
             stride -= 1
         self.stride = stride * session.integrator.camera_paths
         self.ladder = None
-        # Caustics have edges of their own; only the smooth indirect light gains from knowing the surfaces' edges.
-        self.ways = {kind: [False, True] if kind == "indirect" else [False] for kind in session.kinds()}
+        # Caustics have edges of their own; only the smooth indirect light gains from knowing the surfaces' edges, and only where the camera
+        # sees the vertices: deeper ones are spread over the scene, and their blur averages out.
+        self.at_first_vertex = session.integrator.bdd == 0
+        self.ways = {kind: [False, True] if kind == "indirect" and self.at_first_vertex else [False] for kind in session.kinds()}
         self.samples = {(kind, way): [] for kind, ways in self.ways.items() for way in ways}
         self.direct, self.photons = [], {}
         capacity = session._vertex_room(self.paths) * (1 if session.one_vertex else 4)
@@ -161,6 +163,6 @@ class Pilot:
             choices = []
             for way in ways:
                 radius, error = best_radius(self.ladder, samples[kind, way], mean,
-                                            lambda r, way=way: np.maximum(count / self._cost(kind, way, r), 1))
+                                            lambda r, way=way: np.maximum(count / self._cost(kind, way, r), 1), self.at_first_vertex)
                 choices.append((error * CORRECTION_HEADSTART if way else error, radius, way))
             _, session.radii[kind], session.corrected[kind] = min(choices)

@@ -6,8 +6,6 @@ import drjit as dr
 import mitsuba as mi
 
 from ..transport.camera_pass import STATE, trace_camera_paths
-from ..transport.coverage import covered_share
-from ..transport.film import splat_samples
 from ..transport.gather import gather_photons, vertex_section
 from ..transport.light_pass import trace_light_paths
 from .bdpm import BDPM, BDPMSession
@@ -25,14 +23,18 @@ class WeightedBDPM(BDPM):
 
 
 class WeightedSession(BDPMSession):
-    """Iterations of a `WeightedBDPM`. A subclass makes the weights.
+    """Iterations of a `WeightedBDPM`. A subclass makes the weights."""
 
-    The radius is chosen as for merging at the first vertex alone, where its blur is seen most.
-    """
+    weighted_pilot = False
+    """Whether the pilot of the automatic radius renders under the weights, made for `usual_radius()`; else it merges at the first vertex."""
 
     def __init__(self, integrator, scene, sensor, seed, iterations):
-        self._weighted = False                     # the pilot of the radius merges at the first vertex, without weights
+        self._weighted = False
         super().__init__(integrator, scene, sensor, seed, iterations)
+
+    def mixes(self):
+        """Whether the scene has paths that several strategies make."""
+        return True
 
     def prepare(self, spectral):
         """Makes what the weights need, once, when the radius is known."""
@@ -45,21 +47,34 @@ class WeightedSession(BDPMSession):
         """Expected photons in the merge disk per unit of irradiance: a spectrum of width one."""
         raise TypeError(f"{type(self).__name__} does not define photons_per_irradiance")
 
+    def weigher(self, weights, kind, level, vertices, photon_map):
+        """What weighs the photons of a map, of one kind, at the vertices of one strategy (`weigh` of `gather_photons`); None where a vertex
+        weighs all of them as it does its direct light. Caustic photons are merged at all vertices at once (`level` is None)."""
+        if kind == "caustic" or level == self.integrator.strategies - 1:
+            return None
+        notebook, state = weights.notebook(), [vertices[name] for name in STATE]
+
+        def weigh(index, f, p, back, active):
+            return weights.merging(level, state, f, p, notebook.read(level, photon_map.notes, index, active))
+        return weigh
+
     def _start(self):
-        super()._start()
-        if not self._weighted:
+        if not self._weighted and self.kinds() and self.mixes():
+            if not self.weighted_pilot:
+                super()._start()
             self.prepare(super()._spectral(0))
             self._weighted, self.one_vertex = True, False
             self.vertex_capacity = self._vertex_room(self.chunk)
             self._freeze()
+        super()._start()
 
     def _vertex_room(self, paths):
         return super()._vertex_room(paths) if not self._weighted else paths * (2 if self.traits.has_mixed else 1)
 
     def _spectral(self, iteration):
         spectral = super()._spectral(iteration)
-        if self._weighted and self.radii:
-            radii = self.radii_at(iteration)
+        if self._weighted:
+            radii = self.radii_at(iteration) if self.radii else {"indirect": self.usual_radius()}
             spectral["n"] = self.photons_per_irradiance(radii.get("indirect", radii.get("caustic")))
             dr.make_opaque(spectral["n"])
         return spectral
@@ -72,51 +87,39 @@ class WeightedSession(BDPMSession):
                                  sensor.shutter_open(), sensor.shutter_open_time(), self.integrator.max_depth, self.integrator.rr_depth,
                                  notebook=notebook)
 
-    def _render_chunk(self, scene, sensor, tables, photons, seed, first, spectral, radii):
+    def _trace_camera(self, scene, sensor, seed, first, stride, paths, capacity, spectral):
+        if not self._weighted:
+            return super()._trace_camera(scene, sensor, seed, first, stride, paths, capacity, spectral)
         integrator = self.integrator
-        weights = self.weights(spectral.get("n"))
-        last = integrator.first_vertex + integrator.strategies - 1
-        radiance, alpha, position, vertices, count = trace_camera_paths(
-            scene, sensor, integrator, self.lights, self.traits, seed, first, 1, self.chunk, integrator.camera_paths, spectral["sample"],
-            last, integrator.max_depth, integrator.rr_depth, integrator.hide_emitters, self.vertex_capacity if radii else 0,
-            self.has_caustics, self.has_indirect, False, weights)
-        if radii:
-            dr.eval(radiance, alpha, position, vertices, count)
-        if "caustic" in radii:
-            radiance += self._merge_weighted_by_vertex(photons, vertices, "caustic", radii["caustic"], spectral)
-        if "indirect" in radii:
-            photon_map = self._map(photons, "indirect", radii["indirect"])
-            for level in range(integrator.strategies):
-                radiance += self._merge_at(level, scene, photon_map, vertices, weights, radii["indirect"], seed, spectral)
-        if integrator.hide_emitters:
-            radiance = dr.select(alpha > 0, radiance, 0)
-        active = dr.arange(mi.UInt32, self.chunk) + first < self.path_count
-        return splat_samples(sensor.film(), position, radiance, alpha, spectral["matrix"], active), count
+        return trace_camera_paths(scene, sensor, integrator, self.lights, self.traits, seed, first, stride, paths, integrator.camera_paths,
+                                  spectral["sample"], integrator.first_vertex + integrator.strategies - 1, integrator.max_depth,
+                                  integrator.rr_depth, integrator.hide_emitters, capacity, self.has_caustics, self.has_indirect, False,
+                                  self.weights(spectral["n"]))
 
-    def _merge_weighted_by_vertex(self, photons, vertices, kind, radius, spectral):
-        """Photons whose weight is that of the direct light at the vertex."""
-        vertices = _shared(vertices)
-        (gathered,) = self._gather(photons, vertices, kind, [radius], spectral)
-        return self._per_path(gathered, vertices, self.chunk)
-
-    def _merge_at(self, level, scene, photon_map, vertices, weights, radius, seed, spectral):
-        """Indirect photons at the vertices of one strategy."""
+    def _gather(self, photons, vertices, kind, radii, spectral, grey=False):
+        if not self._weighted:
+            return super()._gather(photons, vertices, kind, radii, spectral, grey)
+        photon_map = self._map(photons, kind, radii[-1])
+        weights = self.weights(spectral["n"])
+        if kind == "caustic":
+            return self._merge(kind, None, photon_map, vertices, weights, radii, spectral, grey)
         integrator = self.integrator
-        vertices = vertex_section(vertices, (level + integrator.first_vertex) * self.vertex_capacity, self.vertex_capacity)
-        weigh = None
-        if level == integrator.strategies - 1:
-            vertices = _shared(vertices)             # at the last strategy the weight is the same for all
-        else:
-            notebook, state = weights.notebook(), [vertices[name] for name in STATE]
+        width = dr.width(vertices["path"])
+        section = width // (integrator.first_vertex + integrator.strategies)
+        totals = [dr.zeros(mi.Float if grey else mi.Spectrum, width) for _ in radii]
+        for level in range(integrator.strategies):
+            first = (level + integrator.first_vertex) * section
+            merged = self._merge(kind, level, photon_map, vertex_section(vertices, first, section), weights, radii, spectral, grey)
+            for total, values in zip(totals, merged):
+                dr.scatter(total, values, dr.arange(mi.UInt32, section) + first)
+        dr.eval(totals)
+        return totals
 
-            def weigh(index, f, p, active):
-                return weights.merging(level, state, f, p, notebook.read(level, photon_map.notes, index, active))
-        (gathered,) = gather_photons(self.traits, photon_map, vertices, [radius], spectral["wavelengths"], self.light_paths,
-                                     integrator.max_depth, only_last=True, weigh=weigh)
-        if level == 0 and self.corrected["indirect"]:
-            used = dr.max(vertices["throughput"]) > 0
-            gathered *= dr.rcp(covered_share(scene, vertices, radius, seed, used))
-        return self._per_path(gathered, vertices, self.chunk)
+    def _merge(self, kind, level, photon_map, vertices, weights, radii, spectral, grey):
+        """Weighted radiance that photons of one kind bring to the vertices of one strategy."""
+        weigh = self.weigher(weights, kind, level, vertices, photon_map)
+        return gather_photons(self.traits, photon_map, vertices if weigh else _shared(vertices), radii, spectral["wavelengths"],
+                              self.light_paths, self.integrator.max_depth, only_last=kind == "indirect", grey=grey, weigh=weigh)
 
 
 def _shared(vertices):

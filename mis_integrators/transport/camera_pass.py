@@ -69,8 +69,11 @@ def trace_camera_paths(scene, sensor, integrator, lights, traits, seed, first, s
     With `weights` all photons are wanted at every smooth vertex, and direct light at each is weighted: `begin(width)` gives a path's state,
     `arrived(state, si, bsdf, vertex, mask)` the state at a smooth vertex and its weight of direct light (a spectrum), `leaving(state, si,
     bsdf, bs, vertex, mask)` the state after a smooth scattering, `stored(state)` three spectra to keep with the vertex, `worth_merging(state,
-    share, vertex)` and `worth_going_on(state, vertex)` probabilities with which to gather at the vertex and to leave it. The vertex buffer is
-    then one section for each smooth vertex of the path, of `capacity` each, and `count` has one entry for each.
+    share, vertex, last)` and `worth_going_on(state, vertex)` probabilities with which to gather at the vertex and to leave it. An optional
+    `ends(bsdf, vertex, mask)` tells vertices beyond which no strategy goes on. Where the weight of direct light depends on the point of the
+    light, too, an optional `direct_share(state, ref, ds, mask)` replaces what `arrived` said, with the state after leaving `ref` towards the
+    light `ds`. The vertex buffer is then one section for each smooth vertex of the path, of `capacity` each (a path's last vertex in the last
+    section), and `count` has one entry for each.
     """
     path = dr.arange(mi.UInt32, n_paths)
     number = path * stride + first
@@ -101,6 +104,7 @@ def trace_camera_paths(scene, sensor, integrator, lights, traits, seed, first, s
         sections = bdd + 1
         state = weights.begin(n_paths)
     share_here = mi.Spectrum(1)                      # weight of the direct light at the last smooth vertex
+    by_light = hasattr(weights, "direct_share")
     store = Store(vertices=new_vertex_buffer(capacity * sections, weights is not None), count=dr.zeros(mi.UInt32, sections))
     environment_shows = (scene.environment() is not None) and not hide_emitters
     visible = mi.Bool(environment_shows)
@@ -126,7 +130,10 @@ def trace_camera_paths(scene, sensor, integrator, lights, traits, seed, first, s
             if dr.hint(hide_emitters, mode='scalar'):
                 shown &= (depth > 1) | si.is_valid()
             light_pdf = lights.pdf_direct(origin, ds, shown & (vertex > 0))
-            share = dr.select(vertex == 0, mi.Spectrum(1), mis_power(scatter_pdf, light_pdf) * share_here)
+            weight_here = share_here
+            if dr.hint(by_light, mode='scalar'):
+                weight_here = weights.direct_share(state, origin, ds, shown & (vertex > 0))
+            share = dr.select(vertex == 0, mi.Spectrum(1), mis_power(scatter_pdf, light_pdf) * weight_here)
             radiance[shown] += throughput * share * ds.emitter.eval(si, shown)
 
         active &= si.is_valid() & (vertex <= bdd)
@@ -138,12 +145,21 @@ def trace_camera_paths(scene, sensor, integrator, lights, traits, seed, first, s
         if dr.hint(weights is not None, mode='scalar'):
             state, arrived_share = weights.arrived(state, si, bsdf, vertex, smooth)
             share_here = dr.select(smooth, arrived_share, share_here)
+        ends = vertex >= bdd                         # the path's last smooth vertex
+        if dr.hint(hasattr(weights, "ends"), mode='scalar'):
+            ends |= weights.ends(bsdf, vertex, smooth)
 
         # ---- Direct light
         if dr.hint(not lights.dark, mode='scalar'):
             ds, light, light_pdf = lights.sample_direct(si, rng, smooth)
-            response, response_pdf = bsdf.eval_pdf(context, si, si.to_local(ds.d), smooth)
-            share = dr.select(ds.delta, 1, mis_power(light_pdf, response_pdf)) * share_here
+            towards = si.to_local(ds.d)
+            response, response_pdf = bsdf.eval_pdf(context, si, towards, smooth)
+            weight_here = share_here
+            if dr.hint(by_light, mode='scalar'):
+                reached = smooth & (dr.max(light) > 0)         # elsewhere `ds` may not even be a number
+                left = weights.leaving(state, si, bsdf, mi.BSDFSample3f(towards), vertex, reached)
+                weight_here = weights.direct_share(left, si, ds, reached)
+            share = dr.select(ds.delta, 1, mis_power(light_pdf, response_pdf)) * weight_here
             radiance[smooth] += throughput * share * response * light
 
         # ---- Ask for photons
@@ -152,15 +168,16 @@ def trace_camera_paths(scene, sensor, integrator, lights, traits, seed, first, s
         kept = mi.Float(1)
         if dr.hint(weights is not None, mode='scalar'):
             last |= True
-            kept = weights.worth_merging(state, share_here, vertex)
-            wants &= rng.next_float32(wants) < kept
+            if dr.hint(sections > 1, mode='scalar'):
+                kept = weights.worth_merging(state, share_here, vertex, ends)
+                wants &= rng.next_float32(wants) < kept
         if dr.hint(not has_caustics, mode='scalar'):
             wants &= last & has_indirect
         slot = mi.UInt32(path)
         if dr.hint(not one_vertex, mode='scalar'):
             section = mi.UInt32(0)
             if dr.hint(weights is not None, mode='scalar'):
-                section = dr.minimum(vertex, bdd)
+                section = dr.select(ends, mi.UInt32(bdd), vertex)
             slot = dr.scatter_inc(store.count, section, wants)
             wants &= slot < capacity
             slot += section * capacity
@@ -182,19 +199,20 @@ def trace_camera_paths(scene, sensor, integrator, lights, traits, seed, first, s
         delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         visible |= active & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
         if dr.hint(not traits.has_light_surfaces, mode='scalar'):
-            active &= delta | (vertex < bdd)
+            active &= delta | ~ends
         if dr.hint(weights is not None, mode='scalar'):
             state = weights.leaving(state, si, bsdf, bs, vertex, active & ~delta)
-            kept_on = dr.select(active & ~delta, weights.worth_going_on(state, vertex), 1)
-            active &= rng.next_float32(active) < kept_on
-            weight *= dr.rcp(dr.select(active, kept_on, 1))
+            if dr.hint(sections > 1, mode='scalar'):
+                kept_on = dr.select(active & ~delta, weights.worth_going_on(state, vertex), 1)
+                active &= rng.next_float32(active) < kept_on
+                weight *= dr.rcp(dr.select(active, kept_on, 1))
         throughput *= weight
         eta *= bs.eta
         ray = si.spawn_ray(si.to_world(bs.wo))
         scattered = active & ~delta
         origin[scattered] = mi.Interaction3f(si)
         scatter_pdf[scattered] = bs.pdf
-        vertex[scattered] += 1
+        vertex[scattered] = dr.select(ends, mi.UInt32(bdd), vertex) + 1
         behind_delta = mi.Bool(delta)
         strength = dr.max(throughput)
         active &= strength > 0

@@ -27,8 +27,9 @@ def gather_photons(traits, photon_map, vertices, radii, wavelengths, light_paths
     Constant kernel on a disk: the sum over photons of f x flux, over (pi radius^2 x light sub-paths). Flux through the surface
     carries the geometric cosine where the photon landed, `path`'s scattering integral the shading one at the vertex, hence the
     ratio of the two.
-    `weigh(index, f, p, active)`, if given, is the weight (a spectrum) of photon `index` of the map where the vertex scatters it with value f (a spectrum,
-    without cosine) and a camera path would go there with density p per projected solid angle.
+    `weigh(index, f, p, back, active)`, if given, is the weight (a spectrum) of photon `index` of the map where the vertex scatters it with value f (a
+    spectrum, without cosine) and a camera path would go there with density p per projected solid angle; `back()` computes the density with
+    which a light sub-path would go on from there to the vertex before.
     Returns a list with a `Spectrum` of the vertices' width for each radius, throughput included; with `grey` the mean over its
     channels (fewer sums to keep for many radii).
     """
@@ -86,7 +87,16 @@ def gather_photons(traits, photon_map, vertices, radii, wavelengths, light_paths
                 scale = dr.rcp(dr.maximum(dr.abs(wo.z), 1e-6))
                 value = dr.select(lambertian, value, rough)
                 f, p = dr.select(lambertian, lambert_f, rough * scale), dr.select(lambertian, lambert_p, pdf * scale)
-            value *= dr.select(dr.max(value) > 0, weigh(index, f, p, hit), 0)
+
+            def back():
+                if not traits.has_rough:
+                    return lambert_p
+                view = mi.SurfaceInteraction3f(si)
+                view.wi = mi.Vector3f(wo)
+                pdf = bsdf.pdf(mi.BSDFContext(mi.TransportMode.Importance), view, si.wi, hit & ~lambertian)
+                return dr.select(lambertian, lambert_p, pdf * dr.rcp(dr.maximum(dr.abs(facing), 1e-6)))
+
+            value *= dr.select(dr.max(value) > 0, weigh(index, f, p, back, hit), 0)
         value *= flux * dr.rcp(landing)
         if grey:
             value = dr.mean(value * factor)

@@ -310,12 +310,15 @@ class EnvironmentGuide:
         upper = dr.gather(mi.Float, self._direction_cdf, cell, active)
         lower = dr.select(cell > 0, dr.gather(mi.Float, self._direction_cdf, dr.maximum(cell, 1) - 1, active), 0)
         leftover = dr.clip((sample.x - lower) / dr.maximum(upper - lower, 1e-20), 0, 0.9999999)
-        towards = dr.select(own, ds.d, cell_direction(cell, mi.Point2f(leftover, sample.y)))
-        row = direction_cell(towards)
-        ds.d = towards
-        own_pdf = emitter.pdf_direction(it, ds, active)
-        table_pdf = dr.gather(mi.Float, self._direction_pmf, row, active) * (DIRECTION_CELLS / (4 * dr.pi))
-        return towards, share * own_pdf + (1 - share) * table_pdf, first + row, extra
+        ds.d = dr.select(own, ds.d, cell_direction(cell, mi.Point2f(leftover, sample.y)))
+        return ds.d, self.direction_density(emitter.pdf_direction(it, ds, active), ds.d, active), first + direction_cell(ds.d), extra
+
+    def direction_density(self, own_pdf, towards, active=True):
+        """Density per solid angle of `sample_direction`, where the environment's own sampler has density `own_pdf`."""
+        if self.direction_share == 1.0:
+            return own_pdf
+        table_pdf = dr.gather(mi.Float, self._direction_pmf, direction_cell(towards), active) * (DIRECTION_CELLS / (4 * dr.pi))
+        return self.direction_share * own_pdf + (1 - self.direction_share) * table_pdf
 
     # ------------------------------------------------------------------ power
 

@@ -73,7 +73,9 @@ def trace_light_paths(scene, lights, traits, seed, n_paths: int, capacity: int, 
 
     A `notebook` writes down what weights must know of the vertices that a photon has passed: `begin()` gives a sub-path's state (a list
     of arrays), `scattered(state, si, bsdf, wo, mask)` the state after a smooth scattering into local direction `wo`, `words(state)` a list of
-    uint32 words to store with a photon. The result then has a fourth array, these words.
+    uint32 words to store with a photon. An optional `lit(state, si, source, straight)` learns, at each vertex, on which lanes
+    next-event estimation could bring the same light there, from the point `source` (a `DirectionSample3f` as `sample_emission` makes it). The
+    result then has a fourth array, these words.
     """
     lanes = n_paths
     if dr.hint(dr.backend_v(mi.Float) == dr.JitBackend.LLVM, mode='scalar'):
@@ -101,11 +103,12 @@ def trace_light_paths(scene, lights, traits, seed, n_paths: int, capacity: int, 
     while dr.hint(active | (path < n_paths), label="light sub-paths"):
         # ---- Start the lane's next path where one has ended
         begin = ~active & (path < n_paths)
+        source = dr.zeros(mi.DirectionSample3f)
         if begin:
             time = mi.Float(shutter_open)
             if dr.hint(shutter_time > 0, mode='scalar'):
                 time += rng.next_float32() * shutter_time
-            ray, flux, had_delta = lights.sample_emission(rng, time, wavelengths)
+            ray, flux, had_delta, source = lights.sample_emission(rng, time, wavelengths)
             strength = dr.rcp(dr.maximum(dr.max(flux), 1e-38))
             scattered = mi.Bool(False)
             depth = mi.UInt32(0)
@@ -119,6 +122,8 @@ def trace_light_paths(scene, lights, traits, seed, n_paths: int, capacity: int, 
         active &= si.is_valid()
         depth += 1
         bsdf = si.bsdf(ray)
+        if dr.hint(hasattr(notebook, "lit"), mode='scalar'):
+            notes = notebook.lit(notes, si, source, active & begin & ~had_delta)
 
         # ---- Store a photon
         keep = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth) & (scattered | had_delta | keep_direct)

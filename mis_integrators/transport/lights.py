@@ -12,6 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .guide import direction_cell
 from .random import next_2d, streams
 from .traits import UnsupportedScene, lookup, registry_table
 
@@ -215,15 +216,20 @@ class Lights:
 
     def pdf_direct(self, ref, ds, active):
         """Density per solid angle with which `sample_direct` finds the emitter point of `ds` from `ref`."""
+        pdf = self._pdf_of_emitter(ref, ds, active)
+        if len(self.emitters) > 1:
+            pdf *= self.choice.probability(lookup(self.numbers, ds.emitter, mi.UInt32, active))
+        return dr.select(active, pdf, 0)
+
+    def _pdf_of_emitter(self, ref, ds, active):
+        """`pdf_direct` without the emitter's choice."""
         emitter = ds.emitter
         pdf = emitter.pdf_direction(ref, ds, active)
         if self.has_textured:
             textured = active & self._textured_mask(emitter)
             by_area = dr.square(ds.dist) / (dr.abs_dot(ds.d, ds.n) * emitter.get_shape().surface_area())
             pdf = dr.select(textured, dr.select(dr.dot(ds.d, ds.n) < 0, by_area, 0), pdf)
-        if len(self.emitters) > 1:
-            pdf *= self.choice.probability(lookup(self.numbers, emitter, mi.UInt32, active))
-        return dr.select(active, pdf, 0)
+        return pdf
 
     @staticmethod
     def _textured_mask(emitter):
@@ -250,9 +256,9 @@ class Lights:
     def sample_emission(self, rng, time, wavelengths, active=True):
         """Starts a light sub-path.
 
-        Returns `(ray, flux, unreachable)`: the ray, the flux it carries (emitted radiance times cosine over all densities,
-        so that its mean over sub-paths is the power that leaves the emitters), and whether next-event estimation cannot make
-        the light of this ray's first vertex.
+        Returns `(ray, flux, unreachable, source)`: the ray, the flux it carries (emitted radiance times cosine over all densities,
+        so that its mean over sub-paths is the power that leaves the emitters), whether next-event estimation cannot make
+        the light of this ray's first vertex, and a `DirectionSample3f` of which the emitter, the point and the normal there are set.
         """
         index, probability = self.choice.sample(rng.next_float32() if self.choice.count > 1 else mi.Float(0))
         emitter = self.pointer(index)
@@ -263,18 +269,59 @@ class Lights:
         ray = mi.Ray3f(mi.Point3f(0), mi.Vector3f(0, 0, 1), mi.Float(time), wavelengths)
         flux = mi.Spectrum(0)
         unreachable = mi.Bool(False)
+        source = dr.zeros(mi.DirectionSample3f)
+        source.emitter = emitter
         for number, name in enumerate(_KINDS):
             if name not in self.kinds:
                 continue
             chosen = kind == number
-            o, d, value = getattr(self, "_emit_" + name)(emitter, index, sample_a, sample_b, extra, time, wavelengths, chosen)
+            o, d, value, *surface = getattr(self, "_emit_" + name)(emitter, index, sample_a, sample_b, extra, time, wavelengths, chosen)
             ray.o = dr.select(chosen, o, ray.o)
             ray.d = dr.select(chosen, d, ray.d)
+            p, n = surface or (o, mi.Normal3f(0))
+            source.p, source.n = dr.select(chosen, p, source.p), dr.select(chosen, n, source.n)
             flux = dr.select(chosen, value, flux)
             if name == "directionalarea":
                 unreachable |= chosen
         flux = dr.select(active, flux * dr.rcp(probability), 0)
-        return ray, dr.select(dr.isfinite(luminance_of(flux)), flux, 0), unreachable
+        return ray, dr.select(dr.isfinite(luminance_of(flux)), flux, 0), unreachable, source
+
+    def emission_ratio(self, ref, ds, active):
+        """How likely a light sub-path brings the light of `ds` to `ref`, over how likely next-event estimation does: density of
+        `sample_emission` per unit area across the ray at `ref` times its density of the light's point or direction, over the latter's density of
+        `sample_direct` [1/m^2]. The choice among emitters is the same for both and cancels. Zero for what next-event estimation cannot make."""
+        ratio = mi.Float(0)
+        index = lookup(self.numbers, ds.emitter, mi.UInt32, active)
+        kind = dr.gather(mi.UInt32, self.kind_table, index, active)
+        for number, name in enumerate(_KINDS):
+            if name in self.kinds and name != "directionalarea":
+                chosen = active & (kind == number)
+                ratio = dr.select(chosen, getattr(self, "_ratio_" + name)(ref, ds, index, chosen), ratio)
+        return ratio
+
+    @staticmethod
+    def _ratio_point(ref, ds, index, active):
+        return dr.rcp(4 * dr.pi * dr.square(ds.dist))
+
+    def _ratio_spot(self, ref, ds, index, active):
+        cosine = dr.gather(mi.Float, self._spot_cosine, index, active)
+        return mi.warp.square_to_uniform_cone_pdf(mi.Vector3f(0, 0, 1), cosine) * dr.rcp(dr.square(ds.dist))
+
+    def _ratio_directional(self, ref, ds, index, active):
+        return self.guide.position_density(ds.d, self.guide.row_of_emitter(self._scene_index(index)), ref.p, active)
+
+    def _ratio_environment(self, ref, ds, index, active):
+        own_pdf = ds.emitter.pdf_direction(ref, ds, active)
+        row = self.guide.row_of_emitter(self._scene_index(index)) + direction_cell(ds.d)
+        density = self.guide.direction_density(own_pdf, ds.d, active) * self.guide.position_density(ds.d, row, ref.p, active)
+        return dr.select(own_pdf > 0, density * dr.rcp(own_pdf), 0)
+
+    def _ratio_area(self, ref, ds, index, active):
+        pdf = self._pdf_of_emitter(ref, ds, active) * (dr.pi * ds.emitter.get_shape().surface_area())
+        return dr.select(pdf > 0, dr.rcp(pdf), 0)
+
+    def _ratio_ray(self, ref, ds, index, active):
+        return self._ratio_point(ref, ds, index, active)           # Mitsuba does not tell: as if it shone evenly all around
 
     @staticmethod
     def _reference(p, time, wavelengths):
@@ -330,7 +377,7 @@ class Lights:
         si.wi = mi.warp.square_to_cosine_hemisphere(sample_b)
         radiance = emitter.eval(si, active)
         ray = si.spawn_ray(si.to_world(si.wi))
-        return ray.o, ray.d, radiance * dr.select(ps.pdf > 0, dr.pi * dr.rcp(ps.pdf), 0)
+        return ray.o, ray.d, radiance * dr.select(ps.pdf > 0, dr.pi * dr.rcp(ps.pdf), 0), ps.p, ps.n
 
     def _emit_directionalarea(self, emitter, index, sample_a, sample_b, extra, time, wavelengths, active):
         return self._emit_ray(emitter, index, sample_a, sample_b, extra, time, wavelengths, active)

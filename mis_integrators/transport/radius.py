@@ -39,14 +39,22 @@ def relative_weights(mean):
     return 1 / (mean ** 2 + 0.1 * usual ** 2 + 1e-30)
 
 
-def noise_and_difference(samples, weights):
+def noise_of_photons(radii, variance, floor):
+    """V(R), no smaller than what the larger radii say: the noise of photons falls with the area of the disk, above a `floor` that is not theirs.
+    Small disks seldom meet the rare bright photons that large ones have seen."""
+    photons = np.maximum(variance - floor, 0) * radii ** 2
+    return floor + np.maximum.accumulate(photons[::-1])[::-1] / radii ** 2
+
+
+def noise_and_difference(radii, samples, weights, at_first_vertex=True):
     """V and Q of the module's docstring, one a radius, with Q's standard error.
 
-    `samples`: (iterations, radii, pixels) gathered values of independent iterations; `weights`: (pixels,).
+    `samples`: (iterations, radii, pixels) gathered values of independent iterations; `weights`: (pixels,); `at_first_vertex`: whether all
+    noise is the photons', because the vertices that gather are those which the camera sees.
     """
     m = samples.shape[0]
     variance = np.mean(weights * samples.var(axis=0, ddof=1), axis=1)
-    variance = np.maximum.accumulate(variance[::-1])[::-1]               # a larger disk is never noisier; rare bright photons say so
+    variance = noise_of_photons(radii, variance, 0.0 if at_first_vertex else variance.min())
     steps = np.diff(samples, axis=1)                                      # (m, radii - 1, pixels)
     pairs = weights * (steps.sum(axis=0) ** 2 - (steps ** 2).sum(axis=0)) / (m * (m - 1))
     difference = np.concatenate([[0.0], pairs.mean(axis=1)])
@@ -76,14 +84,14 @@ def expected_difference(radii, difference, error, wanted):
     return np.einsum("qh,qhr->r", weight, heights * (wanted / radii[-1]) ** slopes)
 
 
-def best_radius(radii, samples, mean, iterations):
+def best_radius(radii, samples, mean, iterations, at_first_vertex=True):
     """The radius that minimises the predicted relative error.
 
-    `radii`: the ladder; `samples`: see `noise_and_difference`; `mean`: (pixels,) mean radiance; `iterations(R)`: how many iterations
+    `radii`: the ladder; `samples`, `at_first_vertex`: see `noise_and_difference`; `mean`: (pixels,) mean radiance; `iterations(R)`: how many iterations
     there will be, a function of the radius, so that larger gathers are charged for.
     Returns `(radius, predicted error at it)`.
     """
-    variance, difference, error = noise_and_difference(samples, relative_weights(mean))
+    variance, difference, error = noise_and_difference(radii, samples, relative_weights(mean), at_first_vertex)
     fine = np.exp(np.linspace(np.log(radii[0]), np.log(radii[-1]), 16 * len(radii)))
     noise = np.exp(np.interp(np.log(fine), np.log(radii), np.log(np.maximum(variance, 1e-30))))
     predicted = BIAS_FACTOR * expected_difference(radii, difference, error, fine) + noise / iterations(fine)

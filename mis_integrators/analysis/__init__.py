@@ -1,0 +1,1 @@
+"""Error metrics, variance maps and charts. Nothing here renders."""

@@ -1,0 +1,275 @@
+"""Optimal weights where they meet transport: one weight function for all strategies, unbiased renders, less noise.
+
+Comparisons with `path`: as in `test_against_path` (false-alarm rate 1e-6 each; an error of 1 % in the image and of 3 or 8 % in a block is seen
+with a probability of 0.95).
+"""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from comparing import agree, t_quantile
+from test_against_path import LENS, MONO, ORTHO, PERSPECTIVE, RGB, SPECTRAL, oracle
+from worlds import EMITTERS, RADIUS, has_delta, tray
+
+
+def weighted(plugin="bdpm_opt", **parameters):
+    return mi.load_dict({"type": plugin, "initial_radius": RADIUS, "max_depth": 5, "photon_count": 20000, "camera_paths": 8,
+                         "frozen_photons": 40000, **parameters})
+
+
+# --- One weight function ------------------------------------------------------------------------------
+
+
+class JointPaths:
+    """Random paths through the smooth vertices of a scene, the first seen by the camera, with the weights that each strategy's own code gives
+    them. All arrays have the width of the number of paths; `valid` marks those that have all `length` vertices."""
+
+    def __init__(self, session, length, count=4000):
+        scene = session.scene
+        rng = mi.PCG32(size=count, initstate=3)
+        point = mi.Point2f(rng.next_float32(), rng.next_float32())
+        ray, _ = session.sensor.sample_ray(0, 0.5, point, mi.Point2f(0.5))
+        self.vertices, self.valid = [], mi.Bool(True)
+        for _ in range(length):
+            si = scene.ray_intersect(ray)
+            bsdf = si.bsdf(ray)
+            self.valid &= si.is_valid() & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+            bs, _ = bsdf.sample(mi.BSDFContext(), si, rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32()))
+            self.valid &= (bs.pdf > 0) & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+            ray = si.spawn_ray(si.to_world(bs.wo))
+            dr.eval(si, bsdf, bs, ray, rng, self.valid)
+            self.vertices.append((si, bsdf, bs))
+
+    def camera(self, weights, last):
+        """What a camera path stores at each vertex up to the `last`, and its weight of direct light there."""
+        state, stored, shares = weights.begin(dr.width(self.valid)), [], []
+        for number, (si, bsdf, bs) in enumerate(self.vertices[:last + 1]):
+            vertex = mi.UInt32(number) + dr.zeros(mi.UInt32, dr.width(self.valid))
+            state, share = weights.arrived(state, si, bsdf, vertex, self.valid)
+            dr.eval(state, share)
+            stored.append(weights.stored(state))
+            shares.append(share)
+            state = weights.leaving(state, si, bsdf, bs, vertex, self.valid)
+            dr.eval(state)
+        return stored, shares
+
+    def photon(self, weights, merged, first):
+        """Notes of the light sub-path that starts to scatter at vertex `first` and whose photon lands on vertex `merged`, written and read as
+        a photon's are."""
+        notebook = weights.notebook()
+        state = notebook.begin()
+        for si, bsdf, bs in reversed(self.vertices[merged + 1:first + 1]):
+            view = mi.SurfaceInteraction3f(si)
+            view.wi = mi.Vector3f(bs.wo)
+            state = notebook.scattered(state, view, bsdf, si.wi, self.valid)
+            dr.eval(state)
+        words = notebook.words(state)
+        notes = dr.zeros(mi.UInt32, len(words) * dr.width(self.valid))
+        index = dr.arange(mi.UInt32, dr.width(self.valid))
+        for offset, word in enumerate(words):
+            dr.scatter(notes, mi.UInt32(word) + dr.zeros(mi.UInt32, dr.width(self.valid)), len(words) * index + offset)
+        dr.eval(notes)
+        return notebook.read(merged, notes, index, mi.Bool(True))
+
+
+@pytest.mark.parametrize("kind, strategies", [("local", 2), ("local", 4), ("full", 3)])
+@pytest.mark.parametrize("variant_name, family, emitter, mix", [(RGB, "lambertian", "point", True), (RGB, "rough", "rectangle", False),
+                                                                (MONO, "mixed0", "envmap", False), (SPECTRAL, "smooth1", "spot", True)])
+def test_weights_of_a_path_sum_to_one(variant_name, family, emitter, mix, kind, strategies):
+    mi.set_variant(variant_name)
+    session = weighted(strategies=strategies, weights=kind, mix_diffuse=mix).session(tray(family, emitter), seed=1)
+    session._start()
+    weights = session.weights(session._spectral(0)["n"])
+    paths = JointPaths(session, strategies + 1)
+    stored, shares = paths.camera(weights, strategies - 1)
+    valid = np.array(paths.valid)
+    assert valid.sum() > 50
+    largest = 0.0
+    for length in range(2, strategies + 2):                  # direct light at vertex length - 1; one more: a longer path
+        last = min(length, strategies) - 1
+        total, goes_on = mi.Spectrum(0), mi.Bool(paths.valid)
+        for merged in range(last):
+            si, bsdf, bs = paths.vertices[merged]
+            f, p = weights.scattering(si, bsdf, bs.wo, paths.valid)
+            dr.eval(f, p)
+            weight = weights.merging(merged, stored[merged], f, p, paths.photon(weights, merged, length - 1))
+            dr.eval(weight)
+            largest = max(largest, np.abs(np.array(weight)[:, valid]).max())
+            ends = goes_on & weights.ends(bsdf, mi.UInt32(merged), paths.valid)
+            total += dr.select(ends, shares[merged], dr.select(goes_on, weight, 0))
+            goes_on &= ~ends
+        total += dr.select(goes_on, shares[last], 0)         # at the last strategy a photon, too, has the weight of direct light
+        total = np.array(total)[:, valid]
+        assert np.isfinite(total).all()
+        assert np.abs(total - 1).max() < 1e-4 * (1 + largest)
+    assert largest > 0.02                                    # else the merging strategies have not been tested
+
+
+def test_a_direction_that_the_camera_never_takes_is_left_to_the_photons(rgb):
+    """Where the camera path's density is zero, deeper strategies have no weight, whatever the cache says."""
+    session = weighted(strategies=3, mix_diffuse=True).session(tray("lambertian", "point"), seed=1)
+    session._start()
+    weights = session.weights(session._spectral(0)["n"])
+    paths = JointPaths(session, 3)
+    stored, _ = paths.camera(weights, 0)
+    weight = weights.merging(0, stored[0], mi.Spectrum(0.3), mi.Float(0), paths.photon(weights, 0, 2))
+    assert np.allclose(np.array(weight), 1)
+
+
+# --- Means --------------------------------------------------------------------------------------------
+
+# emitter, family, parameters, sensor, variant, filter
+ROWS = [
+    ("rectangle", "mixed0", {"strategies": 2}, PERSPECTIVE, RGB, "box"),
+    ("sphere", "mixed1", {"strategies": 3}, LENS, RGB, "box"),
+    ("disk", "mixed2", {"strategies": 2, "weights": "full"}, ORTHO, MONO, "tent"),
+    ("cylinder", "smooth0", {"strategies": 3, "weights": "full"}, PERSPECTIVE, MONO, "box"),
+    ("cube", "lambertian", {"strategies": 4, "mix_diffuse": True}, ORTHO, RGB, "gaussian"),
+    ("textured", "smooth2", {"strategies": 2}, PERSPECTIVE, RGB, "box"),
+    ("constant", "lambertian", {"strategies": 3, "mix_diffuse": True}, ORTHO, SPECTRAL, "box"),
+    ("envmap", "smooth1", {"strategies": 2}, PERSPECTIVE, MONO, "mitchell"),
+    ("envmap rotated", "mixed2", {"strategies": 2}, LENS, RGB, "box"),
+    ("sunsky", "lambertian", {"strategies": 3, "weights": "full", "mix_diffuse": True}, LENS, RGB, "box"),
+    ("several", "smooth1", {"strategies": 3, "mix_diffuse": True}, PERSPECTIVE, RGB, "box"),
+    ("point", "smooth0", {"strategies": 2}, LENS, MONO, "box"),
+    ("spot", "lambertian", {"strategies": 2, "first_vertex": 1, "mix_diffuse": True}, ORTHO, SPECTRAL, "box"),
+    ("directional", "smooth2", {"strategies": 3}, PERSPECTIVE, RGB, "catmullrom"),
+    ("projector", "lambertian", {"strategies": 2, "mix_diffuse": True}, PERSPECTIVE, RGB, "box"),
+    ("directionalarea", "lambertian", {"strategies": 2, "mix_diffuse": True}, PERSPECTIVE, RGB, "box"),
+]
+
+
+@pytest.mark.parametrize("emitter, family, parameters, sensor, variant_name, rfilter", ROWS,
+                         ids=[f"{e}-{f}-{'-'.join(map(str, p.values()))}".replace(" ", "_") for e, f, p, *_ in ROWS])
+def test_agrees(emitter, family, parameters, sensor, variant_name, rfilter):
+    mi.set_variant(variant_name)
+    agree(weighted(**parameters), oracle(emitter, 5), tray(family, emitter, sensor, rfilter=rfilter),
+          block=0.08 if has_delta(family) or family == "smooth0" else 0.03, most=600)
+
+
+def test_rows_cover_all_emitters():
+    assert {row[0] for row in ROWS} == set(EMITTERS)
+
+
+def test_one_strategy_is_bdpm(rgb):
+    """With one strategy there is nothing to weigh: the same samples, the same image."""
+    scene = tray("mixed1", "rectangle")
+    one = mi.render(scene, integrator=weighted(strategies=1), spp=16, seed=4)
+    plain = mi.render(scene, integrator=mi.load_dict({"type": "bdpm", "bdd": 0, "initial_radius": RADIUS, "max_depth": 5,
+                                                      "photon_count": 20000, "camera_paths": 8}), spp=16, seed=4)
+    assert np.abs(np.array(one) - np.array(plain)).max() < 2e-4 * np.array(plain).max()
+
+
+# --- Noise --------------------------------------------------------------------------------------------
+
+
+def variances(scene, integrator, iterations=48, trimmed=1e-3):
+    """Mean variance of an iteration's pixels, relative to the squared image, with its standard error over groups of pixels; the noisiest
+    pixels are left out."""
+    session = integrator.session(scene, seed=11)
+    for _ in range(iterations):
+        session.iterate()
+    image = session.image()
+    colour, variance = image[..., :3].mean(-1), image[..., -3:].mean(-1) * iterations
+    relative = (variance / (colour ** 2 + 0.01)).ravel()
+    groups = np.random.default_rng(1).permutation(np.sort(relative)[:int(len(relative) * (1 - trimmed))])
+    groups = np.array([g.mean() for g in np.array_split(groups, 16)])
+    return groups.mean(), groups.std(ddof=1) / 4
+
+
+def glossy_room():
+    T = mi.ScalarTransform4f
+    wall = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.6, 0.6, 0.6]}}
+    metal = {"type": "twosided", "bsdf": {"type": "roughconductor", "alpha": 0.12}}
+    return mi.load_dict({
+        "type": "scene",
+        "floor": {"type": "rectangle", "bsdf": metal},
+        "ceiling": {"type": "rectangle", "to_world": T().translate([0, 0, 2]).rotate([1, 0, 0], 180), "bsdf": wall},
+        "back": {"type": "rectangle", "to_world": T().translate([0, 1, 1]).rotate([1, 0, 0], 90), "bsdf": wall},
+        "left": {"type": "rectangle", "to_world": T().translate([-1, 0, 1]).rotate([0, 1, 0], 90), "bsdf": wall},
+        "right": {"type": "rectangle", "to_world": T().translate([1, 0, 1]).rotate([0, 1, 0], -90), "bsdf": wall},
+        "light": {"type": "point", "position": [0.2, -0.2, 1.7], "intensity": 3.0},
+        "sensor": {"type": "perspective", "fov": 50, "to_world": T().look_at([0, -2.6, 1.2], [0, 0, 0.6], [0, 0, 1]),
+                   "film": {"type": "hdrfilm", "width": 48, "height": 48, "rfilter": {"type": "box"}, "pixel_format": "rgb"}}})
+
+
+def test_weights_lower_the_noise(rgb):
+    """Under optimal weights a glossy room is less noisy than by the better of its two strategies, beyond the error of the measurement (one-sided,
+    false-alarm rate 1e-3)."""
+    scene = glossy_room()
+    common = {"initial_radius": 0.06, "photon_count": 8000, "variance": True, "max_depth": 8}
+    single = [variances(scene, mi.load_dict({"type": "bdpm", "bdd": bdd, **common})) for bdd in (0, 1)]
+    best, error = min(single)
+    for kind in ("local", "full"):
+        mixed, mixed_error = variances(scene, mi.load_dict({"type": "bdpm_opt2", "weights": kind, **common}))
+        assert mixed + t_quantile(2e-3, 15) * np.hypot(error, mixed_error) < best, (kind, mixed, single)
+
+
+def test_noise_law(rgb):
+    """Variance of an iteration = X / (N_F N_B) + B / N_B + (1 - 1 / N_B) F / N_F (Ershov et al. 2019: cross, camera and light noise):
+    fitted to three pairs (N_B, N_F), it predicts three
+    others within 12 % (three standard deviations of a prediction: false-alarm rate below 1 %)."""
+    scene = glossy_room()
+
+    def law(n_b, n_f):
+        return np.array([1e3 / (n_f * n_b), 1 / n_b, 1e3 * (1 - 1 / n_b) / n_f])
+
+    def measured(n_b, n_f):
+        integrator = mi.load_dict({"type": "bdpm", "bdd": 1, "initial_radius": 0.06, "photon_count": n_f, "camera_paths": n_b, "variance": True,
+                                   "max_depth": 8})
+        session = integrator.session(scene, seed=n_b + n_f)
+        for _ in range(48):
+            session.iterate()
+        return session.image()[..., -3:].mean() * session.iterations
+
+    fitted, others = [(1, 1000), (1, 30000), (8, 1000)], [(1, 4000), (4, 1000), (8, 8000)]
+    terms = np.linalg.solve(np.array([law(*pair) for pair in fitted]), np.array([measured(*pair) for pair in fitted]))
+    for pair in others:
+        assert abs(measured(*pair) / (law(*pair) @ terms) - 1) < 0.12, (pair, terms)
+
+
+# --- Plugins ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("plugin, strategies", [("bdpm_opt2", 2), ("bdpm_opt3", 3)])
+def test_presets_fix_the_number_of_strategies(rgb, plugin, strategies):
+    assert mi.load_dict({"type": plugin}).settings()["strategies"] == strategies
+    with pytest.raises(RuntimeError, match='unknown parameter "strategies"'):
+        mi.load_dict({"type": plugin, "strategies": 2})
+
+
+@pytest.mark.parametrize("name, value, allowed", [("strategies", 0, "from 1 to 6"), ("strategies", 2.0, "an integer"),
+                                                  ("weights", "best", '"full" or "local"'), ("first_vertex", -1, "at least 0"),
+                                                  ("frozen_photons", -1, "at least 0"), ("bdd", 1, "unknown parameter")])
+def test_bad_parameter(rgb, name, value, allowed):
+    with pytest.raises(RuntimeError, match=allowed):
+        mi.load_dict({"type": "bdpm_opt", name: value})
+
+
+@pytest.mark.parametrize("kind", ["local", "full"])
+def test_darkness_and_no_indirect_light(rgb, kind):
+    scene = {"type": "scene", "floor": {"type": "rectangle"}, "sensor": {"type": "perspective", "to_world": mi.ScalarTransform4f().look_at(
+        [0, 0, 3], [0, 0, 0], [0, 1, 0]), "film": {"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {"type": "box"}}}}
+    image = mi.render(mi.load_dict(scene), integrator=mi.load_dict({"type": "bdpm_opt", "weights": kind}), spp=2)
+    assert (np.array(image)[..., :3] == 0).all()
+    lit = mi.load_dict({**scene, "light": {"type": "point", "position": [0, 0, 1]}})
+    for depth in (1, 2, 3):
+        mine = mi.render(lit, integrator=mi.load_dict({"type": "bdpm_opt", "weights": kind, "max_depth": depth}), spp=64)
+        truth = mi.render(lit, integrator=mi.load_dict({"type": "path", "max_depth": depth}), spp=64)
+        assert np.allclose(np.array(mine)[..., :3].mean(), np.array(truth)[..., :3].mean(), rtol=0.02)
+
+
+def test_same_seed_same_image(rgb):
+    scene = tray("smooth1", "point")
+    first, second, other = (np.array(mi.render(scene, integrator=weighted(strategies=3, weights="full"), spp=16, seed=seed)) for seed in (5, 5, 6))
+    assert np.abs(first - second).max() <= 1e-4 * first.max()
+    assert np.abs(first - other).max() > 1e-2 * first.max()
+
+
+def test_automatic_radius(rgb):
+    scene = tray("smooth1", "rectangle")
+    session = mi.load_dict({"type": "bdpm_opt2"}).session(scene, seed=1)
+    session.iterate()
+    assert 0 < session.radii["indirect"] < 1
