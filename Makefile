@@ -12,7 +12,7 @@ SETUP := tools/setup.sh
 
 render: $(VENV)/installed
 	@mkdir -p out
-	$(VENV)/bin/mis-render scenes/cornell_area.xml -i bdpm -o out/cornell_area.exr
+	$(VENV)/bin/mis-render scenes/cornell_glossy.xml -i bdpm_opt3 -o out/cornell_glossy.exr
 
 test: $(VENV)/installed-test
 	$(VENV)/bin/python -m pytest
@@ -23,6 +23,7 @@ gallery: $(VENV)/installed
 	    $(VENV)/bin/mis-render $$scene -i bdpm -P bdd=0 --time 60 -o out/$$name.exr && cp out/$$name.png docs/images/ || exit 1; done
 
 bench: $(VENV)/installed
+	$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check --editable '.[bench]'
 	$(VENV)/bin/python benchmarks/run.py throughput
 
 $(VENV)/installed: pyproject.toml $(SETUP)

@@ -6,22 +6,13 @@ import argparse
 import time
 from pathlib import Path
 
-import matplotlib
+import numpy as np
 
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt  # noqa: E402
-import numpy as np  # noqa: E402
-
-from methods import Method  # noqa: E402
-from mis_integrators.analysis.variance_maps import (  # noqa: E402
-    best_single,
-    relative_variance,
-    share_worse,
-    trimmed_mean,
-)
-from mis_integrators.transport.traits import scene_bounds  # noqa: E402
-from reports import Row, save, show, tell  # noqa: E402
-from scene_files import OpenScene, open_scene, scaled_size  # noqa: E402
+from methods import Method
+from mis_integrators.analysis.variance_maps import best_single, relative_variance, share_worse, trimmed_mean
+from mis_integrators.transport.traits import scene_bounds
+from reports import Row, save, show, tell
+from scene_files import OpenScene, open_scene, scaled_size
 
 COLUMNS = ("scene", "N_B", "method", "relative variance", "ratio to best single", "untrimmed ratio",
            "time ratio", "equal-time ratio", "blocks worse")
@@ -95,6 +86,10 @@ def summarise(rows: list[Row], camera_paths: int) -> None:
 
 def draw(path: Path, labels: list[str], images, maps, rows: list[Row]) -> None:
     """Pictures above, variance maps on one logarithmic scale below."""
+    import matplotlib
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
     path.parent.mkdir(parents=True, exist_ok=True)
     height, width = maps[0].shape
     figure, axes = plt.subplots(2, len(maps), figsize=(2.6 * len(maps) + 0.6, 5.2 * height / width + 1.1), squeeze=False,
@@ -109,6 +104,6 @@ def draw(path: Path, labels: list[str], images, maps, rows: list[Row]) -> None:
         axes[1, column].set_title(f"{row['ratio to best single']:.2f} x best single", fontsize=9)
     for axis in axes.flat:
         axis.set_axis_off()
-    figure.colorbar(shown, ax=axes[1, :].tolist(), label="log10 relative variance", shrink=0.9)
+    figure.colorbar(shown, ax=axes.ravel().tolist(), label="log10 relative variance", shrink=0.6, pad=0.01)
     figure.savefig(path, dpi=110)
     plt.close(figure)

@@ -18,9 +18,9 @@ from .random import streams
 PHOTONS_A_CELL = 32
 TRIAL_SHARE = 1 / 64
 """Edge of the first, trial cells as a share of the scene's diagonal."""
-SMALLEST_SHARE, LARGEST_SHARE = 1e-3, 0.2
-"""Bounds of the cells' edge, in the same unit."""
-INDEX_BITS = 22
+LARGEST_SHARE = 0.2
+"""Largest edge of the cells, in the same unit."""
+INDEX_BITS = 23
 MOST_LIGHTS = 64
 """Emitters tried as the strongest of a cell."""
 DIRECT_SAMPLES = 16
@@ -80,9 +80,11 @@ class IrradianceCache:
     def _choose_cells(self, position, normal, stored, count, bounds):
         """Sets the cells' size so that those which hold photons hold `PHOTONS_A_CELL` on average; returns each photon's place."""
         diagonal = max(float(dr.norm(bounds.extents())), 1e-30)
+        volume = np.prod([float(bounds.max[i] - bounds.min[i]) + 0.01 * diagonal for i in range(3)])
+        smallest = (6 * volume / (1 << INDEX_BITS)) ** (1 / 3)              # smaller cells would share entries of the index
         cell = TRIAL_SHARE * diagonal
         for trial in range(3):
-            cell = min(max(cell, SMALLEST_SHARE * diagonal), LARGEST_SHARE * diagonal)
+            cell = min(max(cell, smallest), LARGEST_SHARE * diagonal)
             self.cell = dr.opaque(mi.Float, cell)
             self.columns, self.lines = (int((bounds.max[i] - bounds.min[i]) / cell) + 3 | 1 for i in (0, 1))
             place = self._place(position, normal)
@@ -172,8 +174,7 @@ class IrradianceCache:
         return [self.index, self.table, self.cell]
 
     def _place(self, p, n):
-        """Entry of the index for point `p` on a surface with unit normal `n`: cells along x, y, z times six directions, modulo the
-        index's size (where that is too small for the scene, far cells share entries)."""
+        """Entry of the index for point `p` on a surface with unit normal `n`: cells along x, y, z times six directions."""
         q = mi.Vector3u(mi.Vector3i(dr.floor((p - self.origin) / self.cell)) + 1)
         axis = dr.select((dr.abs(n.x) > dr.abs(n.y)) & (dr.abs(n.x) > dr.abs(n.z)), mi.UInt32(0),
                          dr.select(dr.abs(n.y) > dr.abs(n.z), mi.UInt32(1), mi.UInt32(2)))
