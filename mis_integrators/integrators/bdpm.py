@@ -15,7 +15,7 @@ from ..transport.lights import Lights
 from ..transport.photon_map import build_photon_map, smallest_cell
 from ..transport.random import mix
 from ..transport.recording import recorder
-from ..transport.traits import SceneTraits
+from ..transport.traits import SceneTraits, lookup
 from .common import IterativeIntegrator, IterativeSession
 from .pilot import choose_radii
 
@@ -187,8 +187,13 @@ class BDPMSession(IterativeSession):
                               self.light_paths, self.integrator.max_depth, only_last=kind == "indirect", grey=grey)
 
     def _covered(self, scene, vertices, radius, seed):
-        """Share of each vertex' merge disk that holds surface."""
-        return covered_share(scene, vertices, radius, seed, dr.max(vertices["throughput"]) > 0)
+        """Share of each vertex' merge disk that holds surface; one where the surface is not Lambertian: in a highlight the noise of dividing by
+        an estimate would outweigh what it mends."""
+        probed = dr.max(vertices["throughput"]) > 0
+        if self.traits.has_rough:
+            shape = dr.select(probed, vertices["hit"].shape, dr.zeros(mi.ShapePtr))          # unused places hold no pointers
+            probed &= lookup(self.traits.lambertian, shape.bsdf(), mi.Bool, probed)
+        return dr.select(probed, covered_share(scene, vertices, radius, seed, probed), 1)
 
     def _per_path(self, values, vertices, paths):
         """Sums values of the vertices for each of `paths` camera paths."""
