@@ -23,7 +23,9 @@ LARGEST_SHARE = 0.2
 INDEX_BITS = 23
 MOST_LIGHTS = 64
 """Emitters tried as the strongest of a cell."""
-DIRECT_SAMPLES = 16
+DIRECT_SAMPLES = 32
+UNSEEN_NOISE = 200.0
+"""Relative variance of next-event estimation that is assumed where none of the samples meets light."""
 OWN_STREAM = 0x64697265
 
 
@@ -167,7 +169,7 @@ class IrradianceCache:
         value = dr.mean(weight) * dr.maximum(dr.dot(ds.d, facing), 0)
         mean, square = dr.block_sum(value, DIRECT_SAMPLES) / DIRECT_SAMPLES, dr.block_sum(dr.square(value), DIRECT_SAMPLES) / DIRECT_SAMPLES
         noise = (square / dr.maximum(dr.square(mean), 1e-30) - 1) * (DIRECT_SAMPLES / (DIRECT_SAMPLES - 1))
-        return dr.select(mean > 0, dr.maximum(noise, 0), DIRECT_SAMPLES)
+        return dr.select(mean > 0, dr.maximum(noise, 0), UNSEEN_NOISE)
 
     def tables(self):
         """Every evaluated array that `lookup` reads, for `dr.freeze` to track."""
