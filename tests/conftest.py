@@ -35,6 +35,7 @@ def pytest_addoption(parser):
 
 
 def pytest_configure(config):
+    config.addinivalue_line("markers", "strategies(*K): the numbers of strategies of the discrete worlds that a test is for")
     config.addinivalue_line("markers", "full: the full product of cases, hours of it; left out unless asked for with -m full")
 
 

@@ -29,16 +29,19 @@ def generated(K, seed, **options):
 
 
 def pytest_generate_tests(metafunc):
-    if "case" in metafunc.fixturenames:
-        directory = metafunc.config.getoption("vectors")
-        if directory is None:
-            metafunc.parametrize("case", [functools.partial(generated, *key) for key in GENERATED], ids=[f"K{K}-{s}" for K, s in GENERATED],
-                                 indirect=True)
-            return
+    """The worlds, of as many strategies as the mark `strategies` says (without it: any)."""
+    if "case" not in metafunc.fixturenames:
+        return
+    mark = metafunc.definition.get_closest_marker("strategies")
+    directory = metafunc.config.getoption("vectors")
+    if directory is None:
+        cases = [(K, f"K{K}-{seed}", functools.partial(generated, K, seed)) for K, seed in GENERATED]
+    else:
         file = Path(directory) / "optimal_weights.json"
         entries = json.loads(file.read_text()) if file.exists() else []     # other kinds of vectors are no business of these tests
-        metafunc.parametrize("case", [functools.partial(worlds.load, entry) for entry in entries],
-                             ids=[f"K{entry['K']}-{i}" for i, entry in enumerate(entries)], indirect=True)
+        cases = [(entry["K"], f"K{entry['K']}-{i}", functools.partial(worlds.load, entry)) for i, entry in enumerate(entries)]
+    cases = [(name, make) for K, name, make in cases if mark is None or K in mark.args]
+    metafunc.parametrize("case", [make for _, make in cases], ids=[name for name, _ in cases], indirect=True)
 
 
 @pytest.fixture
@@ -92,10 +95,9 @@ def test_single_strategies(case):
         assert noise >= J
 
 
+@pytest.mark.strategies(2, 3)
 def test_closed_forms(case):
     world, expected, _, _ = case
-    if world.K > 3:
-        pytest.skip("no closed form of more than three strategies")
     # What cancels in 1 - n (...) is of order n times rounding: 4e-16 n seen up to n = 1e10. The vectors stay below n = 1e3.
     assert distance(closed_form(world), expected) < 1e-9 + 1e-14 * world.n_F
 
@@ -109,11 +111,10 @@ def test_two_strategies_deeper():
     assert distance({(2, 0): deeper[0], (2, 1): deeper[1]}, expected) < 1e-9
 
 
+@pytest.mark.strategies(3)
 def test_noise_is_the_papers(case):
     """MIS-3's J as printed, written out, against `residuals`."""
     world, weights, J, _ = case
-    if world.K != 3:
-        pytest.skip("printed for three strategies")
     (f0, f1), (dmu1, dmu2), (L0,), L, n = world.f, world.measure, world.L0, world.L, world.n_F
     w20, w21, w30, w31, w32 = (weights[key] for key in world.families())
     E1 = world.albedo(0)
@@ -128,11 +129,10 @@ def test_noise_is_the_papers(case):
     assert J == pytest.approx(printed, rel=1e-9)     # -F^2 + ... cancels: a few digits of sixteen
 
 
+@pytest.mark.strategies(3, 4, 5)
 def test_least_noise_without_weights(case):
     """J_opt from the root's responses alone."""
     world, _, J, _ = case
-    if world.K < 3:
-        pytest.skip("the drive of z1 is read off w21, which needs three strategies")
     weights, e = worlds.recurse(world)
     luminance = world.L
     for j in range(world.K - 2, 0, -1):
@@ -154,6 +154,7 @@ def test_no_change_lowers_noise(case, size):
             assert worlds.noise(world, worlds.perturbed(world, weights, sign * change)) > least * (1 - 1e-12)
 
 
+@pytest.mark.strategies(2, 3)
 def test_local_weights_are_the_papers(case):
     world = case[0]
     weights, _ = worlds.recurse(world, local=True)
@@ -161,14 +162,12 @@ def test_local_weights_are_the_papers(case):
     if world.K == 2:
         g = mis2.shared_density(world.p(0), world.N_B)
         expected = {(2, 1): mis2.local_weight(g, n, mis2.denominator(g, n, world.b, world.L))}
-    elif world.K == 3:
+    else:
         E1, q = world.albedo(0), mis3.first_cost(f[0], world.N_B)
         W20, W21, _ = mis3.local_direct(q, n, E1, world.L0[0])
         E2, c = E1 * world.albedo(1)[:, None], mis3.deepest_cost(world.b, world.L, n)
         w31, w32 = mis3.local_longest(W21[:, None], q[:, None], E1, f[1], E2, c)
         expected = {(2, 0): W20, (2, 1): W21, (3, 0): 1 - w31 - w32, (3, 1): w31, (3, 2): w32}
-    else:
-        pytest.skip("no closed form of more than three strategies")
     assert distance(weights, expected) < 1e-13     # a dozen roundings of positive terms
     assert all(np.all((w > -1e-13) & (w < 1 + 1e-13)) for w in weights.values())
 
