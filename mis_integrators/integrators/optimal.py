@@ -134,7 +134,7 @@ class OptimalWeights:
         sharp = mask & (known.visible_share > 0)
         ds, unoccluded = self.lights.unoccluded(si, dr.select(sharp, known.light, 0), sharp)
         wo = si.to_local(dr.select(sharp, ds.d, known.direction))
-        scale = dr.select(sharp, unoccluded * known.visible_share * dr.abs(wo.z) / recursion.at_least(dr.mean(known.direct), 1e-30), 1)
+        scale = dr.select(sharp, unoccluded * known.visible_share * dr.abs(wo.z) / recursion.at_least(dr.mean(known.direct), recursion.SMALLEST), 1)
         value = lobe_f
         if self.traits.has_rough:
             lit = mask & (dr.max(known.direct) > 0) & ~lookup(self.traits.lambertian, bsdf, mi.Bool, mask)

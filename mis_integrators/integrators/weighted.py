@@ -37,7 +37,7 @@ class WeightedSession(BDPMSession):
         return True
 
     def prepare(self, spectral):
-        """Makes what the weights need, once, when the radius is known."""
+        """Makes what the weights need, once: before the pilot of the radius if that is weighted, else after it."""
 
     def weights(self, n):
         """The weights (hooks as in `trace_camera_paths` and `trace_light_paths`); `n` is what `photons_per_irradiance` returns."""

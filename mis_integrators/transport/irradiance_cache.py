@@ -59,8 +59,8 @@ class IrradianceCache:
         self.origin = mi.Point3f(bounds.min)
         self.words = 8 if colours() == 1 else 16
         capacity = dr.width(surface) // 4
-        stored = dr.arange(mi.UInt32, capacity) < count
         index = dr.arange(mi.UInt32, capacity)
+        stored = index < count
         record = dr.gather(mi.Vector4u, surface, index, stored)
         position = mi.Point3f(bits_float(record.x), bits_float(record.y), bits_float(record.z))
         flux, packed = read_power(power, index, stored)

@@ -208,8 +208,8 @@ class Lights:
         return ds, dr.select(visible, weight * dr.rcp(probability), 0), ds.pdf * probability
 
     def unoccluded(self, ref, index, active):
-        """Light that emitter `index` would bring to `ref` if nothing stood between, from one fixed point on it: `(direction, irradiance at
-        a surface that faces it, channel mean)`."""
+        """Light that emitter `index` would bring to `ref` if nothing stood between, from one fixed point on it: `(ds, irradiance)`, a
+        `DirectionSample3f` of that point and the irradiance at a surface that faces it, channel mean."""
         ds, weight = self.pointer(index).sample_direction(ref, mi.Point2f(0.5), active)
         value = dr.mean(weight)
         return ds, dr.select(active & dr.isfinite(value), value, 0)
