@@ -1,13 +1,19 @@
-"""How good the automatic radius is: its equal-time relMSE next to that of a sweep of radii, factor sqrt 2."""
+"""How good the automatic radius is: its equal-time relMSE next to that of a sweep of radii, factor sqrt 2.
+
+Iterations are independent and the radius does not change from one to the next, so the error after n of them is bias^2 + V / n. Each radius
+renders for a few seconds, in turns with the others; bias^2, the variance V of an iteration, and the seconds of an iteration and of what goes
+before the first then give the error at any time.
+"""
 
 from __future__ import annotations
 
 import argparse
+from dataclasses import dataclass
 
 import numpy as np
 
 from compare import chosen
-from errors import References, summarise
+from errors import References, errors
 from methods import Method, SessionMaker
 from references import colours, find_references
 from reports import Row, save, show, tell
@@ -15,9 +21,8 @@ from scene_files import OpenScene, open_scene, scaled_size
 from turns import Contender, take_turns
 
 STEP = 2**0.5
-AUTOMATIC, CHOSEN = "automatic", "chosen, pilot free"
 COLUMNS = ("scene", "bdd", "time", "automatic", "best", "auto / best radius", "auto relMSE", "best relMSE",
-           "auto / best relMSE", "choice / best relMSE", "first", "iterations", "best iterations", "note")
+           "auto / best relMSE", "choice / best relMSE", "set-up", "bias share", "note")
 
 
 def run(options: argparse.Namespace) -> None:
@@ -28,59 +33,64 @@ def run(options: argparse.Namespace) -> None:
         opened = open_scene(path, scaled_size(path, options.scale))
         references = find_references(opened, options, tell)
         for bdd in options.bdd:
-            for seconds in options.time:
-                rows = sweep(opened, references, bdd, seconds, options.radii, options.seeds)
-                if rows:
-                    sweeps += rows
-                    summary.append(judge(rows))
-                    show("Automatic radius against the best of a sweep", summary, COLUMNS)
-                    save(options.out, "radius", summary, vars(options))
-                    save(options.out, "radius_sweep", sweeps, vars(options))
+            automatic, fixed = sweep(opened, references, bdd, options.time, options.rendering, options.radii)
+            place = {"scene": opened.name, "size": "{}x{}".format(*opened.size), "bdd": bdd, "references": references.origin}
+            sweeps += [{**place, **vars(law)} for law in fixed + automatic]
+            if fixed:
+                summary += [{**place, **judge(seconds, law, fixed)} for seconds, law in zip(options.time, automatic)]
+                show("Automatic radius against the best of a sweep", summary, COLUMNS)
+                save(options.out, "radius", summary, vars(options))
+                save(options.out, "radius_sweep", sweeps, vars(options))
 
 
-def sweep(
-    opened: OpenScene, references: References, bdd: int, seconds: float, radii: int, seeds: int
-) -> list[Row]:
-    """A row for the automatic radius, one for each of ``radii`` radii around it, and one for the automatic
-    choice without the time of its pilot; none if nothing is gathered."""
-    automatic = SessionMaker(Method(AUTOMATIC, "bdpm", {"bdd": bdd}), opened, seconds)
-    fixed: list[SessionMaker] = []
-    runs: list[list[Contender]] = []
-    for seed in range(seeds):
-        first = Contender.begin(AUTOMATIC, automatic.make, seed)
-        first.iterate()
-        fixed = fixed or sweep_around(central_radius(first.session.settings), radii, bdd, opened, seconds)
-        if not fixed:
-            return []
-        others = [Contender.begin(maker.method.label, maker.make, seed) for maker in fixed]
-        free = Contender.begin(CHOSEN, automatic.make, seed)
-        adopt_choice(free.session, first.session)
-        take_turns([first, *others, free], seconds, tell)
-        runs.append([first, *others, free])
+@dataclass(frozen=True)
+class ErrorLaw:
+    """How the relMSE of one radius falls with time."""
 
-    rows: list[Row] = []
-    for mine in zip(*runs):
-        renders = [colours(contender.session) for contender in mine]
-        mean, bias = summarise(renders, references)
-        rows.append({
-            "scene": opened.name,
-            "size": "{}x{}".format(*opened.size),
-            "bdd": bdd,
-            "time": seconds,
-            "seeds": seeds,
-            "radius": mine[0].label,
-            "value": central_radius(mine[-1].session.settings),
-            "iterations": round(np.mean([c.session.iterations for c in mine])),
-            "seconds": float(np.mean([c.rendering for c in mine])),
-            "first": float(np.mean([c.first for c in mine])),
-            "relMSE": mean.relmse,
-            "relMSE trimmed": mean.relmse_trimmed,
-            "MSE": mean.mse,
-            "bias share": bias,
-            "settings": chosen(mine[-1].session.settings),
-            "references": references.origin,
-        })
-    return rows
+    radius: float
+    settings: str
+    squared_bias: float
+    variance: float
+    """Of one iteration."""
+    seconds: float
+    """Of one iteration."""
+    set_up: float
+    """Seconds until iterations run: preparation, a pilot, recording."""
+
+    def at(self, seconds: float, set_up: float | None = None) -> float:
+        """relMSE after `seconds`."""
+        rendering = seconds - (self.set_up if set_up is None else set_up)
+        return self.squared_bias + self.variance * self.seconds / max(rendering, self.seconds)
+
+
+def sweep(opened: OpenScene, references: References, bdd: int, times: list[float], rendering: float,
+          radii: int) -> tuple[list[ErrorLaw], list[ErrorLaw]]:
+    """Laws of the automatic radius, one for each of the `times` it is to plan for, and of ``radii`` radii around them; none if nothing
+    is gathered. Each renders for `rendering` seconds."""
+    automatic = []
+    for seconds in times:
+        maker = SessionMaker(Method("automatic", "bdpm", {"bdd": bdd, "variance": True}), opened, seconds)
+        automatic.append(Contender.begin(f"automatic for {seconds:g} s", maker.make, seed=0))
+        automatic[-1].iterate()
+    centres = [central_radius(contender.session.settings) for contender in automatic]
+    if None in centres:
+        return [], []
+    makers = sweep_around(float(np.exp(np.mean(np.log(centres)))), radii, bdd, opened, rendering)
+    fixed = [Contender.begin(maker.method.label, maker.make, seed=0) for maker in makers]
+    take_turns([*automatic, *fixed], rendering, tell)
+    return [law(one, references) for one in automatic], [law(one, references) for one in fixed]
+
+
+def law(contender: Contender, references: References) -> ErrorLaw:
+    """What a rendering tells about its error at other times."""
+    session = contender.session
+    image = session.image()
+    noise = image[..., [session.channels.index(name) for name in ("var.R", "var.G", "var.B")]] / references.divisor()
+    seconds = float(np.mean(contender.seconds[1:]))
+    return ErrorLaw(
+        central_radius(session.settings), chosen(session.settings), errors(colours(session), references).relmse - float(noise.mean()),
+        float(noise.mean()) * session.iterations, seconds, contender.first - seconds,
+    )
 
 
 def sweep_around(
@@ -91,7 +101,7 @@ def sweep_around(
         return []
     around = centre * STEP ** (np.arange(radii) - (radii - 1) // 2)
     return [
-        SessionMaker(Method(f"{radius:.4g}", "bdpm", {"bdd": bdd, "initial_radius": radius}), opened, seconds)
+        SessionMaker(Method(f"{radius:.4g}", "bdpm", {"bdd": bdd, "initial_radius": radius, "variance": True}), opened, seconds)
         for radius in around.tolist()
     ]
 
@@ -102,29 +112,20 @@ def central_radius(settings: dict) -> float | None:
     return float(np.exp(np.mean(np.log(radii)))) if radii else None
 
 
-def adopt_choice(session, pilot) -> None:
-    """Give a session the radii that another one chose, so that it needs no pilot of its own."""
-    session.radii, session.corrected = dict(pilot.radii), dict(pilot.corrected)
-
-
-def judge(rows: list[Row]) -> Row:
-    """The automatic radius' row, and that of its choice made for free, against the best row of the sweep."""
-    automatic, *others, chosen_for_free = rows
-    best = min(others, key=lambda row: row["relMSE"])
-    at_end = best in (others[0], others[-1])
+def judge(seconds: float, automatic: ErrorLaw, fixed: list[ErrorLaw]) -> Row:
+    """The automatic radius after `seconds`, and its choice made for free, against the best of the sweep."""
+    best = min(fixed, key=lambda law: law.at(seconds))
+    error, least = automatic.at(seconds), best.at(seconds)
     return {
-        **{name: automatic[name] for name in ("scene", "size", "bdd", "time", "seeds")},
-        "automatic": automatic["settings"],
-        "best": best["value"],
-        "auto / best radius": automatic["value"] / best["value"],
-        "auto relMSE": automatic["relMSE"],
-        "best relMSE": best["relMSE"],
-        "auto / best relMSE": automatic["relMSE"] / best["relMSE"],
-        "choice / best relMSE": chosen_for_free["relMSE"] / best["relMSE"],
-        "first": automatic["first"],
-        "iterations": automatic["iterations"],
-        "best iterations": best["iterations"],
-        "auto bias share": automatic["bias share"],
-        "note": "best at the sweep's end" if at_end else "",
-        "references": automatic["references"],
+        "time": seconds,
+        "automatic": automatic.settings,
+        "best": best.radius,
+        "auto / best radius": automatic.radius / best.radius,
+        "auto relMSE": error,
+        "best relMSE": least,
+        "auto / best relMSE": error / least,
+        "choice / best relMSE": automatic.at(seconds, best.set_up) / least,
+        "set-up": automatic.set_up,
+        "bias share": automatic.squared_bias / error,
+        "note": "best at the sweep's end" if best in (fixed[0], fixed[-1]) else "",
     }

@@ -67,9 +67,12 @@ def _parser() -> argparse.ArgumentParser:
     command = _measuring(commands, "radius", radius)
     command.add_argument("--bdd", type=int, nargs="+", default=[0, 1], help="(default: 0 1)")
     command.add_argument("--time", type=float, nargs="+", default=[5, 60], metavar="SECONDS",
-                         help="rendering seconds of each radius (default: 5 60)")
-    command.add_argument("--radii", type=int, default=9, help="how many, factor sqrt 2 (default: 9)")
-    _compares_with_references(command)
+                         help="seconds for which the automatic radius is chosen and judged (default: 5 60)")
+    command.add_argument("--rendering", type=float, default=10, metavar="SECONDS",
+                         help="what each radius renders; its error at other times follows (default: 10)")
+    command.add_argument("--radii", type=int, default=11, help="how many, factor sqrt 2 (default: 11)")
+    command.add_argument("--scale", type=float, default=1, help="film size, scene's own = 1 (default: 1)")
+    references.add_options(command)
 
     for name, function in (("freeze-scenes", freezing.freeze), ("check-scenes", freezing.check)):
         command = commands.add_parser(name, help=function.__doc__, description=function.__doc__)

@@ -400,6 +400,18 @@ def test_no_light_leaks_around_a_corner(rgb):
     assert render(scene, bdd=0, initial_radius=0.3, spp=32).max() == 0
 
 
+def test_sheets_that_let_light_through_keep_their_photons(rgb):
+    """Two thin diffusers back to back, far closer than R, pass light on in all directions: each gathers its own photons, not both."""
+    sheet = {"type": "principledthin", "base_color": {"type": "rgb", "value": 0.8}, "roughness": 0.9, "diff_trans": 1.0}
+    scene = mi.load_dict({
+        "type": "scene", "upper": {"type": "rectangle", "to_world": T().scale(5), "bsdf": sheet},
+        "lower": {"type": "rectangle", "to_world": T().translate([0, 0, -0.002]).rotate([1, 0, 0], 180).scale(5), "bsdf": sheet},
+        "ceiling": {"type": "rectangle", "to_world": T().translate([0, 0, 2]).rotate([1, 0, 0], 180).scale(5), "bsdf": diffuse(0.9)},
+        "lamp": {"type": "point", "position": [0, 0, 1], "intensity": 5.0},
+        "sensor": {"type": "orthographic", "to_world": look((0, 0, -3), (0, 0, 0)), "film": film(16)}})
+    agree(bdpm(bdd=0, max_depth=5, initial_radius=0.05), path(max_depth=5), scene, blocks=2)
+
+
 @pytest.mark.parametrize("bdd", [0, 1])
 def test_merged_shapes(rgb, bdd):
     """Mitsuba merges shapes that share a BSDF into one mesh: photons must be found there too."""

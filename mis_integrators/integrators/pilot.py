@@ -28,9 +28,6 @@ ROUGH_GATHER_COST = 0.15
 """The same where photons need the BSDF evaluated (measured on the textured scene)."""
 PROBE_COST = 0.7
 """Cost of the coverage probes, in the same units."""
-CORRECTION_HEADSTART = 0.6
-"""Factor on the predicted error of the estimate corrected at edges. The prediction extrapolates to small radii from larger ones, where the
-plain estimate's bias at edges has begun to saturate, and so flatters the plain one (measured on a box with two spheres: 1.8 times)."""
 USUAL_PHOTONS = 10
 """Photons a gather at which an iteration counts as one planned iteration: larger gathers must pay for themselves."""
 
@@ -159,10 +156,7 @@ class Pilot:
         samples = {key: np.array(values) for key, values in self.samples.items()}
         middle = len(self.ladder) * 2 // 3
         mean = np.mean(self.direct, axis=0) + sum(samples[kind, False][:, middle].mean(axis=0) for kind in self.ways)
-        for kind, ways in self.ways.items():
-            choices = []
-            for way in ways:
-                radius, error = best_radius(self.ladder, samples[kind, way], mean,
-                                            lambda r, way=way: np.maximum(count / self._cost(kind, way, r), 1), self.at_first_vertex)
-                choices.append((error * CORRECTION_HEADSTART if way else error, radius, way))
-            _, session.radii[kind], session.corrected[kind] = min(choices)
+        for kind in self.ways:
+            session.radii[kind], session.corrected[kind] = best_radius(
+                self.ladder, samples[kind, False], samples.get((kind, True)), mean,
+                lambda radius, corrected, kind=kind: np.maximum(count / self._cost(kind, corrected, radius), 1), self.at_first_vertex)

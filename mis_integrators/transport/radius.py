@@ -6,8 +6,9 @@ radii at once, on a subset of the pixels. From them, for each radius of the ladd
 - the variance of a pixel over iterations, V(R), and
 - the squared difference of the expected images at neighbouring radii, Q(R), without bias: products of different iterations only.
 
-Neighbours differ by a factor 2. Where the bias grows like R^2 (curvature) its square is 1.8 Q; where it sits in a strip of width R
-(edges) it is 2 Q: 1.9 Q serves both. The error of n iterations is then 1.9 Q(R) + V(R) / n, and its minimum is the radius. All in
+Neighbours differ by a factor 2. The squared bias follows from Q by its growth R^q: where the bias is curvature (q = 4) it is 16/9 Q;
+where it sits in strips of width R along edges, within which the kernel's disk loses part of its area (q = 1), it is 4.33 Q
+(`squared_bias_over_difference`). The error of n iterations is then the squared bias plus V(R) / n, and its minimum is the radius. All in
 relative terms, pixel by pixel.
 """
 
@@ -19,7 +20,13 @@ LADDER_STEPS = 7
 STEP = 2.0
 LARGEST_SHARE = 0.08
 """Largest radius of the ladder in units of the spread of the points where photons are gathered."""
-BIAS_FACTOR = 1.9
+AT_EDGES, BY_CURVATURE = (1, 4.327), (4, 16 / 9)
+"""Exponents q of the squared bias and what it is then in units of Q. At an edge a disk whose centre is u R away loses the share
+g(u) = (acos u - u sqrt(1 - u^2)) / pi, and the ratio is the integral of g(u)^2 over that of (g(u) - g(2u))^2."""
+REGAINED_BY_HALVING = 0.3655
+"""Share of what a disk loses at an edge that one of half the radius regains: the integral of g(u) (g(u) - g(2u)) over that of g(u)^2."""
+SCATTER_OF_REGAINED = 0.25
+"""How far real scenes stray from that, in its units."""
 
 
 def ladder(points, weights):
@@ -46,54 +53,106 @@ def noise_of_photons(radii, variance, floor):
     return floor + np.maximum.accumulate(photons[::-1])[::-1] / radii ** 2
 
 
+def expected_products(a, b, weights):
+    """Weighted mean over pixels of E[a] E[b], without bias: products of different iterations only. `a`, `b`: (iterations, ..., pixels)."""
+    m = a.shape[0]
+    return np.mean(weights * (a.sum(axis=0) * b.sum(axis=0) - (a * b).sum(axis=0)), axis=-1) / (m * (m - 1))
+
+
+def with_error(a, b, weights):
+    """`expected_products` and its standard error, by leaving out one iteration at a time: neighbouring pixels share photons."""
+    value, m = expected_products(a, b, weights), a.shape[0]
+    if m < 3:
+        return value, np.abs(value)
+    left_out = np.stack([expected_products(np.delete(a, i, 0), np.delete(b, i, 0), weights) for i in range(m)])
+    return value, np.sqrt((m - 1) / m * ((left_out - left_out.mean(axis=0)) ** 2).sum(axis=0))
+
+
 def noise_and_difference(radii, samples, weights, at_first_vertex=True):
     """V and Q of the module's docstring, one a radius, with Q's standard error.
 
     `samples`: (iterations, radii, pixels) gathered values of independent iterations; `weights`: (pixels,); `at_first_vertex`: whether all
     noise is the photons', because the vertices that gather are those which the camera sees.
     """
-    m = samples.shape[0]
     variance = np.mean(weights * samples.var(axis=0, ddof=1), axis=1)
     variance = noise_of_photons(radii, variance, 0.0 if at_first_vertex else variance.min())
-    steps = np.diff(samples, axis=1)                                      # (m, radii - 1, pixels)
-    pairs = weights * (steps.sum(axis=0) ** 2 - (steps ** 2).sum(axis=0)) / (m * (m - 1))
-    difference = np.concatenate([[0.0], pairs.mean(axis=1)])
-    # Neighbouring pixels share photons: the error comes from leaving out one iteration at a time.
-    total = steps.sum(axis=0)
-    left_out = np.stack([np.mean(weights * ((total - s) ** 2 - ((steps ** 2).sum(axis=0) - s ** 2)), axis=1)
-                         / ((m - 1) * (m - 2)) for s in steps]) if m > 2 else np.repeat(difference[None, 1:], m, axis=0)
-    error = np.concatenate([[0.0], np.sqrt((m - 1) / m * ((left_out - left_out.mean(axis=0)) ** 2).sum(axis=0))])
-    return variance, difference, error
+    steps = np.diff(samples, axis=1)                                      # (iterations, radii - 1, pixels)
+    difference, error = with_error(steps, steps, weights)
+    return variance, np.concatenate([[0.0], difference]), np.concatenate([[0.0], error])
 
 
-def expected_difference(radii, difference, error, wanted):
-    """Q at the radii `wanted`, from noisy values at the ladder: the mean over power laws a R^q, each weighted by how well it explains
-    the values (flat in q between 1, edges, and 4, curvature, and in the logarithm of a).
+def light_lost_at_edges(plain, corrected, weights):
+    """What the correction at edges adds, squared, one a radius, and the probability that plain estimates do lack it: near one where they
+    lose light at edges as the correction says, near zero where the correction (in clutter) finds edges that are none.
+
+    Disks of half the radius lose half as much. How much of what was added they regain, in units of what is expected at edges, is one or zero
+    under the two hypotheses; along the correction, which has little noise, that shows long before Q does.
+    `plain`, `corrected`: (iterations, radii, pixels) of the same photons.
+    """
+    added = corrected - plain
+    squared = np.maximum(expected_products(added, added, weights), 0)
+    regained, error = with_error(plain[:, :-1] - plain[:, 1:], added[:, 1:], weights)
+    expected = REGAINED_BY_HALVING * squared[1:] + 1e-12
+    precision = 1 / ((error / expected) ** 2 + SCATTER_OF_REGAINED ** 2)
+    share = np.sum(regained / expected * precision) / np.sum(precision)
+    log_odds = (share - 0.5) / (1 / np.sum(precision) + SCATTER_OF_REGAINED ** 2)
+    return squared, float(1 / (1 + np.exp(-np.clip(log_odds, -50, 50))))
+
+
+def squared_bias_over_difference(exponent):
+    """The squared bias at R over the squared difference Q between R and R / 2, where they grow as R^exponent: exact for edges and for
+    curvature, geometric between."""
+    (low, at_edges), (high, by_curvature) = AT_EDGES, BY_CURVATURE
+    return at_edges * (by_curvature / at_edges) ** ((exponent - low) / (high - low))
+
+
+def expected_squared_bias(radii, difference, error, wanted):
+    """Squared bias at the radii `wanted`, from noisy Q at the ladder: the mean over power laws Q = a R^q, each weighted by how well it
+    explains the values (flat in q between 1, edges, and 4, curvature, and in the logarithm of a).
 
     Radii above the second that stands clearly out of its noise are left out: Q saturates, and small radii are what is asked for.
     """
     clear = np.flatnonzero((difference > 3 * error) & (difference > 0))
     used = slice(1, clear[1] + 1 if len(clear) > 1 else len(radii))
-    slopes = np.linspace(1, 4, 31)[:, None, None]
+    slopes = np.linspace(AT_EDGES[0], BY_CURVATURE[0], 31)[:, None, None]
     heights = np.geomspace(1e-9, 10, 200)[None, :, None]                  # Q at the largest radius
     law = heights * (radii[used] / radii[-1]) ** slopes
     spread = np.hypot(error[used], 0.15 * law) + 1e-12
     misfit = np.sum(((difference[used] - law) / spread) ** 2 + 2 * np.log(spread), axis=-1)
     weight = np.exp(-0.5 * (misfit - misfit.min()))
     weight /= weight.sum()
-    return np.einsum("qh,qhr->r", weight, heights * (wanted / radii[-1]) ** slopes)
+    bias = squared_bias_over_difference(slopes) * heights * (wanted / radii[-1]) ** slopes
+    return np.einsum("qh,qhr->r", weight, bias)
 
 
-def best_radius(radii, samples, mean, iterations, at_first_vertex=True):
-    """The radius that minimises the predicted relative error.
+def best_radius(radii, plain, corrected, mean, iterations, at_first_vertex=True):
+    """The radius that minimises the predicted relative error, and whether to correct the estimate at edges.
 
-    `radii`: the ladder; `samples`, `at_first_vertex`: see `noise_and_difference`; `mean`: (pixels,) mean radiance; `iterations(R)`: how many iterations
-    there will be, a function of the radius, so that larger gathers are charged for.
-    Returns `(radius, predicted error at it)`.
+    `radii`: the ladder; `plain`, `at_first_vertex`: see `noise_and_difference`; `corrected`: the same samples corrected at edges, or `None`;
+    `mean`: (pixels,) mean radiance; `iterations(R, corrected)`: how many iterations there will be, so that larger gathers and the correction are
+    charged for.
+    Returns `(radius, correct)`.
     """
-    variance, difference, error = noise_and_difference(radii, samples, relative_weights(mean), at_first_vertex)
+    weights = relative_weights(mean)
     fine = np.exp(np.linspace(np.log(radii[0]), np.log(radii[-1]), 16 * len(radii)))
-    noise = np.exp(np.interp(np.log(fine), np.log(radii), np.log(np.maximum(variance, 1e-30))))
-    predicted = BIAS_FACTOR * expected_difference(radii, difference, error, fine) + noise / iterations(fine)
-    best = int(np.argmin(predicted))
-    return float(fine[best]), float(predicted[best])
+    ways, best = {False: (plain, 0.0)}, plain
+    if corrected is not None:
+        added, lacking = light_lost_at_edges(plain, corrected, weights)
+        added = between(fine, radii, np.maximum.accumulate(added))
+        ways = {False: (plain, lacking * added), True: (corrected, (1 - lacking) * added)}
+        best = plain + lacking * (corrected - plain)
+    _, difference, error = noise_and_difference(radii, best, weights, at_first_vertex)
+    blur = expected_squared_bias(radii, difference, error, fine)
+    choices = []
+    for way, (samples, edges) in ways.items():
+        variance, *_ = noise_and_difference(radii, samples, weights, at_first_vertex)
+        predicted = blur + edges + between(fine, radii, variance) / iterations(fine, way)
+        at = int(np.argmin(predicted))
+        choices.append((float(predicted[at]), float(fine[at]), way))
+    _, radius, way = min(choices)
+    return radius, way
+
+
+def between(wanted, radii, values):
+    """Values at the radii `wanted`, from those at `radii` by power laws."""
+    return np.exp(np.interp(np.log(wanted), np.log(radii), np.log(np.maximum(values, 1e-30))))
