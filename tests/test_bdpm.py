@@ -351,6 +351,19 @@ def test_vertices_that_overflow_are_not_lost(rgb):
     np.testing.assert_allclose(with_capacity(scene, vertices=11), with_capacity(scene), rtol=1e-3, atol=1e-6)
 
 
+def test_vertices_that_overflow_in_the_pilot_are_not_lost(rgb, monkeypatch):
+    scene, radii = glossy_box(), []
+    for room in (None, 11):
+        session = bdpm(bdd=1, initial_radius=0.0).session(scene, seed=1, spp=4)
+        if room:
+            monkeypatch.setattr(session, "_vertex_room", lambda paths: room)
+        session._start()
+        radii.append(session.radii)
+    assert radii[0].keys() == radii[1].keys() == {"caustic", "indirect"}
+    for kind, radius in radii[0].items():
+        assert radii[1][kind] == pytest.approx(radius, rel=0.05)
+
+
 @pytest.mark.parametrize("chunk", [333, 1024])
 def test_camera_pass_in_parts(rgb, monkeypatch, chunk):
     scene = glossy_box()

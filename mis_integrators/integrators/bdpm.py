@@ -12,7 +12,7 @@ from ..transport.gather import gather_photons
 from ..transport.guide import EnvironmentGuide, infinite_emitters
 from ..transport.light_pass import trace_light_paths
 from ..transport.lights import Lights
-from ..transport.photon_map import build_photon_map, smallest_cell
+from ..transport.photon_map import PhotonMap, build_photon_map, smallest_cell
 from ..transport.random import mix
 from ..transport.recording import recorder
 from ..transport.traits import SceneTraits, lookup
@@ -167,6 +167,7 @@ class BDPMSession(IterativeSession):
         """Records the passes anew; from the second iteration on, their kernels run without their Python."""
         self._tables = [self.traits.lambertian, self.traits.perturbed, *self.lights.tables()]
         self._light_pass = self.recorded(self._trace_light)
+        self._map_pass = self.recorded(self._build_maps)
         self._camera_pass = self.recorded(self._render_chunk)
 
     def _trace_light(self, scene, sensor, tables, seed, spectral):
@@ -181,10 +182,10 @@ class BDPMSession(IterativeSession):
                                   integrator.rr_depth, integrator.hide_emitters, capacity, self.has_caustics, self.has_indirect,
                                   self.one_vertex)
 
-    def _gather(self, photons, vertices, kind, radii, spectral, grey=False):
+    def _gather(self, photon_map, vertices, kind, radii, spectral, grey=False):
         """What photons of one kind bring to each vertex, for each radius."""
-        return gather_photons(self.traits, self._map(photons, kind, radii[-1]), vertices, radii, spectral["wavelengths"],
-                              self.light_paths, self.integrator.max_depth, only_last=kind == "indirect", grey=grey)
+        return gather_photons(self.traits, photon_map, vertices, radii, spectral["wavelengths"], self.light_paths, self.integrator.max_depth,
+                              only_last=kind == "indirect", grey=grey)
 
     def _covered(self, scene, vertices, radius, seed):
         """Share of each vertex' merge disk that holds surface; one where the surface is not Lambertian: in a highlight the noise of dividing by
@@ -205,17 +206,23 @@ class BDPMSession(IterativeSession):
         return total
 
     def _map(self, photons, kind, radius):
-        cell = dr.maximum(radius, smallest_cell(self.traits.bounds, self.photon_capacity))
         notes = photons[3] if kind == "indirect" and len(photons) > 3 else None
-        return build_photon_map(*photons[:3], self.traits.bounds, cell, self.photon_capacity, kind, notes)
+        return build_photon_map(*photons[:3], self.traits.bounds, self._cell(radius), self.photon_capacity, kind, notes)
 
-    def _render_chunk(self, scene, sensor, tables, photons, seed, first, spectral, radii):
+    def _cell(self, radius):
+        return dr.maximum(radius, smallest_cell(self.traits.bounds, self.photon_capacity))
+
+    def _build_maps(self, photons, radii):
+        return {kind: self._map(photons, kind, radius).arrays() for kind, radius in radii.items()}
+
+    def _render_chunk(self, scene, sensor, tables, maps, seed, first, spectral, radii):
         radiance, alpha, position, vertices, count = self._trace_camera(scene, sensor, seed, first, 1, self.chunk,
                                                                         self.vertex_capacity, spectral)
         if radii:
             dr.eval(radiance, alpha, position, vertices, count)
         for kind, radius in radii.items():
-            (gathered,) = self._gather(photons, vertices, kind, [radius], spectral)
+            photon_map = PhotonMap.with_grid(maps[kind], self.traits.bounds, self._cell(radius), self.photon_capacity)
+            (gathered,) = self._gather(photon_map, vertices, kind, [radius], spectral)
             if self.corrected[kind]:
                 gathered *= dr.rcp(self._covered(scene, vertices, radius, seed))
             radiance += self._per_path(gathered, vertices, self.chunk)
@@ -258,12 +265,12 @@ class BDPMSession(IterativeSession):
         self._start()
         radii = self.radii_at(iteration)
         spectral = self._spectral(iteration)
-        photons = self._photons(iteration, spectral) if radii else None
+        maps = self._map_pass(self._photons(iteration, spectral), radii) if radii else None
         total = None
         for chunk in range(self.chunks):
             while True:
                 first = dr.opaque(mi.UInt32, chunk * self.chunk)
-                block, count = self._camera_pass(self.scene, self.sensor, self._tables, photons, self._seed(iteration, CAMERA), first,
+                block, count = self._camera_pass(self.scene, self.sensor, self._tables, maps, self._seed(iteration, CAMERA), first,
                                                  spectral, radii)
                 wanted = 0 if self.one_vertex else int(dr.max(count)[0])
                 if wanted <= self.vertex_capacity or not radii:

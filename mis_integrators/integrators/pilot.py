@@ -89,12 +89,25 @@ class Pilot:
         self.ways = {kind: [False, True] if kind == "indirect" and self.at_first_vertex else [False] for kind in session.kinds()}
         self.samples = {(kind, way): [] for kind, ways in self.ways.items() for way in ways}
         self.direct, self.photons = [], {}
-        capacity = session._vertex_room(self.paths) * (1 if session.one_vertex else 4)
+        self._record_camera(session._vertex_room(self.paths) * (1 if session.one_vertex else 4))
+        self._gather = session.recorded(lambda scene, tables, photons, vertices, radii, spectral: {
+            kind: session._gather(session._map(photons, kind, radii[-1]), vertices, kind, radii, spectral, grey=True) for kind in self.ways})
+        self._covered = session.recorded(session._covered)
+
+    def _record_camera(self, capacity):
+        session, self.capacity = self.session, capacity
         self._camera = session.recorded(lambda scene, sensor, tables, seed, spectral: session._trace_camera(
             scene, sensor, seed, mi.UInt32(0), self.stride, self.paths, capacity, spectral))
-        self._gather = session.recorded(lambda scene, tables, photons, vertices, radii, spectral: {
-            kind: session._gather(photons, vertices, kind, radii, spectral, grey=True) for kind in self.ways})
-        self._covered = session.recorded(session._covered)
+
+    def _trace(self, seed, spectral):
+        """Radiance and vertices of the pilot's camera paths. Where the vertices overflow their buffer, it grows and the pass runs again."""
+        session = self.session
+        while True:
+            radiance, _, _, vertices, count = self._camera(session.scene, session.sensor, session._tables, seed, spectral)
+            found = 0 if session.one_vertex else int(dr.max(count)[0])
+            if found <= self.capacity:
+                return radiance, vertices
+            self._record_camera(found + found // 8)
 
     def iterate(self, number):
         """Runs pilot iteration `number`."""
@@ -103,7 +116,7 @@ class Pilot:
         spectral = session._spectral(number)
         photons = session._photons(number, spectral)
         seed = session._seed(number, 1)
-        radiance, _, _, vertices, _ = self._camera(session.scene, session.sensor, session._tables, seed, spectral)
+        radiance, vertices = self._trace(seed, spectral)
         if self.ladder is None and not self._prepare(photons, vertices):
             return
         radii = [dr.opaque(mi.Float, float(radius)) for radius in self.ladder]

@@ -96,10 +96,9 @@ class WeightedSession(BDPMSession):
                                   integrator.rr_depth, integrator.hide_emitters, capacity, self.has_caustics, self.has_indirect, False,
                                   self.weights(spectral["n"]))
 
-    def _gather(self, photons, vertices, kind, radii, spectral, grey=False):
+    def _gather(self, photon_map, vertices, kind, radii, spectral, grey=False):
         if not self._weighted:
-            return super()._gather(photons, vertices, kind, radii, spectral, grey)
-        photon_map = self._map(photons, kind, radii[-1])
+            return super()._gather(photon_map, vertices, kind, radii, spectral, grey)
         weights = self.weights(spectral["n"])
         if kind == "caustic":
             return self._merge(kind, None, photon_map, vertices, weights, radii, spectral, grey)

@@ -56,6 +56,16 @@ class PhotonMap:
     def __init__(self, grid, start, surface, power, notes=None):
         self.grid, self.start, self.surface, self.power, self.notes = grid, start, surface, power, notes
 
+    def arrays(self):
+        """What a recorded function can take; `with_grid` makes the map of it again."""
+        arrays = {"start": self.start, "surface": self.surface, "power": self.power}
+        return arrays if self.notes is None else {**arrays, "notes": self.notes}
+
+    @classmethod
+    def with_grid(cls, arrays, bbox, cell, capacity: int):
+        """The map of `arrays`, built with the same box, cell size and capacity."""
+        return cls(Grid(bbox, cell, table_size(capacity)), **arrays)
+
 
 def build_photon_map(surface, power, count, bbox, cell, capacity: int, kind: str, notes=None):
     """Sorts photons into a grid of cells of edge `cell` (width one) over `bbox`.
