@@ -8,12 +8,12 @@ before the first then give the error at any time.
 from __future__ import annotations
 
 import argparse
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from compare import chosen
-from errors import References, errors
+from errors import TRIMMED_SHARE, References
 from methods import Method, SessionMaker
 from references import colours, find_references
 from reports import Row, save, show, tell
@@ -21,8 +21,9 @@ from scene_files import OpenScene, open_scene, scaled_size
 from turns import Contender, take_turns
 
 STEP = 2**0.5
-COLUMNS = ("scene", "bdd", "time", "automatic", "best", "auto / best radius", "auto relMSE", "best relMSE",
-           "auto / best relMSE", "choice / best relMSE", "set-up", "bias share", "note")
+TRIMMED = " trimmed"
+COLUMNS = ("scene", "bdd", "time", "automatic", "best radius trimmed", "auto / best trimmed", "choice / best trimmed", "best radius",
+           "auto / best", "choice / best", "set-up", "bias share")
 
 
 def run(options: argparse.Namespace) -> None:
@@ -45,65 +46,75 @@ def run(options: argparse.Namespace) -> None:
 
 @dataclass(frozen=True)
 class ErrorLaw:
-    """How the relMSE of one radius falls with time."""
+    """How the relMSE of one radius falls with time; `trimmed`: without the noisiest 0.1 % of the pixels, whose rare bright photons decide the
+    mean of all where surfaces are glossy."""
 
     radius: float
     settings: str
     squared_bias: float
     variance: float
     """Of one iteration."""
+    squared_bias_trimmed: float
+    variance_trimmed: float
     seconds: float
     """Of one iteration."""
     set_up: float
     """Seconds until iterations run: preparation, a pilot, recording."""
 
-    def at(self, seconds: float, set_up: float | None = None) -> float:
+    def at(self, seconds: float, trimmed: bool, set_up: float | None = None) -> float:
         """relMSE after `seconds`."""
         rendering = seconds - (self.set_up if set_up is None else set_up)
-        return self.squared_bias + self.variance * self.seconds / max(rendering, self.seconds)
+        bias, variance = (self.squared_bias_trimmed, self.variance_trimmed) if trimmed else (self.squared_bias, self.variance)
+        return bias + variance * self.seconds / max(rendering, self.seconds)
 
 
 def sweep(opened: OpenScene, references: References, bdd: int, times: list[float], rendering: float,
           radii: int) -> tuple[list[ErrorLaw], list[ErrorLaw]]:
     """Laws of the automatic radius, one for each of the `times` it is to plan for, and of ``radii`` radii around them; none if nothing
     is gathered. Each renders for `rendering` seconds."""
-    automatic = []
+    pilots, chosen_for_free = [], []
     for seconds in times:
         maker = SessionMaker(Method("automatic", "bdpm", {"bdd": bdd, "variance": True}), opened, seconds)
-        automatic.append(Contender.begin(f"automatic for {seconds:g} s", maker.make, seed=0))
-        automatic[-1].iterate()
-    centres = [central_radius(contender.session.settings) for contender in automatic]
-    if None in centres:
-        return [], []
-    makers = sweep_around(float(np.exp(np.mean(np.log(centres)))), radii, bdd, opened, rendering)
-    fixed = [Contender.begin(maker.method.label, maker.make, seed=0) for maker in makers]
-    take_turns([*automatic, *fixed], rendering, tell)
-    return [law(one, references) for one in automatic], [law(one, references) for one in fixed]
+        pilot = Contender.begin("pilot", maker.make, seed=0)
+        take_turns([pilot], 0)
+        if central_radius(pilot.session.settings) is None:
+            return [], []
+        pilots.append(pilot)
+        chosen_for_free.append(Contender.begin(f"automatic for {seconds:g} s", maker.make, seed=0))
+        adopt_choice(chosen_for_free[-1].session, pilot.session)
+    centre = float(np.exp(np.mean([np.log(central_radius(pilot.session.settings)) for pilot in pilots])))
+    fixed = [Contender.begin(maker.method.label, maker.make, seed=0) for maker in sweep_around(centre, radii, bdd, opened, rendering)]
+    take_turns([*chosen_for_free, *fixed], rendering, tell)
+    automatic = [law(free, references) for free in chosen_for_free]
+    automatic = [replace(own, set_up=pilot.first - own.seconds) for own, pilot in zip(automatic, pilots)]
+    return automatic, [law(one, references) for one in fixed]
+
+
+def adopt_choice(session, pilot) -> None:
+    """Give a session the radii that another one chose, so that it needs no pilot of its own."""
+    session.radii, session.corrected = dict(pilot.radii), dict(pilot.corrected)
 
 
 def law(contender: Contender, references: References) -> ErrorLaw:
     """What a rendering tells about its error at other times."""
     session = contender.session
-    image = session.image()
-    noise = image[..., [session.channels.index(name) for name in ("var.R", "var.G", "var.B")]] / references.divisor()
-    seconds = float(np.mean(contender.seconds[1:]))
+    variance = session.image()[..., [session.channels.index(name) for name in ("var.R", "var.G", "var.B")]]
+    image, divisor = colours(session).astype(np.float64), references.divisor()
+    noise = (variance / divisor).mean(axis=-1).ravel()
+    bias = ((image - references.first) * (image - references.second) / divisor).mean(axis=-1).ravel() - noise
+    kept = np.argsort(noise)[: round(noise.size * (1 - TRIMMED_SHARE))]
+    n, seconds = session.iterations, float(np.median(contender.seconds[1:]))
     return ErrorLaw(
-        central_radius(session.settings), chosen(session.settings), errors(colours(session), references).relmse - float(noise.mean()),
-        float(noise.mean()) * session.iterations, seconds, contender.first - seconds,
+        central_radius(session.settings), chosen(session.settings), float(bias.mean()), float(noise.mean()) * n,
+        float(bias[kept].mean()), float(noise[kept].mean()) * n, seconds, contender.rendering - n * seconds,
     )
 
 
-def sweep_around(
-    centre: float | None, radii: int, bdd: int, opened: OpenScene, seconds: float
-) -> list[SessionMaker]:
-    """Sessions with ``radii`` radii around one, factor sqrt 2; none around ``None``."""
-    if centre is None:
-        return []
+def sweep_around(centre: float, radii: int, bdd: int, opened: OpenScene, seconds: float) -> list[SessionMaker]:
+    """Sessions with ``radii`` radii around one, factor sqrt 2."""
     around = centre * STEP ** (np.arange(radii) - (radii - 1) // 2)
-    return [
-        SessionMaker(Method(f"{radius:.4g}", "bdpm", {"bdd": bdd, "initial_radius": radius, "variance": True}), opened, seconds)
-        for radius in around.tolist()
-    ]
+    parameters = [{"bdd": bdd, "initial_radius": radius, "variance": True} for radius in around.tolist()]
+    return [SessionMaker(Method(f"{given['initial_radius']:.4g}", "bdpm", given), opened, seconds) for given in parameters]
 
 
 def central_radius(settings: dict) -> float | None:
@@ -114,18 +125,17 @@ def central_radius(settings: dict) -> float | None:
 
 def judge(seconds: float, automatic: ErrorLaw, fixed: list[ErrorLaw]) -> Row:
     """The automatic radius after `seconds`, and its choice made for free, against the best of the sweep."""
-    best = min(fixed, key=lambda law: law.at(seconds))
-    error, least = automatic.at(seconds), best.at(seconds)
-    return {
-        "time": seconds,
-        "automatic": automatic.settings,
-        "best": best.radius,
-        "auto / best radius": automatic.radius / best.radius,
-        "auto relMSE": error,
-        "best relMSE": least,
-        "auto / best relMSE": error / least,
-        "choice / best relMSE": automatic.at(seconds, best.set_up) / least,
-        "set-up": automatic.set_up,
-        "bias share": automatic.squared_bias / error,
-        "note": "best at the sweep's end" if best in (fixed[0], fixed[-1]) else "",
-    }
+    row: dict = {"time": seconds, "automatic": automatic.settings, "set-up": automatic.set_up}
+    for trimmed, suffix in ((True, TRIMMED), (False, "")):
+        best = min(fixed, key=lambda law: law.at(seconds, trimmed))
+        least = best.at(seconds, trimmed)
+        row |= {
+            "best radius" + suffix: best.radius,
+            "auto relMSE" + suffix: automatic.at(seconds, trimmed),
+            "best relMSE" + suffix: least,
+            "auto / best" + suffix: automatic.at(seconds, trimmed) / least,
+            "choice / best" + suffix: automatic.at(seconds, trimmed, best.set_up) / least,
+            "note" + suffix: "best at the sweep's end" if best in (fixed[0], fixed[-1]) else "",
+        }
+    row["bias share"] = automatic.squared_bias_trimmed / row["auto relMSE trimmed"]
+    return row

@@ -98,9 +98,9 @@ def test_weights_of_a_path_sum_to_one(variant_name, family, emitter, mix, kind, 
             dr.eval(weight)
             largest = max(largest, np.abs(np.array(weight)[:, valid]).max())
             ends = goes_on & weights.ends(bsdf, mi.UInt32(merged), paths.valid)
-            total += dr.select(ends, shares[merged], dr.select(goes_on, weight, 0))
+            total += dr.select(ends, stored[merged][0], dr.select(goes_on, weight, 0))
             goes_on &= ~ends
-        total += dr.select(goes_on, shares[last], 0)         # at the last strategy a photon, too, has the weight of direct light
+        total += dr.select(goes_on, shares[last] if last == length - 1 else stored[last][0], 0)
         total = np.array(total)[:, valid]
         assert np.isfinite(total).all()
         assert np.abs(total - 1).max() < 1e-4 * (1 + largest)

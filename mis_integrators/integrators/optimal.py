@@ -32,38 +32,39 @@ class Node:
     """What is known of a vertex seen from its predecessor.
 
     `f` (spectrum), `p`: BSDF value and camera density of the joint path there; `direct`, `indirect` (spectra): radiance by direct and other
-    light; `lobe_f` (spectrum), `lobe_p`: value and density in a typical direction; `noise`: relative variance of its
-    direct light's estimate; `last` (mask): strategies end here, whatever their number.
+    light; `kernel`: mean BSDF value, what merging a photon there costs where the photon's own is not known; `lobe_f` (spectrum), `lobe_p`:
+    value and density in a typical direction; `noise`: relative variance of its direct light's estimate; `last` (mask): strategies end here,
+    whatever their number; `indirectly` (mask): other than direct light is what the path brings.
     """
 
-    def __init__(self, f, p, direct, indirect, lobe_f, lobe_p, noise, last):
-        self.f, self.p, self.direct, self.indirect, self.lobe_f, self.lobe_p = f, p, direct, indirect, lobe_f, lobe_p
-        self.noise, self.last = noise, last
-
-    def radiance(self, n):
-        """L and b / L. b is the lobe's f times the indirect light, and n times the variance of the direct light's estimate: the noise law takes
-        direct light for exact, but its noise costs as that of photons does."""
-        total = self.direct + self.indirect
-        cost = self.lobe_f * self.indirect + n * self.noise * dr.square(self.direct)
-        return total, cost / recursion.at_least(total, recursion.SMALLEST)
+    def __init__(self, f, p, direct, indirect, kernel, lobe_f, lobe_p, noise, last, indirectly=None):
+        self.f, self.p, self.direct, self.indirect, self.kernel = f, p, direct, indirect, kernel
+        self.lobe_f, self.lobe_p, self.noise, self.last, self.indirectly = lobe_f, lobe_p, noise, last, indirectly
 
     def direct_r(self, n, r):
-        """r with the cost of the direct light's noise: what takes the place of r where direct light is the last strategy."""
+        """r with the cost of the direct light's noise: what takes the place of r where direct light is the last strategy. The noise law takes
+        direct light for exact, but its noise costs as that of photons does."""
         return r + n * self.noise * self.direct
+
+    def final_response(self, n, r):
+        """gamma where no strategy goes on: as at an inner vertex beyond which nothing is merged, so that direct light and photons have weights of
+        their own (the papers give both the same)."""
+        photons = self.indirect / recursion.at_least(r + self.kernel, recursion.SMALLEST)
+        return recursion.inner_response(n, self.direct, self.direct_r(n, r), photons, 0, 0, 0)
 
 
 def typical_node(direct, indirect):
     """A grey Lambertian of the given radiance, at which strategies end."""
-    return Node(None, None, direct, indirect, TYPICAL_ALBEDO / dr.pi, 1 / dr.pi, 0, True)
+    f = TYPICAL_ALBEDO / dr.pi
+    return Node(None, None, direct, indirect, f, f, 1 / dr.pi, 0, True)
 
 
 def response(level, strategies, full, n, r, node):
     """Remainder e and carry tau of the node at z_level, 0 < level < strategies (`weights.recursion`; means over directions are those
     of one typical neighbour)."""
-    radiance, c = node.radiance(n)
-    e_deepest = recursion.remainder(recursion.deepest_response(n, radiance, c, r))
+    e_final = recursion.remainder(node.final_response(n, r))
     if level == strategies - 1 or node.last is True:
-        return e_deepest, mi.Spectrum(0)
+        return e_final, mi.Spectrum(0)
     tau = mi.Spectrum(0)
     gamma = recursion.inner_response(n, node.direct, node.direct_r(n, r), 0, 0, 0, 0)
     if full:
@@ -75,7 +76,7 @@ def response(level, strategies, full, n, r, node):
         tau = dr.select(node.last, 0, recursion.carry(first, e_next))
         photon_sum = incident * rest / node.lobe_p                   # a lobe of projected solid angle 1 / p
         gamma = recursion.inner_response(n, node.direct, node.direct_r(n, r), photon_sum, rest * first, first, tau)
-    return dr.select(node.last, e_deepest, recursion.remainder(gamma)), tau
+    return dr.select(node.last, e_final, recursion.remainder(gamma)), tau
 
 
 class OptimalWeights:
@@ -90,6 +91,7 @@ class OptimalWeights:
         self.lights, self.traits, self.cache, self.surroundings, self.n = lights, traits, cache, surroundings, n
         self.strategies, self.first, self.full, self.mix_diffuse = strategies, first, full, mix_diffuse
         self.camera_paths = camera_paths if first == 0 else 1
+        self.has_caustics = traits.has_delta or lights.needs_photons_for_direct_light()
         self.context = mi.BSDFContext()
         self.smooth = mi.BSDFContext()
         self.smooth.type_mask = mi.BSDFFlags.Smooth
@@ -142,11 +144,17 @@ class OptimalWeights:
             value = dr.select(lit, towards_light, lobe_f)
         ambient = AMBIENT_SHARE * self.cache.mean * lobe_f / (lobe_p * dr.pi)
         indirect = (known.second + known.later) * dr.inv_pi * lobe_f / lobe_p
-        return Node(f, p, value * known.direct * scale + ambient, indirect, lobe_f, lobe_p, known.noise, self.is_last(bsdf, mask))
+        return Node(f, p, value * known.direct * scale + ambient, indirect, dr.mean(lobe_f), lobe_f, lobe_p, known.noise,
+                    self.is_last(bsdf, mask))
 
-    def last_weight(self, drive, e, r, node):
-        """Weight of direct light at an inner vertex."""
+    def direct_weight(self, drive, e, r, node):
+        """Weight of direct light at a vertex, the last strategy of its paths."""
         return recursion.direct_weight(drive, e) * r / recursion.at_least(node.direct_r(self.n, r), recursion.SMALLEST)
+
+    @staticmethod
+    def final_weight(drive, e, r, node):
+        """Weight of photons merged where no strategy goes on."""
+        return recursion.inner_weight(drive, e, recursion.kernel_share(r, node.kernel), 0)
 
     def offset(self, si, bsdf, mask):
         """G = n F / N_B at the first strategy's vertex, its means those of the typical neighbours of its cell."""
@@ -159,27 +167,28 @@ class OptimalWeights:
     # ------------------------------------------------------------------ camera paths (hooks of `trace_camera_paths`)
 
     def begin(self, width):
-        """State of a camera path: drive and r of the vertex it arrives at; after arrival u = e drive and tau, or the offset G in the place of u
-        at the first strategy's vertex."""
+        """State of a camera path: drive and r of the vertex it arrives at; after arrival tau, and u: e drive, or the offset G at the first
+        strategy's vertex, or the photons' weight where strategies end."""
         return [mi.Spectrum(dr.full(mi.Float, value, width)) for value in (1, 1, 0, 0)]
 
     def arrived(self, state, si, bsdf, vertex, mask):
         """State at a smooth vertex, and the weight of the direct light there."""
         drive, r, u, tau = state
         share = mi.Spectrum(1)
-        if self.strategies > 1:
-            at_root = mask & (vertex == self.first)
-            u = dr.select(at_root, self.offset(si, bsdf, at_root) if self.full else mi.Spectrum(0), u)
-            node = self.node(si, bsdf, mask & (vertex > self.first))
-            c = node.radiance(self.n)[1]
-            deepest = node.last | (vertex == self.first + self.strategies - 1)
-            for level in range(1, self.strategies):
-                here = mask & (vertex == self.first + level)
-                e, carried = response(level, self.strategies, self.full, self.n, r, node)
-                u = dr.select(here, recursion.direct_weight(drive, e), u)
-                tau = dr.select(here, carried, tau)
-                weight = dr.select(deepest, recursion.deepest_weight(drive, e, r, c), self.last_weight(drive, e, r, node))
-                share = dr.select(here, weight, share)
+        at_root = mask & (vertex == self.first)
+        if self.strategies == 1:
+            return [drive, r, dr.select(at_root, 1, u), tau], share
+        u = dr.select(at_root, self.offset(si, bsdf, at_root) if self.full else mi.Spectrum(0), u)
+        u = dr.select(at_root & self.is_last(bsdf, at_root), 1, u)
+        node = self.node(si, bsdf, mask & (vertex > self.first))
+        final = node.last | (vertex == self.first + self.strategies - 1)
+        for level in range(1, self.strategies):
+            here = mask & (vertex == self.first + level)
+            e, carried = response(level, self.strategies, self.full, self.n, r, node)
+            merging = dr.select(final, self.final_weight(drive, e, r, node), recursion.direct_weight(drive, e))
+            u = dr.select(here, merging, u)
+            tau = dr.select(here, carried, tau)
+            share = dr.select(here, self.direct_weight(drive, e, r, node), share)
         return [drive, r, u, tau], share
 
     def leaving(self, state, si, bsdf, bs, vertex, mask):
@@ -213,7 +222,9 @@ class OptimalWeights:
     def worth_merging(self, state, share, vertex, last):
         """Probability with which photons are gathered: where the weights are small, seldom."""
         _, _, u, _ = state
-        weight = dr.max(dr.abs(dr.select(last, share, u)))
+        weight = dr.max(dr.abs(u))
+        if self.has_caustics:
+            weight = dr.maximum(weight, dr.max(dr.abs(share)))
         return dr.select(vertex > self.first, dr.clip(weight / WEIGHT_KEPT, SELDOM, 1), 1)
 
     def worth_going_on(self, state, vertex):
@@ -242,57 +253,56 @@ class OptimalWeights:
 
     def deeper_sum(self, level, drive, r, passed):
         """Sum of the weights of the strategies at z_level and beyond."""
-        (node, _), beyond = passed[0], passed[1:]
+        node, beyond = passed[0], passed[1:]
         e, tau = response(level, self.strategies, self.full, self.n, r, node)
-        deepest = recursion.deepest_weight(drive, e, r, node.radiance(self.n)[1])
+        direct, final = self.direct_weight(drive, e, r, node), self.final_weight(drive, e, r, node)
         if level == self.strategies - 1:
-            return deepest
+            return dr.select(node.indirectly, final, direct)
         u = recursion.direct_weight(drive, e)
         deeper = self.deeper_sum(level + 1, *self.step(u, tau, r, node.f, node.p), beyond)
         here = recursion.inner_weight(drive, e, recursion.kernel_share(r, node.f), deeper)
-        return dr.select(node.last, deepest, dr.select(beyond[0][1], here + deeper, self.last_weight(drive, e, r, node)))
-
-
-class NotedNode(Node):
-    """A node read from a photon's notes. Of a path's deepest vertex only the radiance and b / L are noted, and nothing else is asked."""
-
-    def __init__(self, radiance, c, direct=None, f=None, p=None, noise=None, lobe_f=None, lobe_p=None):
-        last = True if noise is None else noise < 0
-        indirect = None if direct is None else radiance - direct
-        super().__init__(f, p, direct, indirect, lobe_f, lobe_p, None if noise is None else dr.select(last, -1 - noise, noise), last)
-        self._known = radiance, c
-
-    def radiance(self, n):
-        return self._known
+        return dr.select(node.indirectly, dr.select(node.last, final, here + deeper), direct)
 
 
 class Notebook:
     """Notes of light sub-paths: what is known of the last `strategies - 1` vertices that scattered smoothly, nearest first (hooks of
-    `trace_light_paths`). All of them but the farthest, which only ever is the deepest vertex of a joint path, as whole nodes."""
+    `trace_light_paths`). Of the farthest, at which strategies end, only what `Node.final_response` and its weights ask for."""
 
     def __init__(self, weights):
         self.weights = weights
         self.whole = weights.strategies - 2
 
     def _fields(self, node):
-        radiance, c = node.radiance(self.weights.n)
-        fields = [mi.Spectrum(radiance), mi.Spectrum(c)]
+        """A node's fields, those of the farthest one first. The kernel is negative where strategies end, the noise where the path goes on."""
+        fields = [node.direct, node.indirect, dr.select(node.last, -1 - node.kernel, node.kernel),
+                  dr.select(node.indirectly, -1 - node.noise, node.noise)]
         if self.whole:
-            fields += [node.direct, node.f, node.p, dr.select(node.last, -1 - node.noise, node.noise)]     # negative: the last
+            fields += [node.f, node.p]
             if self.weights.full:
                 fields += [node.lobe_f, node.lobe_p]
         return fields
 
+    @staticmethod
+    def _node(direct, indirect, kernel, noise, f=None, p=None, lobe_f=None, lobe_p=None):
+        """The node of fields read back."""
+        last, indirectly = kernel < 0, noise < 0
+        return Node(f, p, direct, indirect, dr.select(last, -1 - kernel, kernel), lobe_f, lobe_p, dr.select(indirectly, -1 - noise, noise),
+                    last, indirectly)
+
     def begin(self):
-        none, zero = mi.Spectrum(-1), mi.Spectrum(0)              # a vertex that does not exist has negative radiance
-        node = Node(mi.Spectrum(0), mi.Float(0), mi.Spectrum(0), mi.Spectrum(0), mi.Spectrum(0), mi.Float(1), mi.Float(0), mi.Bool(False))
-        return [[mi.Spectrum(none), *[type(x)(x) for x in self._fields(node)[1:]]] for _ in range(self.whole)] + [[none, zero]]
+        def nothing():                                            # a vertex that does not exist has negative radiance
+            zero = mi.Spectrum(0)
+            return self._fields(Node(zero, mi.Float(0), mi.Spectrum(-1), mi.Spectrum(0), mi.Float(0), zero, mi.Float(1), mi.Float(0),
+                                     mi.Bool(False), mi.Bool(False)))
+        return [[type(x)(x) for x in nothing()] for _ in range(self.whole)] + [[type(x)(x) for x in nothing()[:4]]]
 
     def scattered(self, state, si, bsdf, wo, mask):
         view = mi.SurfaceInteraction3f(si)
         view.wi = mi.Vector3f(wo)
         f, p = self.weights.scattering(view, bsdf, si.wi, mask) if self.whole else (None, None)
-        new = self._fields(self.weights.node(view, bsdf, mask, f, p))
+        node = self.weights.node(view, bsdf, mask, f, p)
+        node.indirectly = state[0][0][0] >= 0
+        new = self._fields(node)
         result = []
         for old in state:
             result.append([dr.select(mask, a, b) for a, b in zip(new, old)])
@@ -307,13 +317,13 @@ class Notebook:
         return words + [mi.UInt32(0)] * ((2 - len(words)) if len(words) <= 2 else -len(words) % 4)
 
     def read(self, level, notes, index, active):
-        """The vertices that photon `index`, merged at z_level, has passed: a list of (`Node`, whether it exists), nearest first, as
-        many as there are strategies beyond that level; the last one is the deepest vertex."""
+        """The vertices that photon `index`, merged at z_level, has passed: `Node`s, nearest first, as many as there are strategies beyond that
+        level. Those that do not exist come after one that direct light ends."""
         template = self.begin()
         count = len(self.words(template))
         template = template[:self.whole + 1 - level]
-        template[-1] = template[-1][:2]
-        needed = len(self.words(template))
+        template[-1] = template[-1][:4]
+        needed = sum(dr.size_v(mi.Spectrum) if dr.depth_v(field) > 1 else 1 for fields in template for field in fields)
         words = []
         for part in range(-(-needed // 4)):
             words += list(dr.gather(mi.Vector2u if count == 2 else mi.Vector4u, notes, max(count // 4, 1) * index + part, active))
@@ -324,5 +334,5 @@ class Notebook:
                 size = dr.size_v(mi.Spectrum) if dr.depth_v(field) > 1 else 1
                 mine, words = words[:size], words[size:]
                 values.append(mi.Spectrum([bits_float(w) for w in mine]) if dr.depth_v(field) > 1 else bits_float(mine[0]))
-            passed.append((NotedNode(*values), dr.max(values[0]) >= 0))
+            passed.append(self._node(*values))
         return passed

@@ -34,8 +34,7 @@ class Surroundings:
             return
         si, bsdf, active = self._neighbours(scene, cache, cells)
         node = weights.node(si, bsdf, active)
-        radiance, _ = node.radiance(0)
-        grey = np.array(dr.select(active, dr.mean(radiance), 0)).reshape(cells, RAYS)
+        grey = np.array(dr.select(active, dr.mean(node.direct + node.indirect), 0)).reshape(cells, RAYS)
         order = np.argsort(grey, axis=1)
         ends = np.round(np.cumsum((0,) + SHARES) * RAYS).astype(int)
         table = np.zeros((cells + 1, len(SHARES), 2, channels), dtype=np.float32)

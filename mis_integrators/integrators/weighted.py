@@ -49,7 +49,8 @@ class WeightedSession(BDPMSession):
 
     def weigher(self, weights, kind, level, vertices, photon_map):
         """What weighs the photons of a map, of one kind, at the vertices of one strategy (`weigh` of `gather_photons`); None where a vertex
-        weighs all of them as it does its direct light. Caustic photons are merged at all vertices at once (`level` is None)."""
+        weighs all of them alike: caustic ones as its direct light, others by the first word of its state. Caustic photons are merged at all
+        vertices at once (`level` is None)."""
         if kind == "caustic" or level == self.integrator.strategies - 1:
             return None
         notebook, state = weights.notebook(), [vertices[name] for name in STATE]
@@ -117,11 +118,13 @@ class WeightedSession(BDPMSession):
     def _merge(self, kind, level, photon_map, vertices, weights, radii, spectral, grey):
         """Weighted radiance that photons of one kind bring to the vertices of one strategy."""
         weigh = self.weigher(weights, kind, level, vertices, photon_map)
-        return gather_photons(self.traits, photon_map, vertices if weigh else _shared(vertices), radii, spectral["wavelengths"],
-                              self.light_paths, self.integrator.max_depth, only_last=kind == "indirect", grey=grey, weigh=weigh)
+        if weigh is None:
+            vertices = _scaled(vertices, "share" if kind == "caustic" else STATE[0])
+        return gather_photons(self.traits, photon_map, vertices, radii, spectral["wavelengths"], self.light_paths, self.integrator.max_depth,
+                              only_last=kind == "indirect", grey=grey, weigh=weigh)
 
 
-def _shared(vertices):
-    """The vertices with their weight of direct light multiplied into their throughput."""
+def _scaled(vertices, weight):
+    """The vertices with one of their weights as a scale of what they gather."""
     used = dr.max(vertices["throughput"]) > 0
-    return {**vertices, "throughput": dr.select(used, vertices["throughput"], 0), "scale": dr.select(used, vertices["share"], 0)}
+    return {**vertices, "throughput": dr.select(used, vertices["throughput"], 0), "scale": dr.select(used, vertices[weight], 0)}

@@ -48,7 +48,7 @@ def colours():
 class IrradianceCache:
     """Irradiance by cell.
 
-    Attributes: `cell` (edge of the cells, width one), `photon_flux` (flux of a typical stored photon for one light sub-path, a list of one
+    Attributes: `cell` (edge of the cells, width one), `photon_flux` (flux of a typical photon that is merged, for one light sub-path, a list of one
     number a channel), `mean` (irradiance of a typical lit point), `center` and `facing` (mean position and normal of the photons of each cell,
     from cell number 1 on).
     """
@@ -66,7 +66,10 @@ class IrradianceCache:
         flux, packed = read_power(power, index, stored)
         normal = unpack_normal(record.w)
         normal = mi.Normal3f(dr.normalize(dr.mulsign(normal, dr.dot(normal, unpack_direction(packed)))))
-        self.photon_flux = [_typical(dr.select(stored, value, 0)) for value in self._channels(flux)]
+        merged = stored & ~unpack_caustic(record.w)                         # those of direct light, often far brighter, are never merged
+        if not dr.any(merged):
+            merged = stored
+        self.photon_flux = [_typical(dr.select(merged, value, 0)) for value in self._channels(flux)]
         place = self._choose_cells(position, normal, stored, int(count[0]), bounds)
         self._sum_cells(position, normal, place, stored)
         self.table = dr.zeros(mi.Float, self.words * (dr.width(self.center) + 1))
