@@ -314,6 +314,6 @@ def test_radii(rgb):
     assert session.radii["indirect"] > 0 and session.radii["caustic"] > 0
     session.radii = {"indirect": 0.04, "caustic": 0.02}
     session.prepare(None)
-    weights = session.weights(session._spectral(0)["n"])
+    weights = session.weights(session._spectral(0)["merging"])
     assert weights.caustic_share[0] == pytest.approx(4, rel=1e-5)
     assert weights.disk_paths[0] == pytest.approx(np.pi * 0.04 ** 2 * 5000, rel=1e-5)

@@ -64,23 +64,16 @@ class BDPMBalance(WeightedBDPM):
 class BDPMBalanceSession(WeightedSession):
     """Iterations of `bdpm_balance`."""
 
-    def prepare(self, spectral):
-        areas = {kind: radius ** 2 for kind, radius in self.radii.items()}
-        both = {"caustic", "indirect"} <= areas.keys()
-        self._caustic_share = dr.opaque(mi.Float, areas["indirect"] / areas["caustic"] if both else 1.0)
-
-    def _freeze(self):
-        super()._freeze()
-        if self._weighted:
-            self._tables.append(self._caustic_share)
-
-    def weights(self, n):
+    def weights(self, merging):
         integrator = self.integrator
         beta = int(integrator.beta) if integrator.beta == int(integrator.beta) else integrator.beta
-        return HeuristicWeights(self.lights, mi.Float(n[0]), self._caustic_share, integrator.strategies, beta)
+        return HeuristicWeights(self.lights, merging["disk_paths"], merging["caustic_share"], integrator.strategies, beta)
 
-    def photons_per_irradiance(self, radius):
-        return mi.Spectrum(dr.pi * dr.square(radius) * self.light_paths)
+    def merging(self, radii):
+        radius = radii.get("indirect", radii.get("caustic"))
+        both = {"caustic", "indirect"} <= radii.keys()
+        return {"disk_paths": dr.pi * dr.square(radius) * self.light_paths,
+                "caustic_share": dr.square(radius / radii["caustic"]) if both else mi.Float(1)}
 
     def weigher(self, weights, kind, level, vertices, photon_map):
         return weights.weigher(kind, level, vertices, photon_map)

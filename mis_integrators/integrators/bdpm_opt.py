@@ -130,21 +130,26 @@ class BDPMOptSession(WeightedSession):
             found = int(photons[2][0])
         self.cache = IrradianceCache(self.scene, self.lights, *photons, paths, self.traits.bounds)
         if integrator.weights == "full":
-            self.surroundings = Surroundings(self.scene, self.weights(mi.Spectrum(0)))
+            self.surroundings = Surroundings(self.scene, self.weights({"n": mi.Spectrum(0), "caustic_cost": mi.Float(0)}))
 
     def _freeze(self):
         super()._freeze()
         if self._weighted:
             self._tables += self.cache.tables() + ([self.surroundings.table] if self.surroundings else [])
 
-    def weights(self, n):
+    def weights(self, merging):
         integrator = self.integrator
-        return OptimalWeights(self.lights, self.traits, self.cache, self.surroundings, n, integrator.strategies, integrator.first_vertex,
-                              integrator.camera_paths, integrator.weights == "full", integrator.mix_diffuse)
+        return OptimalWeights(self.lights, self.traits, self.cache, self.surroundings, merging["n"], merging["caustic_cost"],
+                              integrator.strategies, integrator.first_vertex, integrator.camera_paths, integrator.weights == "full",
+                              integrator.mix_diffuse)
 
-    def photons_per_irradiance(self, radius):
-        inverse = [self.light_paths / flux if flux > 0 else 0.0 for flux in self.cache.photon_flux]
-        return dr.pi * dr.square(radius) * mi.Spectrum(inverse if len(inverse) > 1 else inverse[0])
+    def merging(self, radii):
+        cache = self.cache
+        inverse = [self.light_paths / flux if flux > 0 else 0.0 for flux in cache.photon_flux]
+        radius = radii.get("indirect", radii.get("caustic"))
+        dearer = sum(cache.caustic_flux) / max(sum(cache.photon_flux), 1e-30)
+        return {"n": dr.pi * dr.square(radius) * mi.Spectrum(inverse if len(inverse) > 1 else inverse[0]),
+                "caustic_cost": dearer * dr.square(radius / radii.get("caustic", radius))}
 
 
 FROZEN = 3

@@ -33,24 +33,19 @@ class Node:
 
     `f` (spectrum), `p`: BSDF value and camera density of the joint path there; `direct`, `indirect` (spectra): radiance by direct and other
     light; `kernel`: mean BSDF value, what merging a photon there costs where the photon's own is not known; `lobe_f` (spectrum), `lobe_p`:
-    value and density in a typical direction; `noise`: relative variance of its direct light's estimate; `last` (mask): strategies end here,
-    whatever their number; `indirectly` (mask): other than direct light is what the path brings.
+    value and density in a typical direction; `noise`: what the noise of its direct light costs, in the units of `kernel`; `last` (mask):
+    strategies end here, whatever their number; `indirectly` (mask): other than direct light is what the path brings.
     """
 
     def __init__(self, f, p, direct, indirect, kernel, lobe_f, lobe_p, noise, last, indirectly=None):
         self.f, self.p, self.direct, self.indirect, self.kernel = f, p, direct, indirect, kernel
         self.lobe_f, self.lobe_p, self.noise, self.last, self.indirectly = lobe_f, lobe_p, noise, last, indirectly
 
-    def direct_r(self, n, r):
-        """r with the cost of the direct light's noise: what takes the place of r where direct light is the last strategy. The noise law takes
-        direct light for exact, but its noise costs as that of photons does."""
-        return r + n * self.noise * self.direct
-
     def final_response(self, n, r):
         """gamma where no strategy goes on: as at an inner vertex beyond which nothing is merged, so that direct light and photons have weights of
         their own (the papers give both the same)."""
         photons = self.indirect / recursion.at_least(r + self.kernel, recursion.SMALLEST)
-        return recursion.inner_response(n, self.direct, self.direct_r(n, r), photons, 0, 0, 0)
+        return recursion.inner_response(n, self.direct, r + self.noise, photons, 0, 0, 0)
 
 
 def typical_node(direct, indirect):
@@ -66,7 +61,7 @@ def response(level, strategies, full, n, r, node):
     if level == strategies - 1 or node.last is True:
         return e_final, mi.Spectrum(0)
     tau = mi.Spectrum(0)
-    gamma = recursion.inner_response(n, node.direct, node.direct_r(n, r), 0, 0, 0, 0)
+    gamma = recursion.inner_response(n, node.direct, r + node.noise, 0, 0, 0, 0)
     if full:
         theta, rest = recursion.kernel_share(r, node.lobe_f), recursion.kernel_rest(r, node.lobe_f)
         next_r = recursion.next_ratio(theta, node.lobe_p)
@@ -75,7 +70,7 @@ def response(level, strategies, full, n, r, node):
         first = rest * (1 - e_next)
         tau = dr.select(node.last, 0, recursion.carry(first, e_next))
         photon_sum = incident * rest / node.lobe_p                   # a lobe of projected solid angle 1 / p
-        gamma = recursion.inner_response(n, node.direct, node.direct_r(n, r), photon_sum, rest * first, first, tau)
+        gamma = recursion.inner_response(n, node.direct, r + node.noise, photon_sum, rest * first, first, tau)
     return dr.select(node.last, e_final, recursion.remainder(gamma)), tau
 
 
@@ -83,12 +78,13 @@ class OptimalWeights:
     """Weights of `strategies` merging strategies, the first at camera vertex `first`.
 
     `full`: keep the recursion's integrals, else drop them (local weights). `cache`: an `IrradianceCache`; `surroundings`: a `Surroundings`
-    of its cells (full weights only). `n`: photons per unit of irradiance in the merge disk (a spectrum of width one). `mix_diffuse`: whether
-    strategies go on beyond Lambertian vertices; else the first of these is a path's last strategy.
+    of its cells (full weights only). `n`: photons per unit of irradiance in the merge disk (a spectrum of width one). `caustic_cost`: what
+    merging a caustic photon costs in units of merging another one (width one). `mix_diffuse`: whether strategies go on beyond Lambertian
+    vertices; else the first of these is a path's last strategy.
     """
 
-    def __init__(self, lights, traits, cache, surroundings, n, strategies, first, camera_paths, full, mix_diffuse):
-        self.lights, self.traits, self.cache, self.surroundings, self.n = lights, traits, cache, surroundings, n
+    def __init__(self, lights, traits, cache, surroundings, n, caustic_cost, strategies, first, camera_paths, full, mix_diffuse):
+        self.lights, self.traits, self.cache, self.surroundings, self.n, self.caustic_cost = lights, traits, cache, surroundings, n, caustic_cost
         self.strategies, self.first, self.full, self.mix_diffuse = strategies, first, full, mix_diffuse
         self.camera_paths = camera_paths if first == 0 else 1
         self.has_caustics = traits.has_delta or lights.needs_photons_for_direct_light()
@@ -144,12 +140,16 @@ class OptimalWeights:
             value = dr.select(lit, towards_light, lobe_f)
         ambient = AMBIENT_SHARE * self.cache.mean * lobe_f / (lobe_p * dr.pi)
         indirect = (known.second + known.later) * dr.inv_pi * lobe_f / lobe_p
-        return Node(f, p, value * known.direct * scale + ambient, indirect, dr.mean(lobe_f), lobe_f, lobe_p, known.noise,
-                    self.is_last(bsdf, mask))
+        direct, kernel = value * known.direct * scale + ambient, dr.mean(lobe_f)
+        # The noise law takes direct light for exact. Its noise costs as that of photons does: n times the variance over the radiance.
+        noise = dr.mean(self.n * direct) * known.noise * dr.square(1 - known.caustic_share)
+        if self.has_caustics:
+            noise += self.caustic_cost * known.caustic_share * kernel
+        return Node(f, p, direct, indirect, kernel, lobe_f, lobe_p, noise, self.is_last(bsdf, mask))
 
     def direct_weight(self, drive, e, r, node):
         """Weight of direct light at a vertex, the last strategy of its paths."""
-        return recursion.direct_weight(drive, e) * r / recursion.at_least(node.direct_r(self.n, r), recursion.SMALLEST)
+        return recursion.direct_weight(drive, e) * r / recursion.at_least(r + node.noise, recursion.SMALLEST)
 
     @staticmethod
     def final_weight(drive, e, r, node):

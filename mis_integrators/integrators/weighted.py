@@ -39,13 +39,13 @@ class WeightedSession(BDPMSession):
     def prepare(self, spectral):
         """Makes what the weights need, once: before the pilot of the radius if that is weighted, else after it."""
 
-    def weights(self, n):
-        """The weights (hooks as in `trace_camera_paths` and `trace_light_paths`); `n` is what `photons_per_irradiance` returns."""
+    def weights(self, merging):
+        """The weights (hooks as in `trace_camera_paths` and `trace_light_paths`); `merging` is what the method of that name returns."""
         raise TypeError(f"{type(self).__name__} does not define weights")
 
-    def photons_per_irradiance(self, radius):
-        """Expected photons in the merge disk per unit of irradiance: a spectrum of width one."""
-        raise TypeError(f"{type(self).__name__} does not define photons_per_irradiance")
+    def merging(self, radii):
+        """What the weights must know of the merge disks: arrays of width one, by name."""
+        raise TypeError(f"{type(self).__name__} does not define merging")
 
     def weigher(self, weights, kind, level, vertices, photon_map):
         """What weighs the photons of a map, of one kind, at the vertices of one strategy (`weigh` of `gather_photons`); None where a vertex
@@ -76,14 +76,14 @@ class WeightedSession(BDPMSession):
         spectral = super()._spectral(iteration)
         if self._weighted:
             radii = self.radii_at(iteration) if self.radii else {"indirect": self.usual_radius()}
-            spectral["n"] = self.photons_per_irradiance(radii.get("indirect", radii.get("caustic")))
-            dr.make_opaque(spectral["n"])
+            spectral["merging"] = self.merging(radii)
+            dr.make_opaque(spectral["merging"])
         return spectral
 
     def _trace_light(self, scene, sensor, tables, seed, spectral):
         if not self._weighted:
             return super()._trace_light(scene, sensor, tables, seed, spectral)
-        notebook = self.weights(spectral["n"]).notebook() if self.has_indirect else None
+        notebook = self.weights(spectral["merging"]).notebook() if self.has_indirect else None
         return trace_light_paths(scene, self.lights, self.traits, seed, self.light_paths, self.photon_capacity, spectral["wavelengths"],
                                  sensor.shutter_open(), sensor.shutter_open_time(), self.integrator.max_depth, self.integrator.rr_depth,
                                  notebook=notebook)
@@ -95,12 +95,12 @@ class WeightedSession(BDPMSession):
         return trace_camera_paths(scene, sensor, integrator, self.lights, self.traits, seed, first, stride, paths, integrator.camera_paths,
                                   spectral["sample"], integrator.first_vertex + integrator.strategies - 1, integrator.max_depth,
                                   integrator.rr_depth, integrator.hide_emitters, capacity, self.has_caustics, self.has_indirect, False,
-                                  self.weights(spectral["n"]))
+                                  self.weights(spectral["merging"]))
 
     def _gather(self, photon_map, vertices, kind, radii, spectral, grey=False):
         if not self._weighted:
             return super()._gather(photon_map, vertices, kind, radii, spectral, grey)
-        weights = self.weights(spectral["n"])
+        weights = self.weights(spectral["merging"])
         if kind == "caustic":
             return self._merge(kind, None, photon_map, vertices, weights, radii, spectral, grey)
         integrator = self.integrator

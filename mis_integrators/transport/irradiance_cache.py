@@ -33,11 +33,11 @@ class Irradiance:
     """What a cell knows. Spectra: `direct` (irradiance by direct light and caustics), `second` (by light scattered once), `later` (more
     often). `direction`: mean direction from which the direct part comes. `slot`: the cell's number. `light`: number of the
     emitter that brings most of the direct part, `visible_share`: how much of that emitter's unoccluded light the direct part is (0: none
-    is known). `noise`: relative variance of next-event estimation with one sample."""
+    is known). `noise`: relative variance of next-event estimation with one sample. `caustic_share`: share of caustics in the direct part."""
 
-    def __init__(self, direct, second, later, direction, slot, light, visible_share, noise):
+    def __init__(self, direct, second, later, direction, slot, light, visible_share, noise, caustic_share):
         self.direct, self.second, self.later, self.direction = direct, second, later, direction
-        self.slot, self.light, self.visible_share, self.noise = slot, light, visible_share, noise
+        self.slot, self.light, self.visible_share, self.noise, self.caustic_share = slot, light, visible_share, noise, caustic_share
 
 
 def colours():
@@ -57,7 +57,7 @@ class IrradianceCache:
         """`surface`, `power`, `count`: photons as `trace_light_paths` stores them, direct light's included; `light_paths`: how many
         sub-paths made them."""
         self.origin = mi.Point3f(bounds.min)
-        self.words = 8 if colours() == 1 else 16
+        self.words = 12 if colours() == 1 else 16
         capacity = dr.width(surface) // 4
         index = dr.arange(mi.UInt32, capacity)
         stored = index < count
@@ -66,10 +66,11 @@ class IrradianceCache:
         flux, packed = read_power(power, index, stored)
         normal = unpack_normal(record.w)
         normal = mi.Normal3f(dr.normalize(dr.mulsign(normal, dr.dot(normal, unpack_direction(packed)))))
-        merged = stored & ~unpack_caustic(record.w)                         # those of direct light, often far brighter, are never merged
-        if not dr.any(merged):
-            merged = stored
-        self.photon_flux = [_typical(dr.select(merged, value, 0)) for value in self._channels(flux)]
+        straight = unpack_caustic(record.w)
+        flux_of = {kind: [_typical(dr.select(stored & mask, value, 0)) for value in self._channels(flux)]
+                   for kind, mask in (("indirect", ~straight), ("caustic", straight & (unpack_depth(record.w) > 1)))}
+        self.photon_flux = flux_of["indirect"] if any(flux_of["indirect"]) else flux_of["caustic"]
+        self.caustic_flux = flux_of["caustic"]
         place = self._choose_cells(position, normal, stored, int(count[0]), bounds)
         self._sum_cells(position, normal, place, stored)
         self.table = dr.zeros(mi.Float, self.words * (dr.width(self.center) + 1))
@@ -130,18 +131,22 @@ class IrradianceCache:
             soon = hit & ~straight & (unpack_depth(record.w) <= 2)
             added = [dr.select(kind, value, 0) for kind in (straight, soon, hit & ~straight & ~soon) for value in self._channels(flux)]
             added += [dr.select(straight, dr.mean(flux) * x, 0) for x in towards]
+            added += [dr.select(straight & (unpack_depth(record.w) > 1), dr.mean(flux), 0)]
             return tuple(old + new for old, new in zip(totals, added))
 
         totals = for_each_photon(photon_map, self.center, self.cell, mi.Bool(True), visit,
-                                 tuple(mi.Float(0) for _ in range(3 * channels + 3)))
+                                 tuple(mi.Float(0) for _ in range(3 * channels + 4)))
         area = dr.rcp(dr.pi * dr.square(self.cell) * light_paths)
         irradiance = [total * area for total in totals[:3 * channels]]
-        direction = mi.Vector3f(*totals[3 * channels:])
+        direction = mi.Vector3f(*totals[3 * channels:-1])
         direction *= dr.rsqrt(dr.maximum(dr.squared_norm(direction), 1e-30))
-        dr.eval(irradiance, direction)
-        light, visible_share = self._strongest_light(scene, lights, sum(irradiance[:channels]) / channels)
+        straight = sum(irradiance[:channels]) / channels
+        caustic_share = dr.select(straight > 0, dr.minimum(totals[-1] * area / dr.maximum(straight, 1e-30), 1), 0)
+        dr.eval(irradiance, direction, caustic_share)
+        light, visible_share = self._strongest_light(scene, lights, straight)
         number = dr.arange(mi.UInt32, dr.width(self.center)) + 1
-        for offset, value in enumerate((*irradiance, *direction, _pack_light(light, visible_share), self._direct_noise(lights))):
+        for offset, value in enumerate((*irradiance, *direction, _pack_light(light, visible_share), self._direct_noise(lights),
+                                          caustic_share)):
             dr.scatter(self.table, mi.Float(value), self.words * number + offset)
         dr.eval(self.table)
         self.mean = float(dr.mean(sum(irradiance) / channels)[0])
@@ -202,7 +207,7 @@ class IrradianceCache:
                    for i in range(3)]
         rest = words[3 * channels:]
         light, visible_share = _unpack_light(rest[3])
-        return Irradiance(*spectra, mi.Vector3f(*rest[:3]), slot, light, visible_share, rest[4])
+        return Irradiance(*spectra, mi.Vector3f(*rest[:3]), slot, light, visible_share, *rest[4:6])
 
 
 def _typical(flux):
