@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 
 from comparing import PathBatches, SessionBatches, agree, assert_powerful, collect_until, differences, t_quantile
+from mis_integrators.integrators import optimal
+from mis_integrators.integrators.optimal import OptimalWeights
 from test_against_path import LENS, MONO, ORTHO, PERSPECTIVE, RGB, SPECTRAL, oracle
 from worlds import EMITTERS, RADIUS, has_delta, tray
 
@@ -231,6 +233,63 @@ def test_noise_law(rgb):
     terms = np.linalg.solve(np.array([law(*pair) for pair in fitted]), np.array([measured(*pair) for pair in fitted]))
     for pair in others:
         assert abs(measured(*pair) / (law(*pair) @ terms) - 1) < 0.12, (pair, terms)
+
+
+# A closed white sphere lit from its middle: everything is even, so the noise of any weights is known. With `max_depth` 4 and two strategies,
+# a path of three segments is a photon of two at z0 or direct light at z1, which has no noise; one of four is a photon of three at z0
+# or of two at z1, equally noisy. Best is no weight for the former's photon, and half for each of the latter's.
+SPHERE = {"albedo": 0.95, "intensity": 2.0, "radius": 0.1, "light_paths": 4000}
+
+
+def noise_in_sphere(direct_weight, final_weight):
+    """Variance of an iteration's pixel where direct light at z1 has the first weight, and photons there have the second."""
+    share = SPHERE["radius"] ** 2 / 4                                       # of the sphere in a merge disk (exactly, also on a sphere)
+    rho, flux = SPHERE["albedo"], 4 * np.pi * SPHERE["intensity"]
+    photon = rho / np.pi * flux / (np.pi * SPHERE["radius"] ** 2)           # of one segment
+    squares = ((1 - direct_weight) * rho) ** 2 + ((1 - final_weight) ** 2 + final_weight ** 2) * rho ** 4
+    return share / SPHERE["light_paths"] * photon ** 2 * squares
+
+
+def measured_in_sphere(iterations):
+    """The same of the weights as they are: mean, and standard error over blocks of the image."""
+    scene = mi.load_dict({
+        "type": "scene", "room": {"type": "sphere", "flip_normals": True, "bsdf": {"type": "diffuse", "reflectance": {
+            "type": "rgb", "value": [SPHERE["albedo"]] * 3}}},
+        "light": {"type": "point", "position": [0, 0, 0], "intensity": SPHERE["intensity"]},
+        "sensor": {"type": "perspective", "fov": 90, "to_world": mi.ScalarTransform4f().look_at([0.3, 0, 0.1], [0, 1, 0], [0, 0, 1]),
+                   "film": {"type": "hdrfilm", "width": 24, "height": 24, "rfilter": {"type": "box"}, "pixel_format": "rgb"}}})
+    integrator = mi.load_dict({"type": "bdpm_opt2", "weights": "full", "mix_diffuse": True, "max_depth": 4, "rr_depth": 100,
+                               "initial_radius": SPHERE["radius"], "photon_count": SPHERE["light_paths"], "variance": True})
+    session = integrator.session(scene, seed=1)
+    for _ in range(iterations):
+        session.iterate()
+    noise = session.image()[..., -3:].mean(-1).reshape(4, 6, 4, 6).mean(axis=(1, 3)) * iterations
+    return float(noise.mean()), float(noise.std(ddof=1) / 4)
+
+
+def test_predicted_optimum(rgb):
+    """Full weights come within 10 % of the least noise that theory allows (and not below it by more than the error of the measurement)."""
+    least = noise_in_sphere(1, 0.5)
+    measured, error = measured_in_sphere(300)
+    assert error < 0.03 * least
+    assert least - 4 * error < measured < 1.1 * least + 2 * error, (measured / least, error / least)
+
+
+@pytest.mark.parametrize("number", [pytest.param(n, marks=[pytest.mark.full] if n > 1 else []) for n in range(20)])
+def test_other_weights_are_worse(rgb, monkeypatch, number):
+    """Weights that differ from the optimal ones by 20 % (RMS over the two kinds of paths, in a random direction) are noisier by more than the
+    error of the measurement (4 standard deviations), and by as much as the closed form says (the noise of our own weights aside).
+    Strategies of little weight are used every time here, not at random."""
+    monkeypatch.setattr(optimal, "WEIGHT_KEPT", 1e-3)
+    angle = 2 * np.pi * np.random.default_rng(5).random(20)[number]
+    steps = 0.2 * 2 ** 0.5 * np.cos(angle), 0.2 * 2 ** 0.5 * np.sin(angle)
+    direct, final = OptimalWeights.direct_weight, OptimalWeights.final_weight
+    monkeypatch.setattr(OptimalWeights, "direct_weight", staticmethod(lambda *args: direct(*args) + dr.opaque(mi.Float, steps[0])))
+    monkeypatch.setattr(OptimalWeights, "final_weight", staticmethod(lambda *args: final(*args) + dr.opaque(mi.Float, steps[1])))
+    measured, error = measured_in_sphere(150)
+    least = noise_in_sphere(1, 0.5)
+    assert measured - 4 * error > 1.06 * least, (measured / least, error / least)
+    assert measured == pytest.approx(noise_in_sphere(1 + steps[0], 0.5 + steps[1]), rel=0.15)
 
 
 # --- Where weights could fail -------------------------------------------------------------------------

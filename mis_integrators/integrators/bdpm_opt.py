@@ -135,7 +135,7 @@ class BDPMOptSession(WeightedSession):
     def _freeze(self):
         super()._freeze()
         if self._weighted:
-            self._tables += self.cache.tables() + ([self.surroundings.table] if self.surroundings else [])
+            self._tables += self.cache.tables() + ([self.surroundings.table, self.surroundings.albedo] if self.surroundings else [])
 
     def weights(self, merging):
         integrator = self.integrator

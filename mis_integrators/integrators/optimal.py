@@ -15,13 +15,14 @@ from ..transport.traits import lookup
 from ..weights import recursion
 from .surroundings import SHARES
 
-TYPICAL_ALBEDO = 0.5
-"""Neighbours of which nothing is known but the light around them are grey Lambertians."""
 AMBIENT_SHARE = 0.02
 """Share of the scene's mean irradiance that is taken to reach every vertex, lest one that the cache calls dark be left to a strategy
 that hardly ever makes its paths."""
 STEEPEST_DRIVE = 30.0
 """Bound on the corrections 1 + G / f_0 and 1 + tau / (1 - theta), which grow without bound where the BSDF falls to zero."""
+LARGEST_SHARE = 2.0
+"""Bound on e drive, the weights that are left for a vertex and those beyond. Right ones exceed one where the surroundings are brighter; far
+larger ones mean that the cache does not know the vertex."""
 WEIGHT_KEPT, SELDOM = 0.4, 0.02
 """Strategies of less than this weight are used at random, with a probability in proportion, but no smaller than the second number."""
 SMALLEST_COSINE, SMALLEST_LOBE_COSINE = 1e-6, 0.05
@@ -48,25 +49,25 @@ class Node:
         return recursion.inner_response(n, self.direct, r + self.noise, photons, 0, 0, 0)
 
 
-def typical_node(direct, indirect):
+def typical_node(direct, indirect, albedo):
     """A grey Lambertian of the given radiance, at which strategies end."""
-    f = TYPICAL_ALBEDO / dr.pi
+    f = albedo / dr.pi
     return Node(None, None, direct, indirect, f, f, 1 / dr.pi, 0, True)
 
 
-def response(level, strategies, full, n, r, node):
-    """Remainder e and carry tau of the node at z_level, 0 < level < strategies (`weights.recursion`; means over directions are those
-    of one typical neighbour)."""
+def response(level, strategies, n, r, node, albedo=None):
+    """Remainder e and carry tau of the node at z_level, 0 < level < strategies (`weights.recursion`). Means over directions are those of one
+    typical neighbour of that `albedo`; without it they are left out (local weights)."""
     e_final = recursion.remainder(node.final_response(n, r))
     if level == strategies - 1 or node.last is True:
         return e_final, mi.Spectrum(0)
     tau = mi.Spectrum(0)
     gamma = recursion.inner_response(n, node.direct, r + node.noise, 0, 0, 0, 0)
-    if full:
+    if albedo is not None:
         theta, rest = recursion.kernel_share(r, node.lobe_f), recursion.kernel_rest(r, node.lobe_f)
         next_r = recursion.next_ratio(theta, node.lobe_p)
         incident = node.indirect * node.lobe_p / recursion.at_least(node.lobe_f, recursion.SMALLEST)
-        e_next, _ = response(level + 1, strategies, full, n, next_r, typical_node(0.5 * incident, 0.5 * incident))
+        e_next, _ = response(level + 1, strategies, n, next_r, typical_node(0.5 * incident, 0.5 * incident, albedo), albedo)
         first = rest * (1 - e_next)
         tau = dr.select(node.last, 0, recursion.carry(first, e_next))
         photon_sum = incident * rest / node.lobe_p                   # a lobe of projected solid angle 1 / p
@@ -86,6 +87,7 @@ class OptimalWeights:
     def __init__(self, lights, traits, cache, surroundings, n, caustic_cost, strategies, first, camera_paths, full, mix_diffuse):
         self.lights, self.traits, self.cache, self.surroundings, self.n, self.caustic_cost = lights, traits, cache, surroundings, n, caustic_cost
         self.strategies, self.first, self.full, self.mix_diffuse = strategies, first, full, mix_diffuse
+        self.albedo = surroundings.albedo if surroundings else None
         self.camera_paths = camera_paths if first == 0 else 1
         self.has_caustics = traits.has_delta or lights.needs_photons_for_direct_light()
         self.context = mi.BSDFContext()
@@ -147,21 +149,28 @@ class OptimalWeights:
             noise += self.caustic_cost * known.caustic_share * kernel
         return Node(f, p, direct, indirect, kernel, lobe_f, lobe_p, noise, self.is_last(bsdf, mask))
 
-    def direct_weight(self, drive, e, r, node):
-        """Weight of direct light at a vertex, the last strategy of its paths."""
-        return recursion.direct_weight(drive, e) * r / recursion.at_least(r + node.noise, recursion.SMALLEST)
+    @staticmethod
+    def left(drive, e):
+        """u: what the vertex and those beyond it share in, before the cost of each."""
+        return dr.minimum(recursion.direct_weight(drive, e), LARGEST_SHARE)
 
     @staticmethod
-    def final_weight(drive, e, r, node):
+    def direct_weight(u, r, node):
+        """Weight of direct light at a vertex, the last strategy of its paths."""
+        return u * r / recursion.at_least(r + node.noise, recursion.SMALLEST)
+
+    @staticmethod
+    def final_weight(u, r, node):
         """Weight of photons merged where no strategy goes on."""
-        return recursion.inner_weight(drive, e, recursion.kernel_share(r, node.kernel), 0)
+        return recursion.inner_weight(u, 1, recursion.kernel_share(r, node.kernel), 0)
 
     def offset(self, si, bsdf, mask):
         """G = n F / N_B at the first strategy's vertex, its means those of the typical neighbours of its cell."""
         f, p = self.lobe(si, bsdf, mask)
         r = recursion.first_ratio(p, self.camera_paths)
         around = self.surroundings.lookup(self.cache.slot(si.p, self.side(si), mask), mask)
-        e = sum(share * response(1, self.strategies, True, self.n, r, typical_node(*radiance))[0] for share, radiance in zip(SHARES, around))
+        e = sum(share * response(1, self.strategies, self.n, r, typical_node(*radiance, self.albedo), self.albedo)[0]
+                for share, radiance in zip(SHARES, around))
         return recursion.root_offset(f * (1 - e), e)
 
     # ------------------------------------------------------------------ camera paths (hooks of `trace_camera_paths`)
@@ -184,11 +193,11 @@ class OptimalWeights:
         final = node.last | (vertex == self.first + self.strategies - 1)
         for level in range(1, self.strategies):
             here = mask & (vertex == self.first + level)
-            e, carried = response(level, self.strategies, self.full, self.n, r, node)
-            merging = dr.select(final, self.final_weight(drive, e, r, node), recursion.direct_weight(drive, e))
-            u = dr.select(here, merging, u)
+            e, carried = response(level, self.strategies, self.n, r, node, self.albedo)
+            remaining = self.left(drive, e)
+            u = dr.select(here, dr.select(final, self.final_weight(remaining, r, node), remaining), u)
             tau = dr.select(here, carried, tau)
-            share = dr.select(here, self.direct_weight(drive, e, r, node), share)
+            share = dr.select(here, self.direct_weight(remaining, r, node), share)
         return [drive, r, u, tau], share
 
     def leaving(self, state, si, bsdf, bs, vertex, mask):
@@ -254,13 +263,13 @@ class OptimalWeights:
     def deeper_sum(self, level, drive, r, passed):
         """Sum of the weights of the strategies at z_level and beyond."""
         node, beyond = passed[0], passed[1:]
-        e, tau = response(level, self.strategies, self.full, self.n, r, node)
-        direct, final = self.direct_weight(drive, e, r, node), self.final_weight(drive, e, r, node)
+        e, tau = response(level, self.strategies, self.n, r, node, self.albedo)
+        u = self.left(drive, e)
+        direct, final = self.direct_weight(u, r, node), self.final_weight(u, r, node)
         if level == self.strategies - 1:
             return dr.select(node.indirectly, final, direct)
-        u = recursion.direct_weight(drive, e)
         deeper = self.deeper_sum(level + 1, *self.step(u, tau, r, node.f, node.p), beyond)
-        here = recursion.inner_weight(drive, e, recursion.kernel_share(r, node.f), deeper)
+        here = recursion.inner_weight(u, 1, recursion.kernel_share(r, node.f), deeper)
         return dr.select(node.indirectly, dr.select(node.last, final, here + deeper), direct)
 
 

@@ -20,7 +20,7 @@ OWN_STREAM = 0x6e656172
 class Surroundings:
     """For each cell `len(SHARES)` typical neighbours, each with its radiance by direct and by other light (spectra).
 
-    Attribute: `table` (float32).
+    Attributes: `table` (float32), `albedo` of a typical neighbour (width one).
     """
 
     def __init__(self, scene, weights):
@@ -30,10 +30,12 @@ class Surroundings:
         channels = colours()
         self.words = 2 * channels * len(SHARES)
         if cells == 0:
-            self.table = dr.zeros(mi.Float, self.words)
+            self.table, self.albedo = dr.zeros(mi.Float, self.words), dr.opaque(mi.Float, 0)
             return
         si, bsdf, active = self._neighbours(scene, cache, cells)
         node = weights.node(si, bsdf, active)
+        albedo = dr.sum(dr.select(active, node.kernel / node.lobe_p, 0)) / dr.maximum(dr.count(active), 1)
+        self.albedo = dr.opaque(mi.Float, min(float(albedo[0]), 1.0))
         grey = np.array(dr.select(active, dr.mean(node.direct + node.indirect), 0)).reshape(cells, RAYS)
         order = np.argsort(grey, axis=1)
         ends = np.round(np.cumsum((0,) + SHARES) * RAYS).astype(int)

@@ -16,6 +16,8 @@ from .photon_map import build_photon_map, for_each_photon, read_power, smallest_
 from .random import streams
 
 PHOTONS_A_CELL = 32
+GATHER_RADIUS = 2.0
+"""Radius within which photons count for a cell, in units of its edge: noise of the cells costs more than their blur does."""
 TRIAL_SHARE = 1 / 64
 """Edge of the first, trial cells as a share of the scene's diagonal."""
 LARGEST_SHARE = 0.2
@@ -76,7 +78,7 @@ class IrradianceCache:
         self.table = dr.zeros(mi.Float, self.words * (dr.width(self.center) + 1))
         self.mean = 0.0
         if dr.width(self.center):
-            reach = dr.maximum(self.cell, smallest_cell(bounds, capacity))
+            reach = dr.maximum(GATHER_RADIUS * self.cell, smallest_cell(bounds, capacity))
             self._gather(scene, lights, build_photon_map(surface, power, count, bounds, reach, capacity, "all"), light_paths)
 
     @staticmethod
@@ -134,9 +136,9 @@ class IrradianceCache:
             added += [dr.select(straight & (unpack_depth(record.w) > 1), dr.mean(flux), 0)]
             return tuple(old + new for old, new in zip(totals, added))
 
-        totals = for_each_photon(photon_map, self.center, self.cell, mi.Bool(True), visit,
+        totals = for_each_photon(photon_map, self.center, GATHER_RADIUS * self.cell, mi.Bool(True), visit,
                                  tuple(mi.Float(0) for _ in range(3 * channels + 4)))
-        area = dr.rcp(dr.pi * dr.square(self.cell) * light_paths)
+        area = dr.rcp(dr.pi * dr.square(GATHER_RADIUS * self.cell) * light_paths)
         irradiance = [total * area for total in totals[:3 * channels]]
         direction = mi.Vector3f(*totals[3 * channels:-1])
         direction *= dr.rsqrt(dr.maximum(dr.squared_norm(direction), 1e-30))
@@ -148,6 +150,8 @@ class IrradianceCache:
         for offset, value in enumerate((*irradiance, *direction, _pack_light(light, visible_share), self._direct_noise(lights),
                                           caustic_share)):
             dr.scatter(self.table, mi.Float(value), self.words * number + offset)
+        # A cell that no photon met: dark, or hardly touched by a surface, which is worse to get wrong. As bright as others are.
+        dr.scatter(self.table, mi.Float([float(dr.mean(value)[0]) for value in irradiance]), dr.arange(mi.UInt32, 3 * channels))
         dr.eval(self.table)
         self.mean = float(dr.mean(sum(irradiance) / channels)[0])
 
