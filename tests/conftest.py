@@ -1,5 +1,7 @@
 """What all tests share."""
 
+from collections import Counter
+
 import mis_integrators  # noqa: F401  before mitsuba: it chooses the LLVM
 
 import mitsuba as mi
@@ -36,10 +38,22 @@ def pytest_addoption(parser):
 
 def pytest_configure(config):
     config.addinivalue_line("markers", "strategies(*K): the numbers of strategies of the discrete worlds that a test is for")
+    config.addinivalue_line("markers", "thinned(inner, n): of a product of parameters, the last of which has `inner` values, every n-th "
+                                       "case in diagonals; the rest is full")
     config.addinivalue_line("markers", "full: the full product of cases, hours of it; left out unless asked for with -m full")
 
 
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config, items):
+    places = Counter()
+    for item in items:
+        thinned = item.get_closest_marker("thinned")
+        if thinned:
+            inner, keep = thinned.args
+            row, column = divmod(places[item.function], inner)
+            places[item.function] += 1
+            if (row + column) % keep:
+                item.add_marker("full")
     if config.option.markexpr:
         return
     left_out = [item for item in items if item.get_closest_marker("full")]

@@ -50,6 +50,7 @@ def series(first, ratio, count):
 # --- Point light in the middle of a diffuse sphere -----------------------------------------------------
 
 
+@pytest.mark.thinned(4, 2)
 @BDD
 @pytest.mark.parametrize("max_depth", [-1, 2, 3, 4, 5])
 def test_point_in_sphere(rgb, bdd, max_depth):
@@ -96,6 +97,7 @@ def test_roulette_in_sphere(rgb, bdd, rr_depth):
 # --- Furnaces ---------------------------------------------------------------------------------------------
 
 
+@pytest.mark.thinned(4, 2)
 @BDD
 @pytest.mark.parametrize("max_depth", [-1, 1, 2, 3, 4])
 def test_furnace_of_emitting_sphere(rgb, bdd, max_depth):
@@ -109,6 +111,7 @@ def test_furnace_of_emitting_sphere(rgb, bdd, max_depth):
     assert_value(scene, bdpm(bdd=bdd, max_depth=max_depth), series(emission, rho, terms), slack=2e-3)
 
 
+@pytest.mark.thinned(4, 2)
 @BDD
 @pytest.mark.parametrize("material", ["diffuse", "conductor", "dielectric", "thindielectric", "mask", "null", "blend"])
 def test_white_furnace(rgb, bdd, material):

@@ -76,6 +76,7 @@ class JointPaths:
         return notebook.read(merged, notes, index, mi.Bool(True))
 
 
+@pytest.mark.thinned(3, 3)
 @pytest.mark.parametrize("kind, strategies", [("local", 2), ("local", 4), ("full", 3)])
 @pytest.mark.parametrize("variant_name, family, emitter, mix", [(RGB, "lambertian", "point", True), (RGB, "rough", "rectangle", False),
                                                                 (MONO, "mixed0", "envmap", False), (SPECTRAL, "smooth1", "spot", True)])
@@ -312,6 +313,7 @@ HARD = {
 }
 
 
+@pytest.mark.thinned(2, 2)
 @pytest.mark.parametrize("plugin", [{"type": "bdpm_opt3"}, {"type": "bdpm_opt", "weights": "full", "mix_diffuse": True}],
                          ids=["default", "full"])
 @pytest.mark.parametrize("case", HARD)
