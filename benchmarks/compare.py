@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from errors import summarise
+from mis_integrators.analysis.metrics import decompose, mean_errors
 from mis_integrators.session import Session
 from methods import SessionMaker
 from references import colours, find_references

@@ -6,8 +6,8 @@ import argparse
 
 import numpy as np
 
+from mis_integrators.analysis.metrics import References, decompose, mean_errors
 from compare import chosen
-from errors import References, summarise
 from methods import Method, SessionMaker
 from references import colours, find_references
 from reports import Row, save, show, tell
@@ -61,7 +61,7 @@ def sweep(
     rows: list[Row] = []
     for mine in zip(*runs):
         renders = [colours(contender.session) for contender in mine]
-        mean, bias = summarise(renders, references)
+        mean, parts = mean_errors(renders, references), decompose(renders, references)
         rows.append({
             "scene": opened.name,
             "size": "{}x{}".format(*opened.size),
@@ -76,7 +76,7 @@ def sweep(
             "relMSE": mean.relmse,
             "relMSE trimmed": mean.relmse_trimmed,
             "MSE": mean.mse,
-            "bias share": bias,
+            "bias share": parts and parts.bias_share,
             "settings": chosen(mine[-1].session.settings),
             "references": references.origin,
         })

@@ -12,8 +12,8 @@ import numpy as np
 import OpenEXR
 
 import mis_integrators
+from mis_integrators.analysis.metrics import References
 from mis_integrators.output import write_exr
-from errors import References
 from methods import Method, SessionMaker, parse_method
 from scene_files import OpenScene, fingerprint
 
