@@ -32,8 +32,8 @@ def add_options(command: argparse.ArgumentParser) -> None:
     command.add_argument("--references", type=Path, default=Path("out/references"), metavar="DIR",
                          help="where references are kept that do not lie beside the scene "
                          "(default: out/references)")
-    command.add_argument("--reference-time", type=float, default=60, metavar="SECONDS",
-                         help="rendering seconds of each of the two references (default: 60)")
+    command.add_argument("--reference-time", type=float, default=30, metavar="SECONDS",
+                         help="rendering seconds of each of the two references (default: 30)")
     command.add_argument("--reference-method", type=parse_method, metavar="PLUGIN[:...]",
                          help="what renders them (default: path, or for the scenes that it cannot do bdpm "
                          "with a radius below the pixels' size)")

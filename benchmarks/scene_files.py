@@ -18,7 +18,8 @@ BUNDLED = Path(__file__).resolve().parent.parent / "scenes"
 class OpenScene:
     """A loaded scene: its file, what its own integrator hands on to others, its sensor and film size."""
 
-    path: Path
+    path: Path | None
+    """``None`` for a scene that no file holds."""
     scene: mi.Scene
     inherited: dict[str, loading.Value]
 
