@@ -79,10 +79,10 @@ def summary(rows: Sequence[Row], failures: dict[str, dict[str, str]], what: str)
             ratios[label].append(row["trimmed ratio"])
             kind = "win" if row is best else "worse" if row["trimmed ratio"] > 3 else ""
             almost = " ≈" if row is not best and not row["trimmed ratio low"] > best["trimmed ratio high"] else ""
-            cells.append(f'<td class="{kind}" title="{_interval(row, "trimmed ratio")}">{row["trimmed ratio"]:.2f}{almost}</td>')
+            cells.append(f'<td class="{kind}" title="{_interval(row, "trimmed ratio")}">{_short(row["trimmed ratio"])}{almost}</td>')
         lines.append(f'<tr><td><a href="#{scene}">{scene}</a></td><td class="text">{chip(best["method"], style[best["method"]])}</td>'
                      f'<td>{1 / best["trimmed ratio"]:.1f} ×</td>{"".join(cells)}</tr>')
-    total = "".join(f"<td>{np.exp(np.mean(np.log(np.maximum(values, 1e-9)))):.2f}</td>" if values else "<td>-</td>" for values in ratios.values())
+    total = "".join(f"<td>{_short(np.exp(np.mean(np.log(np.maximum(values, 1e-9)))))}</td>" if values else "<td>-</td>" for values in ratios.values())
     head = "".join(f"<th>{chip(label, style[label])}</th>" for label in labels)
     return f"""<p>Error of each method {html.escape(what)}, over that of <b>{base}</b> in the same run: below 1 is better. Relative mean square error without the
 worst 0.1 % of the pixels; green: least error; red: more than three times {base}'s; ≈: not told apart from the winner by the intervals (95 %, in the
@@ -112,7 +112,7 @@ def pictures(measurement: Measurement, rows: Sequence[Row], folder: Path) -> str
     for measured, row, error_map in zip(measurement.methods, rows, maps):
         label = row["method"]
         seen = f"FLIP {row['FLIP']:.3f}, " if row["FLIP"] is not None else ""
-        bias = f", bias {row['bias share']:.0%}" if row["bias share"] is not None else ""
+        bias = f", bias {max(row['bias share'], 0):.0%}" if row["bias share"] is not None else ""
         caption = (f"<b>{_interval(row, 'trimmed ratio')} × {measurement.base.method.label}</b>{seen}{row['samples_per_pixel']} spp, "
                    f"relMSE {row['relMSE']:.3g}{bias}")
         image = measured.images[0] / white
@@ -217,8 +217,13 @@ def table(rows: Sequence[Row]) -> str:
 
 def _interval(row: Row, name: str) -> str:
     if not np.isfinite(row[f"{name} low"]) or row[f"{name} low"] == row[f"{name} high"]:
-        return f"{row[name]:.2f}"
-    return f"{row[name]:.2f} ({row[f'{name} low']:.2f} to {row[f'{name} high']:.2f})"
+        return _short(row[name])
+    return f"{_short(row[name])} ({_short(row[f'{name} low'])} to {_short(row[f'{name} high'])})"
+
+
+def _short(value: float) -> str:
+    """A ratio with two or three digits."""
+    return f"{value:.3f}" if value < 0.095 else f"{value:.2f}" if value < 9.95 else f"{value:.0f}" if value < 1e4 else f"{value:.0e}"
 
 
 def _file_name(label: str) -> str:

@@ -19,12 +19,8 @@ from scene_files import OpenScene, fingerprint
 
 COLOURS = ("R", "G", "B")
 
-BEYOND_PATH = {
-    "caustics": "bdpm:bdd=0,initial_radius=0.005,photon_count=200000",
-    "sds": "bdpm:bdd=0,initial_radius=0.005,photon_count=200000",
-}
-"""Bundled scenes that path cannot render in reasonable time, and what makes their references: the blur of
-that radius is smaller than a pixel's image on the surfaces."""
+RECIPE = json.loads(Path(__file__).with_name("references.json").read_text())
+"""Scenes that path cannot render in reasonable time: what makes their references, and which other methods must agree with them."""
 
 
 def add_options(command: argparse.ArgumentParser) -> None:
@@ -39,12 +35,18 @@ def add_options(command: argparse.ArgumentParser) -> None:
                          "with a radius below the pixels' size)")
 
 
+def recipe(opened: OpenScene) -> dict:
+    """How the references of a scene are made, ``method``, and the methods that must agree, ``opinions``: path unless `references.json` knows
+    better."""
+    return RECIPE.get(opened.name, {"method": "path", "opinions": []})
+
+
 def find_references(
     opened: OpenScene, options: argparse.Namespace, tell: Callable[[str], None]
 ) -> References:
     """References beside the scene (``NAME.exr`` and ``NAME_2.exr``, if of the film's size), else those kept
     from an earlier run, else new ones, which are then kept. ``options``: see ``add_options``."""
-    method = options.reference_method or parse_method(BEYOND_PATH.get(opened.name, "path"))
+    method = options.reference_method or parse_method(recipe(opened)["method"])
     directory, seconds = options.references, options.reference_time
     beside = _paths(opened.path.parent, opened.path.stem)
     if all(path.exists() for path in beside):

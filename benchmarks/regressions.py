@@ -60,18 +60,29 @@ def find_changes(rows: Sequence[Row], before: Sequence[Row]) -> tuple[list[Row],
          if _key(row) in earlier and all(_judgeable(r, name) for r in (row, earlier[_key(row)]))),
         key=lambda test: test[0],
     )
-    named = max((rank for rank, (p, _) in enumerate(tests, 1) if p <= FALSE_ALARM * rank / len(tests)), default=0)
-    return sorted((change for _, change in tests[:named]), key=lambda change: -change["change"]), len(tests)
+    named = max((rank for rank, test in enumerate(tests, 1) if test[0] <= FALSE_ALARM * rank / len(tests)), default=0)
+    changes = [_in_words(*test[1:]) for test in tests[:named]]
+    return sorted(changes, key=lambda change: -change["change"]), len(tests)
 
 
-def _test(row: Row, old: Row, name: str) -> tuple[float, Row]:
-    """Probability of so large a change of one figure by chance, and the change in words and figures."""
+def _change(row: Row, old: Row, name: str) -> tuple[float, float, float]:
+    """Logarithm of the change of one figure, its standard error, and Welch's degrees of freedom."""
     new2, old2 = row[f"{name} error"] ** 2, old[f"{name} error"] ** 2
     freedom = (new2 + old2) ** 2 / (new2 ** 2 / (row["seeds"] - 1) + old2 ** 2 / (old["seeds"] - 1))
-    change, error = math.log(row[name] / old[name]), math.sqrt(new2 + old2)
+    return math.log(row[name] / old[name]), math.sqrt(new2 + old2), freedom
+
+
+def _test(row: Row, old: Row, name: str) -> tuple[float, Row, Row, str]:
+    """Probability of so large a change of one figure by chance, and what was compared."""
+    change, error, freedom = _change(row, old, name)
+    return t_two_sided(abs(change) / error, freedom), row, old, name
+
+
+def _in_words(row: Row, old: Row, name: str) -> Row:
+    change, error, freedom = _change(row, old, name)
     half = t_quantile(0.05, freedom) * error
     words = JUDGED[name] if change > 0 else f"less so: {JUDGED[name]}"
-    return t_two_sided(abs(change) / error, freedom), {
+    return {
         **{key: row[key] for key in SAME}, "what": words, "figure": name, "before": old[name], "now": row[name],
         "change": math.exp(change), "from": math.exp(change - half), "to": math.exp(change + half),
     }

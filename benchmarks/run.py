@@ -14,6 +14,7 @@ mi.set_variant("llvm_ad_rgb")
 import compare  # noqa: E402
 import converge  # noqa: E402
 import freezing  # noqa: E402
+import opinions  # noqa: E402
 import overview  # noqa: E402
 import radius  # noqa: E402
 import references  # noqa: E402
@@ -89,6 +90,13 @@ def _parser() -> argparse.ArgumentParser:
                          help="rendering seconds of each radius (default: 5 60)")
     command.add_argument("--radii", type=int, default=9, help="how many, factor sqrt 2 (default: 9)")
     _compares_with_references(command)
+
+    command = _measuring(commands, "references", opinions)
+    command.add_argument("--integrators", nargs="+", type=parse_method, metavar="PLUGIN[:name=value,...]",
+                         help="methods that must agree (default: those of references.json that there are)")
+    command.add_argument("--time", type=float, default=20, metavar="SECONDS", help="rendering seconds of each of their two renders (default: 20)")
+    command.add_argument("--scale", type=float, default=1, help="film size, scene's own = 1 (default: 1)")
+    references.add_options(command)
 
     for name, function in (("freeze-scenes", freezing.freeze), ("check-scenes", freezing.check)):
         command = commands.add_parser(name, help=function.__doc__, description=function.__doc__)

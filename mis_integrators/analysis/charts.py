@@ -12,6 +12,7 @@ import numpy as np
 from matplotlib import colormaps, rc_context
 from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
 
 from .stability import Point, breaks
 
@@ -78,7 +79,7 @@ def error_against_time(curves: Mapping[str, Curve], style: Mapping[str, Style]) 
             axis.plot(x[good], y[good], look.dashes, color=look.colour, marker=look.marker, ms=4, lw=1.6, label=f"{label}  {curve.slope}")
             if np.isfinite(low).any():
                 axis.fill_between(x[good], np.maximum(low[good], y[good] / 3), np.minimum(high[good], 3 * y[good]), color=look.colour, alpha=0.1, lw=0)
-    axis.set(xscale="log", yscale="log", xlabel="seconds (log)", ylabel="relMSE, mean of the seeds (log)")
+    _logarithmic(axis, "seconds", "relMSE, mean of the seeds")
     _legend(axis, "method, slope")
     return figure
 
@@ -97,7 +98,7 @@ def front(points: Mapping[str, Sequence[tuple[float, float, bool]]], style: Mapp
                 axis.plot(*zip(*some), look.marker, color=look.colour, ms=8 if filled else 4, mfc=look.colour if filled else "none",
                           label=None if labelled else label, alpha=1 if filled else 0.7)
                 labelled = True
-    axis.set(xscale="log", yscale="log", xlabel="seconds (log)", ylabel="relMSE without the worst 0.1 % (log)")
+    _logarithmic(axis, "seconds", "relMSE without the worst 0.1 %")
     _legend(axis, "large: on the front")
     return figure
 
@@ -113,7 +114,7 @@ def sweep(title: str, sweeps: Mapping[str, Sequence[Point]], style: Mapping[str,
         if broken:
             axis.plot(*zip(*broken), "o", ms=12, mfc="none", mec=look.colour, mew=1.8)
             axis.plot(*zip(*broken), "x", ms=7, color=look.colour, mew=2)
-    axis.set(xscale="log", yscale="log", xlabel=f"{title} (log)", ylabel="relMSE without the worst 0.1 % (log)")
+    _logarithmic(axis, title, "relMSE without the worst 0.1 %")
     _legend(axis, "ringed: breaks")
     return figure
 
@@ -166,6 +167,17 @@ def _axes(width: float, height: float):
         axis = figure.subplots()
         axis.grid(True, which="major")
     return figure, axis
+
+
+def _logarithmic(axis, x: str, y: str) -> None:
+    """Logarithmic axes with plain numbers at 1, 2 and 5 times powers of ten, at powers alone where these are many."""
+    axis.set(xscale="log", yscale="log", xlabel=f"{x} (log)", ylabel=f"{y} (log)")
+    for one, (low, high) in ((axis.xaxis, axis.get_xlim()), (axis.yaxis, axis.get_ylim())):
+        decades = np.log10(high / low)
+        one.set_major_locator(LogLocator(subs=(1, 2, 5) if decades < 2.5 else (1,), numticks=12))
+        one.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        one.set_minor_locator(NullLocator())
+        one.set_minor_formatter(NullFormatter())
 
 
 def _legend(axis, title: str) -> None:
