@@ -12,6 +12,7 @@ import regressions
 from measuring import Measured, Measurement, measure
 from mis_integrators.analysis.confidence import log_ratio_error, mean_interval, ratio_interval
 from mis_integrators.analysis.metrics import Errors, decompose, efficiency, errors, flip
+from mis_integrators.analysis.stability import CLOSE
 from references import find_references
 from reports import Row, console, save, show, tell
 from scene_files import open_scene, scaled_size
@@ -110,6 +111,7 @@ def _row(measured: Measured, mine: dict, base: dict, measurement: Measurement) -
         "trimmed ratio low": trimmed.low,
         "trimmed ratio high": trimmed.high,
         "trimmed ratio error": log_ratio_error(mine["relmse_trimmed"], base["relmse_trimmed"]),
+        "trimmed by seed": " ".join(f"{value:.6g}" for value in mine["relmse_trimmed"]),
         "cost ratio": cost.value,
         "cost ratio low": cost.low,
         "cost ratio high": cost.high,
@@ -117,6 +119,24 @@ def _row(measured: Measured, mine: dict, base: dict, measurement: Measurement) -
         "settings": chosen(measured.runs[-1].settings),
         "references": measurement.references.origin,
     }
+
+
+def told_apart(row: Row, better: Row) -> bool:
+    """Whether a method's error (relMSE without the worst 0.1 %) is beyond the noise above that of a better one: by pairs of seeds, 95 %."""
+    mine, other = ([float(value) for value in one["trimmed by seed"].split()] for one in (row, better))
+    return ratio_interval(mine, other).low > 1
+
+
+def winners(rows: list[Row]) -> list[Row]:
+    """One row a scene: its least error, in ratios to the base, and the methods that are about as good or cannot be told apart."""
+    found: list[Row] = []
+    for scene in dict.fromkeys(row["scene"] for row in rows):
+        mine = [row for row in rows if row["scene"] == scene]
+        best = min(mine, key=lambda row: row["trimmed ratio"])
+        close = [row["method"] for row in mine
+                 if row is not best and (row["trimmed ratio"] <= CLOSE * best["trimmed ratio"] or not told_apart(row, best))]
+        found.append({"scene": scene, "best": best["method"], "error over path's": best["trimmed ratio"], "about as good": ", ".join(close) or "-"})
+    return found
 
 
 def chosen(settings: dict) -> str:

@@ -58,7 +58,8 @@ def run(options: argparse.Namespace) -> None:
         write(page, pages, rows, failures, scenes, "", options)
     show("Variance of one iteration, best single strategy = 1", varied, variance.COLUMNS)
     sweeps = pages.stability(stability.sweep_all(options), options.out, options.integrators) if options.sweeps else ""
-    write(page, pages, rows, failures, scenes, sweeps, options)
+    write(page, pages, rows, failures, scenes, pages.choices(compare.winners(rows)) + sweeps, options)
+    (options.out / "which_scene.md").write_text(stability.as_markdown(compare.winners(rows)))
     console.print(f"page: {page.path} after {(time.perf_counter() - start) / 60:.1f} minutes")
 
 

@@ -10,6 +10,7 @@ from typing import Sequence
 import mitsuba as mi
 import numpy as np
 
+from compare import told_apart
 from measuring import Measurement
 from methods import Method
 from mis_integrators.analysis import charts
@@ -78,15 +79,15 @@ def summary(rows: Sequence[Row], failures: dict[str, dict[str, str]], what: str)
                 continue
             ratios[label].append(row["trimmed ratio"])
             kind = "win" if row is best else "worse" if row["trimmed ratio"] > 3 else ""
-            almost = " ≈" if row is not best and not row["trimmed ratio low"] > best["trimmed ratio high"] else ""
+            almost = " ≈" if row is not best and not told_apart(row, best) else ""
             cells.append(f'<td class="{kind}" title="{_interval(row, "trimmed ratio")}">{_short(row["trimmed ratio"])}{almost}</td>')
         lines.append(f'<tr><td><a href="#{scene}">{scene}</a></td><td class="text">{chip(best["method"], style[best["method"]])}</td>'
                      f'<td>{1 / best["trimmed ratio"]:.1f} ×</td>{"".join(cells)}</tr>')
     total = "".join(f"<td>{_short(np.exp(np.mean(np.log(np.maximum(values, 1e-9)))))}</td>" if values else "<td>-</td>" for values in ratios.values())
     head = "".join(f"<th>{chip(label, style[label])}</th>" for label in labels)
     return f"""<p>Error of each method {html.escape(what)}, over that of <b>{base}</b> in the same run: below 1 is better. Relative mean square error without the
-worst 0.1 % of the pixels; green: least error; red: more than three times {base}'s; ≈: not told apart from the winner by the intervals (95 %, in the
-tooltip).</p>
+worst 0.1 % of the pixels; green: least error; red: more than three times {base}'s; ≈: not told apart from the winner
+(95 %, by pairs of seeds). Tooltips: 95 % intervals.</p>
 <div class="wide"><table><tr><th>scene</th><th class="text">winner</th><th>less error<br>than {base}</th>{head}</tr>
 {"".join(lines)}<tr class="total"><td>geometric mean</td><td></td><td></td>{total}</tr></table></div>"""
 
@@ -186,6 +187,11 @@ def variance(name: str, picture: Path) -> str:
 # --- Stability ------------------------------------------------------------------------------------------
 
 
+def choices(rows: Sequence[Row]) -> str:
+    """The best method of each scene, as a table."""
+    return f'<h3>Which method for which scene</h3>{table(rows)}'
+
+
 def stability(results, folder: Path, methods: Sequence[Method]) -> str:
     """The sweeps' charts, and the table of choices that follows from them."""
     from stability import choice_rows
@@ -210,7 +216,7 @@ def table(rows: Sequence[Row]) -> str:
         return ""
     head = "".join(f'<th class="text">{html.escape(name)}</th>' for name in rows[0])
     body = "".join("<tr>" + "".join(
-        f"<td>{value:g}</td>" if isinstance(value, (int, float)) else f'<td class="text">{html.escape(str(value))}</td>' for value in row.values()
+        f"<td>{value:.3g}</td>" if isinstance(value, (int, float)) else f'<td class="text">{html.escape(str(value))}</td>' for value in row.values()
     ) + "</tr>" for row in rows)
     return f'<div class="wide"><table><tr>{head}</tr>{body}</table></div>'
 

@@ -58,7 +58,7 @@ def _parser() -> argparse.ArgumentParser:
                          help=f"methods of the variance maps (default: {' '.join(method.label for method in registered(VARIED))})")
     command.add_argument("--variance-scale", type=float, default=0.5, metavar="SCALE", help="film size of variance maps (default: 0.5)")
     _variance(command, 16)
-    _sweeps(command)
+    _sweeps(command, 0.4)
     command.add_argument("--every-value", dest="coarse", action="store_false", help="all values of the sweeps instead of every other")
 
     command = _measuring(commands, "compare", compare)
@@ -81,7 +81,7 @@ def _parser() -> argparse.ArgumentParser:
 
     command = _measuring(commands, "stability", stability, scenes=False)
     _chooses(command, COMPARED, "each swept where it knows the parameter")
-    _sweeps(command)
+    _sweeps(command, 0.6)
     _coarse(command)
 
     command = _measuring(commands, "radius", radius)
@@ -130,12 +130,13 @@ def _variance(command: argparse.ArgumentParser, iterations: int) -> None:
     command.add_argument("--radius-share", type=float, default=0.005, metavar="SHARE", help="(default: 0.005)")
 
 
-def _sweeps(command: argparse.ArgumentParser) -> None:
+def _sweeps(command: argparse.ArgumentParser, seconds: float) -> None:
     """Which parameters are swept, and how carefully."""
     names = [sweep.name for sweep in SWEEPS]
     command.add_argument("--sweeps", nargs="*", choices=names, default=names, metavar="NAME", help=f"(default: {' '.join(names)})")
     command.add_argument("--size", type=int, default=64, metavar="PIXELS", help="edge of the film (default: 64)")
-    command.add_argument("--point-time", type=float, default=0.6, metavar="SECONDS", help="rendering seconds of each point (default: 0.6)")
+    command.add_argument("--point-time", type=float, default=seconds, metavar="SECONDS",
+                         help=f"rendering seconds of each point (default: {seconds})")
 
 
 def _coarse(command: argparse.ArgumentParser) -> None:

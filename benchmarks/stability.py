@@ -47,6 +47,7 @@ def sweep_all(options: argparse.Namespace) -> list[tuple[Sweep, Points]]:
             save(options.out, "stability", rows, vars(options))
             save(options.out, "choices", choices, vars(options))
     show("Which method where", choices)
+    options.out.mkdir(parents=True, exist_ok=True)
     (options.out / "which_method.md").write_text(as_markdown(choices))
     return results
 
@@ -134,5 +135,5 @@ def as_markdown(rows: list[Row]) -> str:
     if not rows:
         return ""
     names = list(rows[0])
-    body = ["| " + " | ".join(f"{row[name]:g}" if isinstance(row[name], (int, float)) else f"{row[name]}" for name in names) + " |" for row in rows]
+    body = ["| " + " | ".join(f"{row[name]:.3g}" if isinstance(row[name], (int, float)) else f"{row[name]}" for name in names) + " |" for row in rows]
     return "\n".join(["| " + " | ".join(names) + " |", "|" + "---|" * len(names), *body]) + "\n"

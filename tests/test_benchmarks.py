@@ -120,6 +120,17 @@ def test_regressions_raise_few_false_alarms(module):
     assert alarms <= trials * 0.05 + 4 * math.sqrt(trials * 0.05 * 0.95)
 
 
+def test_winner_and_those_that_cannot_be_told_apart(module):
+    compare = module("compare")
+
+    def of(method, *values):
+        return {"scene": "s", "method": method, "trimmed ratio": np.mean(values), "trimmed by seed": " ".join(map(str, values))}
+    rows = [of("path", 1, 1.01, 0.99), of("a", 0.5, 0.51, 0.49), of("b", 0.55, 0.56, 0.54), of("c", 0.2, 2.0, 0.4), of("d", 0.7, 0.72, 0.69)]
+    assert compare.told_apart(rows[2], rows[1]) and not compare.told_apart(rows[3], rows[1])
+    (winner,) = compare.winners(rows)
+    assert winner["best"] == "a" and winner["about as good"] == "b, c"
+
+
 # --- The commands ---------------------------------------------------------------------------------------
 
 
@@ -148,5 +159,5 @@ def test_page_of_one_small_scene(module, tmp_path):
     rows = json.loads((tmp_path / "out" / "compare.json").read_text())["rows"]
     assert [r["method"] for r in rows] == ["path", "bdpm:bdd=0"]
     assert rows[0]["relMSE ratio"] == 1 and 0.9 < rows[1]["mean ratio"] < 1.1
-    for name in ("converge.csv", "variance.csv", "stability.csv", "which_method.md", "tiny_time.png", "tiny_path.png", "variance_tiny_1.png"):
+    for name in ("converge.csv", "variance.csv", "stability.csv", "which_method.md", "which_scene.md", "tiny_time.png", "tiny_path.png", "variance_tiny_1.png"):
         assert (tmp_path / "out" / name).stat().st_size > 0
