@@ -27,7 +27,7 @@ def run(options: argparse.Namespace) -> None:
         measurement = measure_scene(path, options, marks(options.time, options.snapshots))
         found = converge(measurement)
         fitted = fit_slopes(measurement, found)
-        show(f"{measurement.opened.name}: relMSE is proportional to time to the power of the slope", fitted, COLUMNS)
+        show(f"{measurement.opened.name}: relMSE is proportional to samples, i.e. time without set-up, to the power of the slope", fitted, COLUMNS)
         points, slopes = points + found, slopes + fitted
         save(options.out, "converge", points, vars(options))
         save(options.out, "slopes", slopes, vars(options))
@@ -73,7 +73,10 @@ def _row(measured: Measured, number: int, measurement: Measurement) -> Row:
 
 
 def fit_slopes(measurement: Measurement, rows: list[Row]) -> list[Row]:
-    """One row a method: the exponent of time in its error, one fit a seed, with the interval of their mean."""
+    """One row a method: the exponent of the rendering in its error, one fit a seed, with the interval of their mean.
+
+    The fit is against samples per pixel, that is time without what goes before the first iteration: a pilot would otherwise pass for convergence.
+    """
     fitted: list[Row] = []
     for measured in measurement.methods:
         mine = [row for row in rows if row["method"] == measured.method.label]
@@ -95,5 +98,5 @@ def fit_slopes(measurement: Measurement, rows: list[Row]) -> list[Row]:
 
 
 def _curve(snapshots, name: str, measurement: Measurement) -> tuple[list[float], list[float]]:
-    return ([snapshot.seconds for snapshot in snapshots],
+    return ([snapshot.samples_per_pixel for snapshot in snapshots],
             [getattr(errors(snapshot.image, measurement.references), name) for snapshot in snapshots])

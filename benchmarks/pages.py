@@ -164,8 +164,8 @@ def convergence(measurement: Measurement, points: Sequence[Row], fitted: Sequenc
     time_chart = charts.save(charts.error_against_time(curves, style), folder / f"{name}_time.png")
     front_chart = charts.save(charts.front(clouds, style), folder / f"{name}_front.png")
     return f"""<h3>{name}: error against time, and the front of speed and accuracy</h3><div class="charts">
-<figure><img alt="error against time" src="{time_chart}"><figcaption>Lower is better. Slope: relMSE is proportional to time to that power (-1: noise alone;
-flatter: bias), ± half the 95 % interval over seeds.</figcaption></figure>
+<figure><img alt="error against time" src="{time_chart}"><figcaption>Lower is better. Slope: relMSE is proportional to the samples, that is to time
+without the pilot before the first, to that power (-1: noise alone; flatter: bias), ± half the 95 % interval over seeds.</figcaption></figure>
 <figure><img alt="front" src="{front_chart}"><figcaption>Nothing is both faster and more accurate than the points on the grey staircase.</figcaption></figure></div>"""
 
 
