@@ -11,7 +11,7 @@ import numpy as np
 import regressions
 from measuring import Measured, Measurement, measure
 from mis_integrators.analysis.confidence import log_ratio_error, mean_interval, ratio_interval
-from mis_integrators.analysis.metrics import Errors, decompose, efficiency, errors, flip
+from mis_integrators.analysis.metrics import Errors, decompose, efficiency, errors
 from mis_integrators.analysis.stability import CLOSE
 from references import find_references
 from reports import Row, console, save, show, tell
@@ -64,8 +64,8 @@ def _figures(measured: Measured, measurement: Measurement) -> dict[str, list[flo
     judged = [errors(image, measurement.references) for image in measured.images]
     figures = {field.name: [getattr(error, field.name) for error in judged] for field in fields(Errors)}
     figures["cost"] = [run.last.seconds / run.last.samples_per_pixel for run in measured.runs]
-    flips = [flip(image, measurement.references) for image in measured.images[:1]]
-    figures["flip"] = [found[0] for found in flips if found]
+    perceived = measured.perceived(measurement.references)
+    figures["flip"] = [perceived[0]] if perceived else []
     return figures
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from methods import Method, SessionMaker, base_of
 from mis_integrators import loading
-from mis_integrators.analysis.metrics import References
+from mis_integrators.analysis.metrics import References, flip
 from scene_files import OpenScene
 from turns import Contender, Snapshot, take_turns
 
@@ -38,6 +38,7 @@ class Measured:
     warm_up: float
     """Seconds of the throw-away session that compiled the kernels."""
     runs: list[Run] = field(default_factory=list)
+    _perceived: tuple[float, np.ndarray] | None = None
 
     @property
     def images(self) -> list[np.ndarray]:
@@ -47,6 +48,12 @@ class Measured:
     def at(self, number: int) -> list[Snapshot]:
         """Snapshot ``number`` of each run."""
         return [run.snapshots[number] for run in self.runs]
+
+    def perceived(self, references: References) -> tuple[float, np.ndarray] | None:
+        """FLIP of the first seed's picture, worked out once; ``None`` without the package."""
+        if self._perceived is None:
+            self._perceived = flip(self.images[0], references)
+        return self._perceived
 
     @property
     def common_snapshots(self) -> int:

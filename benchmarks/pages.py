@@ -14,7 +14,6 @@ from compare import told_apart
 from measuring import Measurement
 from methods import Method
 from mis_integrators.analysis import charts
-from mis_integrators.analysis.metrics import flip
 from mis_integrators.analysis.zooms import telling_windows
 from mis_integrators.output import write_png
 from reports import Row, machine
@@ -83,10 +82,11 @@ def summary(rows: Sequence[Row], failures: dict[str, dict[str, str]], what: str)
             cells.append(f'<td class="{kind}" title="{_interval(row, "trimmed ratio")}">{_short(row["trimmed ratio"])}{almost}</td>')
         lines.append(f'<tr><td><a href="#{scene}">{scene}</a></td><td class="text">{chip(best["method"], style[best["method"]])}</td>'
                      f'<td>{1 / best["trimmed ratio"]:.1f} ×</td>{"".join(cells)}</tr>')
-    total = "".join(f"<td>{_short(np.exp(np.mean(np.log(np.maximum(values, 1e-9)))))}</td>" if values else "<td>-</td>" for values in ratios.values())
+    means = [np.exp(np.mean(np.log(np.maximum(values, 1e-9)))) if values else None for values in ratios.values()]
+    total = "".join("<td>-</td>" if mean is None else f"<td>{_short(mean)}</td>" for mean in means)
     head = "".join(f"<th>{chip(label, style[label])}</th>" for label in labels)
-    return f"""<p>Error of each method {html.escape(what)}, over that of <b>{base}</b> in the same run: below 1 is better. Relative mean square error without the
-worst 0.1 % of the pixels; green: least error; red: more than three times {base}'s; ≈: not told apart from the winner
+    return f"""<p>Error of each method {html.escape(what)}, over that of <b>{base}</b> in the same run: below 1 is better. Relative mean
+square error without the worst 0.1 % of the pixels; green: least error; red: more than three times {base}'s; ≈: not told apart from the winner
 (95 %, by pairs of seeds). Tooltips: 95 % intervals.</p>
 <div class="wide"><table><tr><th>scene</th><th class="text">winner</th><th>less error<br>than {base}</th>{head}</tr>
 {"".join(lines)}<tr class="total"><td>geometric mean</td><td></td><td></td>{total}</tr></table></div>"""
@@ -100,7 +100,7 @@ def pictures(measurement: Measurement, rows: Sequence[Row], folder: Path) -> str
     references, name = measurement.references, measurement.opened.name
     style = styles_of([row["method"] for row in rows])
     white = max(float(np.quantile(references.mean, 0.97)), 1e-9)
-    found = [flip(measured.images[0], references) for measured in measurement.methods]
+    found = [measured.perceived(references) for measured in measurement.methods]
     with_flip = all(found)
     maps = [one[1] for one in found] if with_flip else [_relative(measured.images[0], references) for measured in measurement.methods]
     windows = telling_windows(maps, ZOOM)
@@ -120,7 +120,8 @@ def pictures(measurement: Measurement, rows: Sequence[Row], folder: Path) -> str
         cards.append(_card(chip(label, style[label]), "best" if row is best else "", image, error_map, image, windows,
                            folder / f"{name}_{_file_name(label)}", caption))
     scale = "HDR-FLIP" if with_flip else "relative error |x - r| / (r + 0.1)"
-    failures = "".join(f"<p class='soft'>{html.escape(label)} cannot render it: {html.escape(why)}</p>" for label, why in measurement.failures.items())
+    failures = "".join(f"<p class='soft'>{html.escape(label)} cannot render it: {html.escape(why)}</p>"
+                       for label, why in measurement.failures.items())
     return (f'<p class="soft">Picture, error map ({scale}: 0 <span class="scale"></span> 1), enlarged parts. {measurement.asked} each.</p>'
             f'<div class="pictures">{"".join(cards)}</div>{failures}')
 
@@ -166,7 +167,8 @@ def convergence(measurement: Measurement, points: Sequence[Row], fitted: Sequenc
     return f"""<h3>{name}: error against time, and the front of speed and accuracy</h3><div class="charts">
 <figure><img alt="error against time" src="{time_chart}"><figcaption>Lower is better. Slope: relMSE is proportional to the samples, that is to time
 without the pilot before the first, to that power (-1: noise alone; flatter: bias), ± half the 95 % interval over seeds.</figcaption></figure>
-<figure><img alt="front" src="{front_chart}"><figcaption>Nothing is both faster and more accurate than the points on the grey staircase.</figcaption></figure></div>"""
+<figure><img alt="front" src="{front_chart}"><figcaption>Nothing is both faster and more accurate than
+the points on the grey staircase.</figcaption></figure></div>"""
 
 
 def _slope(fit: Row) -> str:
@@ -180,8 +182,8 @@ def variance(name: str, picture: Path) -> str:
     """The variance maps of one scene, from the PNG that holds them."""
     uri = charts.data_uri(picture.read_bytes(), "image/png")
     return (f'<h3>{name}: variance of one iteration at equal merge radius</h3><figure class="chart"><img alt="variance maps" src="{uri}">'
-            "<figcaption>Below each picture the relative variance of its pixels, all on one scale; in the title its mean over that of the best single "
-            "strategy.</figcaption></figure>")
+            "<figcaption>Below each picture the relative variance of its pixels, all on one scale; in the title its mean over that of the "
+            "best single strategy.</figcaption></figure>")
 
 
 # --- Stability ------------------------------------------------------------------------------------------

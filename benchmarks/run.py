@@ -146,7 +146,8 @@ def _coarse(command: argparse.ArgumentParser) -> None:
 def _renders(command: argparse.ArgumentParser, seconds: float | None) -> None:
     """What is rendered, and how long."""
     _chooses(command, COMPARED, "ratios are to path, or to the first where it is not among them")
-    command.add_argument("--time", type=float, default=seconds, metavar="SECONDS", help=f"rendering seconds of each (default: {seconds or 'as fits'})")
+    command.add_argument("--time", type=float, default=seconds, metavar="SECONDS",
+                         help=f"rendering seconds of each (default: {seconds or 'as fits'})")
     command.add_argument("--spp", type=int, metavar="N", help="samples per pixel of each, instead of equal time")
 
 

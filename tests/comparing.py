@@ -25,7 +25,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mis_integrators.analysis.confidence import t_quantile, t_two_sided  # noqa: F401
+from mis_integrators.analysis.confidence import t_quantile
 
 FALSE_ALARM = 1e-6
 POWER = 0.95

@@ -159,5 +159,6 @@ def test_page_of_one_small_scene(module, tmp_path):
     rows = json.loads((tmp_path / "out" / "compare.json").read_text())["rows"]
     assert [r["method"] for r in rows] == ["path", "bdpm:bdd=0"]
     assert rows[0]["relMSE ratio"] == 1 and 0.9 < rows[1]["mean ratio"] < 1.1
-    for name in ("converge.csv", "variance.csv", "stability.csv", "which_method.md", "which_scene.md", "tiny_time.png", "tiny_path.png", "variance_tiny_1.png"):
+    for name in ("converge.csv", "variance.csv", "stability.csv", "which_method.md", "which_scene.md", "tiny_time.png",
+                 "tiny_path.png", "variance_tiny_1.png"):
         assert (tmp_path / "out" / name).stat().st_size > 0

@@ -78,7 +78,8 @@ def error_against_time(curves: Mapping[str, Curve], style: Mapping[str, Style]) 
             look = style[label]
             axis.plot(x[good], y[good], look.dashes, color=look.colour, marker=look.marker, ms=4, lw=1.6, label=f"{label}  {curve.slope}")
             if np.isfinite(low).any():
-                axis.fill_between(x[good], np.maximum(low[good], y[good] / 3), np.minimum(high[good], 3 * y[good]), color=look.colour, alpha=0.1, lw=0)
+                low, high = np.maximum(low, y / 3), np.minimum(high, 3 * y)        # wider ones would hide the rest
+                axis.fill_between(x[good], low[good], high[good], color=look.colour, alpha=0.1, lw=0)
     _logarithmic(axis, "seconds", "relMSE, mean of the seeds")
     _legend(axis, "method, slope")
     return figure
