@@ -23,13 +23,24 @@ COLUMNS = ("method", "iterations", "seconds", "first", "relMSE", "relMSE ratio",
 
 def run(options: argparse.Namespace) -> None:
     """The sub-command ``compare``."""
+    import pages
+
     rows: list[Row] = []
+    failures: dict[str, dict[str, str]] = {}
+    pictures: list[str] = []
+    page = pages.Page("Comparison", options.out / "compare.html")
     for path in options.scenes:
         measurement = measure_scene(path, options, [])
         found = compare(measurement)
         show_comparison(found, measurement, options)
         rows += found
         save(options.out, "compare", rows, vars(options))
+        name = measurement.opened.name
+        failures[name] = measurement.failures
+        pictures.append(f'<h2 id="{name}">{name}</h2>' + pages.pictures(measurement, found, options.out))
+        page.sections = [pages.summary(rows, failures, f"({measurement.asked} each, {options.seeds} seeds)"), *pictures]
+        page.write()
+    console.print(f"page: {page.path}")
     if options.record:
         regressions.record(rows, vars(options))
     if options.baseline:

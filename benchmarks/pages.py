@@ -36,8 +36,8 @@ class Page:
         """Where PNG files go."""
         return self.path.parent
 
-    def add(self, section: str, first: bool = False) -> None:
-        self.sections.insert(0 if first else len(self.sections), section)
+    def add(self, section: str) -> None:
+        self.sections.append(section)
 
     def write(self) -> None:
         about = machine()
@@ -114,7 +114,7 @@ def pictures(measurement: Measurement, rows: Sequence[Row], folder: Path) -> str
         label = row["method"]
         seen = f"FLIP {row['FLIP']:.3f}, " if row["FLIP"] is not None else ""
         bias = f", bias {max(row['bias share'], 0):.0%}" if row["bias share"] is not None else ""
-        caption = (f"<b>{_interval(row, 'trimmed ratio')} × {measurement.base.method.label}</b>{seen}{row['samples_per_pixel']} spp, "
+        caption = (f"<b>{_interval(row, 'trimmed ratio')} × {measurement.base.method.label}</b>{seen}{row['samples_per_pixel']} spp in {row['seconds']:.1f} s, "
                    f"relMSE {row['relMSE']:.3g}{bias}")
         image = measured.images[0] / white
         cards.append(_card(chip(label, style[label]), "best" if row is best else "", image, error_map, image, windows,
