@@ -7,6 +7,7 @@ import math
 
 import numpy as np
 
+import stability
 from methods import Method, registered
 from measuring import measure
 from mis_integrators.analysis.metrics import References
@@ -29,6 +30,7 @@ def run(options: argparse.Namespace) -> None:
         for method in options.integrators or registered(recipe(opened)["opinions"]):
             rows.append(opinion(opened, method, references, options.time))
         console.print(f"{opened.name}: references by {references.origin}")
+    stability.prepare(options)
     if rows:
         show("Second opinions", rows)
         save(options.out, "references", rows, vars(options))

@@ -83,8 +83,7 @@ def overhead(options: argparse.Namespace) -> float:
     values = [(sweep, len(sweep.values[::2] if options.coarse else sweep.values)) for sweep in SWEEPS if sweep.name in options.sweeps]
     points = sum(count for _, count in values) * methods * options.point_time
     compiling = sum((0.3 if sweep.of_method else 1.0) * count for sweep, count in values) * methods * 0.5 * COMPILING_SECONDS
-    references = sum((1 if sweep.of_method else count) * 4 * options.point_time for sweep, count in values)
-    return scenes + points + compiling + references
+    return scenes + points + compiling
 
 
 def planned_time(options: argparse.Namespace) -> float:

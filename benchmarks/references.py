@@ -25,14 +25,19 @@ RECIPE = json.loads(Path(__file__).with_name("references.json").read_text())
 
 def add_options(command: argparse.ArgumentParser) -> None:
     """The options that ``find_references`` reads."""
-    command.add_argument("--references", type=Path, default=Path("out/references"), metavar="DIR",
-                         help="where references are kept that do not lie beside the scene "
-                         "(default: out/references)")
+    add_folder(command)
     command.add_argument("--reference-time", type=float, default=30, metavar="SECONDS",
                          help="rendering seconds of each of the two references (default: 30)")
     command.add_argument("--reference-method", type=parse_method, metavar="PLUGIN[:...]",
                          help="what renders them (default: path, or for the scenes that it cannot do bdpm "
                          "with a radius below the pixels' size)")
+
+
+def add_folder(command: argparse.ArgumentParser) -> None:
+    """The option that names where references are kept."""
+    command.add_argument("--references", type=Path, default=Path("out/references"), metavar="DIR",
+                         help="where references are kept that do not lie beside the scene "
+                         "(default: out/references)")
 
 
 def recipe(opened: OpenScene) -> dict:
@@ -48,8 +53,8 @@ def find_references(
     from an earlier run, else new ones, which are then kept. ``options``: see ``add_options``."""
     method = options.reference_method or parse_method(recipe(opened)["method"])
     directory, seconds = options.references, options.reference_time
-    beside = _paths(opened.path.parent, opened.path.stem)
-    if all(path.exists() for path in beside):
+    beside = _paths(opened.path.parent, opened.path.stem) if opened.path else []
+    if beside and all(path.exists() for path in beside):
         images = [read_colours(path) for path in beside]
         if all(image.shape[1::-1] == opened.size for image in images):
             return References(*images, origin="beside the scene", noisy=False)
@@ -58,7 +63,7 @@ def find_references(
     record = kept[0].with_suffix(".json")
     made_with = {
         "scene": opened.name,
-        "fingerprint": fingerprint(opened.path),
+        "fingerprint": fingerprint(opened),
         "size": [width, height],
         "method": method.label,
         "inherited": opened.inherited,

@@ -82,7 +82,8 @@ def _parser() -> argparse.ArgumentParser:
     command = _measuring(commands, "stability", stability, scenes=False)
     _chooses(command, COMPARED, "each swept where it knows the parameter")
     _sweeps(command, 0.6)
-    _coarse(command)
+    command.add_argument("--coarse", action="store_true", help="only every other value of a sweep")
+    references.add_folder(command)
 
     command = _measuring(commands, "radius", radius)
     command.add_argument("--bdd", type=int, nargs="+", default=[0, 1], help="(default: 0 1)")
@@ -97,6 +98,8 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument("--time", type=float, default=20, metavar="SECONDS", help="rendering seconds of each of their two renders (default: 20)")
     command.add_argument("--scale", type=float, default=1, help="film size, scene's own = 1 (default: 1)")
     references.add_options(command)
+    _sweeps(command, 0.4)
+    command.add_argument("--every-value", dest="coarse", action="store_false", help="all values of the sweeps instead of every other")
 
     for name, function in (("freeze-scenes", freezing.freeze), ("check-scenes", freezing.check)):
         command = commands.add_parser(name, help=function.__doc__, description=function.__doc__)
@@ -137,10 +140,8 @@ def _sweeps(command: argparse.ArgumentParser, seconds: float) -> None:
     command.add_argument("--size", type=int, default=64, metavar="PIXELS", help="edge of the film (default: 64)")
     command.add_argument("--point-time", type=float, default=seconds, metavar="SECONDS",
                          help=f"rendering seconds of each point (default: {seconds})")
-
-
-def _coarse(command: argparse.ArgumentParser) -> None:
-    command.add_argument("--coarse", action="store_true", help="only every other value of a sweep")
+    command.add_argument("--room-reference-time", type=float, default=10, metavar="SECONDS",
+                         help="rendering seconds of each of the two references of the scene swept (default: 10)")
 
 
 def _renders(command: argparse.ArgumentParser, seconds: float | None) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import time
 from typing import Sequence
 
 import mitsuba as mi
@@ -12,10 +11,10 @@ from methods import Method, SessionMaker
 from mis_integrators import loading
 from mis_integrators.analysis.metrics import References
 from mis_integrators.analysis.stability import Point, breaks, choose, judge
-from references import colours
+from references import colours, find_references
 from reports import Row, console, save, show, tell
 from scene_files import OpenScene
-from sweeps import SWEEPS, Sweep, room
+from sweeps import SWEEPS, Sweep, room, rooms
 from turns import Contender, take_turns
 
 Points = dict[str, list[Point]]
@@ -40,7 +39,7 @@ def sweep_all(options: argparse.Namespace) -> list[tuple[Sweep, Points]]:
     results = []
     for sweep in SWEEPS:
         if sweep.name in options.sweeps:
-            points = measure_sweep(sweep, options.integrators, options.size, options.point_time, options.coarse)
+            points = measure_sweep(sweep, options.integrators, options)
             results.append((sweep, points))
             rows += point_rows(sweep, points)
             choices += choice_rows(sweep, points)
@@ -52,16 +51,17 @@ def sweep_all(options: argparse.Namespace) -> list[tuple[Sweep, Points]]:
     return results
 
 
-def measure_sweep(sweep: Sweep, methods: Sequence[Method], size: int, seconds: float, coarse: bool = False) -> Points:
-    """Errors of all methods that the sweep concerns, `seconds` of rendering each after a first iteration that is free (pilots, recording:
-    this is about what a method can do, not about how soon it starts)."""
-    values = sweep.values[::2] if coarse else sweep.values
+def measure_sweep(sweep: Sweep, methods: Sequence[Method], options: argparse.Namespace) -> Points:
+    """Errors of all methods that the sweep concerns, `point_time` seconds of rendering each after a first iteration that is free (pilots,
+    recording: this is about what a method can do, not about how soon it starts)."""
+    seconds = options.point_time
+    values = rooms(sweep, options.coarse)
     points: Points = {}
-    references, opened = None, None
-    for value in values:
-        if opened is None or not sweep.of_method:
-            opened = room(size) if sweep.of_method else room(size, **{sweep.parameter: value})
-            references = make_references(opened, seconds)
+    opened = None
+    for value, change in values:
+        if opened is None or change:
+            opened = room(options.size, **change)
+            references = room_references(opened, options)
         contenders = []
         for method in methods:
             tried = _with_value(method, sweep, value)
@@ -99,17 +99,18 @@ def knows(plugin: str, parameter: str, value: float) -> bool:
     return True
 
 
-def make_references(opened: OpenScene, seconds: float) -> References:
-    """Two halves by `path`, each twice as long as what is compared with them."""
-    maker = SessionMaker(Method("path", "path"), opened, seconds)
-    halves = []
-    for seed in (1_000_003, 1_000_004):
-        session = maker.make(seed)
-        start = time.perf_counter()
-        while session.iterations == 0 or time.perf_counter() - start < 2 * seconds:
-            session.iterate()
-        halves.append(colours(session))
-    return References(*halves, origin="path", noisy=True)
+def room_references(opened: OpenScene, options: argparse.Namespace) -> References:
+    """Two halves by `path`, kept like those of scenes."""
+    how = argparse.Namespace(references=options.references, reference_time=options.room_reference_time, reference_method=None)
+    return find_references(opened, how, tell)
+
+
+def prepare(options: argparse.Namespace) -> None:
+    """Make the references of all sweeps that the options name, where they are missing."""
+    for sweep in SWEEPS:
+        if sweep.name in options.sweeps:
+            for _, change in rooms(sweep, options.coarse):
+                room_references(room(options.size, **change), options)
 
 
 def point_rows(sweep: Sweep, points: Points) -> list[Row]:

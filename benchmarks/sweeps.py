@@ -6,6 +6,7 @@ a square lamp. What a sweep does not vary keeps the values of `room`.
 
 from __future__ import annotations
 
+import inspect
 from dataclasses import dataclass
 
 import mitsuba as mi
@@ -36,6 +37,11 @@ SWEEPS = (
 )
 
 
+def rooms(sweep: Sweep, coarse: bool) -> list[tuple[float, dict[str, float]]]:
+    """The sweep's values, and what each changes in the scene: every other value if `coarse`."""
+    return [(value, {} if sweep.of_method else {sweep.parameter: value}) for value in (sweep.values[::2] if coarse else sweep.values)]
+
+
 def room(size: int, roughness: float = 0.15, light_size: float = 0.15, light_distance: float | None = None, max_depth: int = 8,
          scale: float = 1.0) -> OpenScene:
     """The scene, ready to render at `size` x `size` pixels.
@@ -43,6 +49,8 @@ def room(size: int, roughness: float = 0.15, light_size: float = 0.15, light_dis
     `roughness`: of the floor; `light_size`: half the edge of the lamp; `light_distance`: ``None`` for a lamp close below the ceiling that
     faces down, else its distance from the ceiling that it faces; `scale`: factor of all lengths. The lamp's power is always the same.
     """
+    title = "_".join(["room", *(f"{name}_{value:g}" for name, value in sorted(dict(
+        roughness=roughness, light_size=light_size, light_distance=light_distance or 0, max_depth=max_depth, scale=scale).items()))])
     to_scale = mi.ScalarTransform4f().scale(scale)
 
     def placed(kind, transform, bsdf, **more):
@@ -73,7 +81,7 @@ def room(size: int, roughness: float = 0.15, light_size: float = 0.15, light_dis
         "lamp": placed("rectangle", lamp, _diffuse(0, 0, 0),
                        emitter={"type": "area", "radiance": _rgb(*[0.4 / light_size ** 2] * 3)}),
     })
-    return OpenScene(None, scene, {"max_depth": max_depth})
+    return OpenScene(None, scene, {"max_depth": max_depth}, made=inspect.getsource(room) + title, title=title)
 
 
 def _rgb(*values):

@@ -80,9 +80,16 @@ def test_robust_errors_forget_outliers():
     assert errors(spoiled, references()).relmse_median == pytest.approx(clean.relmse_median, rel=0.1)
 
 
+def test_trimming_does_not_favour_either_sign():
+    """A perfect image has no error, trimmed or not, however noisy the references are."""
+    products = squared_errors(truth(), references()).mean(axis=-1)
+    assert abs(errors(truth(), references()).mse_trimmed) < 5 * products.std() / math.sqrt(products.size)
+
+
 def test_robust_means_of_known_values():
     assert trimmed_mean(np.arange(1000.0)) == pytest.approx(np.arange(999).mean())
     assert trimmed_mean(np.arange(10.0), 0.25) == pytest.approx(3.0)
+    assert trimmed_mean(np.array([1.0, 2.0, -50.0, 3.0]), 0.25) == pytest.approx(2.0)
     assert median_of_means(np.full(100, 3.0)) == 3.0
     many = np.random.default_rng(5).normal(2.0, 1.0, 30000)
     assert median_of_means(many) == pytest.approx(2.0, abs=5 * 1.2533 / math.sqrt(30000))

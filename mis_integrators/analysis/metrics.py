@@ -145,9 +145,13 @@ def efficiency(variance: float, seconds: float) -> float:
 
 
 def trimmed_mean(values: np.ndarray, share: float = TRIMMED_SHARE) -> float:
-    """Mean without the given share of largest values."""
-    values = np.sort(values, axis=None)
-    return float(values[:len(values) - int(np.ceil(share * len(values)))].mean())
+    """Mean without the given share of values, those of largest magnitude.
+
+    By magnitude, because products with noisy references are large with either sign: leaving out positive ones alone would bias the rest.
+    """
+    values = np.ravel(values)
+    kept = len(values) - int(np.ceil(share * len(values)))
+    return float(values[np.argpartition(np.abs(values), kept)[:kept]].mean())
 
 
 def median_of_means(values: np.ndarray, groups: int = GROUPS) -> float:
