@@ -1,4 +1,4 @@
-"""References: made where they are missing; where `path` does not converge, other methods must agree with them."""
+"""References: made where they are missing; where `path` does not converge, other methods are then asked whether they agree."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import stability
 from methods import Method, registered
 from measuring import measure
 from mis_integrators.analysis.metrics import References
-from references import find_references, recipe
+from references import are_there, find_references, recipe
 from reports import Row, console, save, show, tell
 from scene_files import OpenScene, open_scene, scaled_size
 
@@ -26,8 +26,9 @@ def run(options: argparse.Namespace) -> None:
     rows: list[Row] = []
     for path in options.scenes:
         opened = open_scene(path, scaled_size(path, options.scale))
+        old = are_there(opened, options)
         references = find_references(opened, options, tell)
-        for method in options.integrators or registered(recipe(opened)["opinions"]):
+        for method in options.integrators or ([] if old and not options.again else registered(recipe(opened)["opinions"])):
             rows.append(opinion(opened, method, references, options.time))
         console.print(f"{opened.name}: references by {references.origin}")
     stability.prepare(options)

@@ -51,30 +51,52 @@ def find_references(
 ) -> References:
     """References beside the scene (``NAME.exr`` and ``NAME_2.exr``, if of the film's size), else those kept
     from an earlier run, else new ones, which are then kept. ``options``: see ``add_options``."""
-    method = options.reference_method or parse_method(recipe(opened)["method"])
-    directory, seconds = options.references, options.reference_time
-    beside = _paths(opened.path.parent, opened.path.stem) if opened.path else []
-    if beside and all(path.exists() for path in beside):
-        images = [read_colours(path) for path in beside]
-        if all(image.shape[1::-1] == opened.size for image in images):
-            return References(*images, origin="beside the scene", noisy=False)
-    width, height = opened.size
-    kept = _paths(directory, f"{opened.name}_{width}x{height}")
-    record = kept[0].with_suffix(".json")
-    made_with = {
-        "scene": opened.name,
-        "fingerprint": fingerprint(opened),
-        "size": [width, height],
-        "method": method.label,
-        "inherited": opened.inherited,
-        "seconds_at_least": seconds,
-    }
+    beside = _beside(opened)
+    if beside:
+        return References(*beside, origin="beside the scene", noisy=False)
+    method = _method(opened, options)
+    kept, record, made_with = _wanted(opened, options)
     if not _usable(record, made_with):
-        directory.mkdir(parents=True, exist_ok=True)
-        iterations = _make(opened, method, seconds, kept, tell)
+        options.references.mkdir(parents=True, exist_ok=True)
+        iterations = _make(opened, method, options.reference_time, kept, tell)
         made_with |= {"iterations": iterations, "version": mis_integrators.__version__}
         record.write_text(json.dumps(made_with, indent=1) + "\n")
     return References(*(read_colours(path) for path in kept), origin=method.label, noisy=True)
+
+
+def are_there(opened: OpenScene, options: argparse.Namespace) -> bool:
+    """Whether `find_references` has nothing to render."""
+    _, record, made_with = _wanted(opened, options)
+    return _beside(opened) is not None or _usable(record, made_with)
+
+
+def _beside(opened: OpenScene) -> list[np.ndarray] | None:
+    """The references beside the scene; ``None`` if there are none of the film's size."""
+    if not opened.path:
+        return None
+    paths = _paths(opened.path.parent, opened.path.stem)
+    if not all(path.exists() for path in paths):
+        return None
+    images = [read_colours(path) for path in paths]
+    return images if all(image.shape[1::-1] == opened.size for image in images) else None
+
+
+def _method(opened: OpenScene, options: argparse.Namespace) -> Method:
+    return options.reference_method or parse_method(recipe(opened)["method"])
+
+
+def _wanted(opened: OpenScene, options: argparse.Namespace) -> tuple[list[Path], Path, dict]:
+    """Where the kept references of a scene lie, their record, and what must stand in it."""
+    width, height = opened.size
+    kept = _paths(options.references, f"{opened.name}_{width}x{height}")
+    return kept, kept[0].with_suffix(".json"), {
+        "scene": opened.name,
+        "fingerprint": fingerprint(opened),
+        "size": [width, height],
+        "method": _method(opened, options).label,
+        "inherited": opened.inherited,
+        "seconds_at_least": options.reference_time,
+    }
 
 
 def read_colours(path: Path) -> np.ndarray:

@@ -95,6 +95,7 @@ def _parser() -> argparse.ArgumentParser:
     command = _measuring(commands, "references", opinions)
     command.add_argument("--integrators", nargs="+", type=parse_method, metavar="PLUGIN[:name=value,...]",
                          help="methods that must agree (default: those of references.json that there are)")
+    command.add_argument("--again", action="store_true", help="ask them about references that were there before, too")
     command.add_argument("--time", type=float, default=20, metavar="SECONDS", help="rendering seconds of each of their two renders (default: 20)")
     command.add_argument("--scale", type=float, default=1, help="film size, scene's own = 1 (default: 1)")
     references.add_options(command)

@@ -5,6 +5,7 @@ import json
 import math
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -156,6 +157,10 @@ def test_page_of_one_small_scene(module, tmp_path):
     assert "src=\"http" not in page and page.count('src="data:') >= 12
     for part in ("geometric mean", "error against time", "variance of one iteration", "Which method where", "bogus", "HDR-FLIP"):
         assert part in page or (part == "HDR-FLIP" and "relative error" in page), part
+    references, opened = module("references"), module("scene_files").open_scene(scene)
+    kept = {"references": tmp_path / "references", "reference_method": None}
+    assert references.are_there(opened, SimpleNamespace(**kept, reference_time=0.2))
+    assert not references.are_there(opened, SimpleNamespace(**kept, reference_time=0.3))
     rows = json.loads((tmp_path / "out" / "compare.json").read_text())["rows"]
     assert [r["method"] for r in rows] == ["path", "bdpm:bdd=0"]
     assert rows[0]["relMSE ratio"] == 1 and 0.9 < rows[1]["mean ratio"] < 1.1
