@@ -114,8 +114,8 @@ def pictures(measurement: Measurement, rows: Sequence[Row], folder: Path) -> str
         label = row["method"]
         seen = f"FLIP {row['FLIP']:.3f}, " if row["FLIP"] is not None else ""
         bias = f", bias {max(row['bias share'], 0):.0%}" if row["bias share"] is not None else ""
-        caption = (f"<b>{_interval(row, 'trimmed ratio')} × {measurement.base.method.label}</b>{seen}{row['samples_per_pixel']} spp in {row['seconds']:.1f} s, "
-                   f"relMSE {row['relMSE']:.3g}{bias}")
+        caption = (f"<b>{_interval(row, 'trimmed ratio')} × {measurement.base.method.label}</b>{seen}{row['samples_per_pixel']} spp "
+                   f"in {row['seconds']:.1f} s, relMSE {row['relMSE']:.3g}{bias}")
         image = measured.images[0] / white
         cards.append(_card(chip(label, style[label]), "best" if row is best else "", image, error_map, image, windows,
                            folder / f"{name}_{_file_name(label)}", caption))
