@@ -127,7 +127,8 @@ def variance_maps(labels: Sequence[str], images: Sequence[np.ndarray], maps: Seq
         figure = Figure(figsize=(2.0 * len(maps) + 0.7, 4.0 * height / width + 1.0), layout="constrained")
         axes = figure.subplots(2, len(maps), squeeze=False)
         logs = [np.log10(np.maximum(m, 1e-9)) for m in maps]
-        low, high = np.percentile(np.concatenate([m.ravel() for m in logs]), [1, 99.5])
+        seen = np.concatenate([log[m > 0] for log, m in zip(logs, maps)])      # where nothing varies, a lamp perhaps, is off the scale
+        low, high = np.percentile(seen, [1, 99.5]) if seen.size else (-9, 0)
         white = np.quantile(images[0], 0.98)
         for column, (label, image, log, note) in enumerate(zip(labels, images, logs, notes)):
             axes[0, column].imshow(np.clip(image / white, 0, 1) ** (1 / 2.2))
