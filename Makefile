@@ -1,6 +1,6 @@
 # make render   set everything up, then render a bundled scene into out/
 # make test     set everything up, then run the tests
-# make bench    set everything up, then measure the throughput
+# make bench    set everything up, then compare all methods on all bundled scenes: out/bench/index.html (half an hour)
 # make gallery  set everything up, then render the pictures of docs/ (minutes)
 
 PYTHON ?= python3
@@ -24,7 +24,8 @@ gallery: $(VENV)/installed
 
 bench: $(VENV)/installed
 	$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check --editable '.[bench]'
-	$(VENV)/bin/python benchmarks/run.py throughput
+	$(VENV)/bin/python benchmarks/run.py references --out out/bench
+	$(VENV)/bin/python benchmarks/run.py page --out out/bench
 
 $(VENV)/installed: pyproject.toml $(SETUP)
 	@$(SETUP) $(PYTHON) $(VENV)

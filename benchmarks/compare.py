@@ -1,86 +1,153 @@
-"""Equal-time comparison of integrators, as ratios to the first one in the same run."""
+"""Equal-time (or equal-sample) comparison of integrators, as ratios to `path` in the same run."""
 
 from __future__ import annotations
 
 import argparse
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
 
-from errors import summarise
-from mis_integrators.session import Session
-from methods import SessionMaker
-from references import colours, find_references
-from reports import Row, save, show, tell
+import regressions
+from measuring import Measured, Measurement, measure
+from mis_integrators.analysis.confidence import log_ratio_error, mean_interval, ratio_interval
+from mis_integrators.analysis.metrics import Errors, decompose, efficiency, errors
+from mis_integrators.analysis.stability import CLOSE
+from references import find_references
+from reports import Row, console, save, show, tell
 from scene_files import open_scene, scaled_size
-from turns import Contender, take_turns
 
-COLUMNS = ("method", "iterations", "seconds", "first", "MSE", "relMSE", "MSE ratio", "relMSE ratio",
-           "trimmed ratio", "bias share", "settings")
+COLUMNS = ("method", "iterations", "seconds", "first", "relMSE", "relMSE ratio", "trimmed ratio", "MSE ratio", "FLIP", "bias share",
+           "cost ratio", "settings")
 
 
 def run(options: argparse.Namespace) -> None:
     """The sub-command ``compare``."""
+    import pages
+
     rows: list[Row] = []
+    failures: dict[str, dict[str, str]] = {}
+    pictures: list[str] = []
+    page = pages.Page("Comparison", options.out / "compare.html")
     for path in options.scenes:
-        found = compare_scene(path, options)
-        show(f"{found[0]['scene']}: equal time, {options.time:g} s each", found, COLUMNS)
+        measurement = measure_scene(path, options, [])
+        found = compare(measurement)
+        show_comparison(found, measurement, options)
         rows += found
         save(options.out, "compare", rows, vars(options))
+        name = measurement.opened.name
+        failures[name] = measurement.failures
+        pictures.append(f'<h2 id="{name}">{name}</h2>' + pages.pictures(measurement, found, options.out))
+        page.sections = [pages.summary(rows, failures, f"({measurement.asked} each, {options.seeds} seeds)"), *pictures]
+        page.write()
+    console.print(f"page: {page.path}")
+    if options.record:
+        regressions.record(rows, vars(options))
+    if options.baseline:
+        regressions.report(rows, options.baseline)
 
 
-def compare_scene(path: Path, options: argparse.Namespace) -> list[Row]:
-    """One row a method: mean errors over the seeds and their ratios to the first method's.
-
-    ``first`` are the seconds until the first iteration was done, with what went before it (a pilot).
-    """
+def measure_scene(path: Path, options: argparse.Namespace, marks: list[float]) -> Measurement:
+    """The renders that the options ask for."""
     opened = open_scene(path, scaled_size(path, options.scale))
     references = find_references(opened, options, tell)
-    makers = [SessionMaker(method, opened, options.time) for method in options.integrators]
-    runs: list[list[Contender]] = []
-    images: list[list[np.ndarray]] = []
-    for seed in range(options.seeds):
-        contenders = [Contender.begin(maker.method.label, maker.make, seed) for maker in makers]
-        take_turns(contenders, options.time, tell)
-        images.append([colours(contender.session) for contender in contenders])
-        runs.append(contenders)
-
-    rows: list[Row] = []
-    base = None
-    for number, method in enumerate(options.integrators):
-        mine = [contenders[number] for contenders in runs]
-        renders = [seed_images[number] for seed_images in images]
-        mean, bias = summarise(renders, references)
-        base = base or mean
-        settings = mine[-1].session.settings
-        rows.append({
-            "scene": opened.name,
-            "size": "{}x{}".format(*opened.size),
-            "method": method.label,
-            "seeds": len(mine),
-            "iterations": round(np.mean([c.session.iterations for c in mine])),
-            "samples_per_pixel": round(np.mean([samples_per_pixel(c.session) for c in mine])),
-            "seconds": float(np.mean([c.rendering for c in mine])),
-            "first": float(np.mean([c.first for c in mine])),
-            "compiling": float(np.mean([c.compiling for c in mine])),
-            "warm_up": makers[number].warm_up_seconds,
-            "MSE": mean.mse,
-            "relMSE": mean.relmse,
-            "MSE trimmed": mean.mse_trimmed,
-            "relMSE trimmed": mean.relmse_trimmed,
-            "MSE ratio": mean.mse / base.mse,
-            "relMSE ratio": mean.relmse / base.relmse,
-            "trimmed ratio": mean.relmse_trimmed / base.relmse_trimmed,
-            "bias share": bias,
-            "settings": chosen(settings),
-            "references": references.origin,
-        })
-    return rows
+    return measure(opened, options.integrators, references, options.time, options.spp, options.seeds, marks, tell)
 
 
-def samples_per_pixel(session: Session) -> int:
-    """Camera paths per pixel so far."""
-    return session.iterations * session.samples_per_iteration
+def show_comparison(rows: list[Row], measurement: Measurement, options: argparse.Namespace) -> None:
+    """Print the table of one scene, with intervals."""
+    much = f"{options.spp} samples per pixel" if options.spp else f"{options.time:g} s each"
+    shown = [{**row, **{name: _with_interval(row, name) for name in ("relMSE ratio", "cost ratio")}} for row in rows]
+    show(f"{measurement.opened.name}: {much}, {options.seeds} seeds, ratios to {measurement.base.method.label}", shown, COLUMNS)
+    for label, reason in measurement.failures.items():
+        console.print(f"{label} cannot render {measurement.opened.name}: {reason}")
+
+
+def compare(measurement: Measurement) -> list[Row]:
+    """One row a method: mean errors over the seeds, and ratios to the base with their confidence intervals."""
+    every = {measured.method.label: _figures(measured, measurement) for measured in measurement.methods}
+    base = every[measurement.base.method.label]
+    return [_row(measured, every[measured.method.label], base, measurement) for measured in measurement.methods]
+
+
+def _figures(measured: Measured, measurement: Measurement) -> dict[str, list[float]]:
+    """Errors and costs of each seed's render, by name."""
+    judged = [errors(image, measurement.references) for image in measured.images]
+    figures = {field.name: [getattr(error, field.name) for error in judged] for field in fields(Errors)}
+    figures["cost"] = [run.last.seconds / run.last.samples_per_pixel for run in measured.runs]
+    perceived = measured.perceived(measurement.references)
+    figures["flip"] = [perceived[0]] if perceived else []
+    return figures
+
+
+def _row(measured: Measured, mine: dict, base: dict, measurement: Measurement) -> Row:
+    opened, lasts = measurement.opened, [run.last for run in measured.runs]
+    parts = decompose(measured.images, measurement.references)
+    relative, cost = mean_interval(mine["relmse"]), ratio_interval(mine["cost"], base["cost"])
+    error_ratio = ratio_interval(mine["relmse"], base["relmse"])
+    trimmed = ratio_interval(mine["relmse_trimmed"], base["relmse_trimmed"])
+    seconds = float(np.mean([last.seconds for last in lasts]))
+    return {
+        "scene": opened.name,
+        "size": "{}x{}".format(*opened.size),
+        "method": measured.method.label,
+        "asked": measurement.asked,
+        "seeds": len(lasts),
+        "iterations": round(np.mean([last.iterations for last in lasts])),
+        "samples_per_pixel": round(np.mean([last.samples_per_pixel for last in lasts])),
+        "seconds": seconds,
+        "first": float(np.mean([run.first for run in measured.runs])),
+        "compiling": float(np.mean([run.compiling for run in measured.runs])),
+        "warm_up": measured.warm_up,
+        "MSE": float(np.mean(mine["mse"])),
+        "relMSE": relative.value,
+        "relMSE low": relative.low,
+        "relMSE high": relative.high,
+        "MSE trimmed": float(np.mean(mine["mse_trimmed"])),
+        "relMSE trimmed": float(np.mean(mine["relmse_trimmed"])),
+        "relMSE median of means": float(np.mean(mine["relmse_median"])),
+        "MAPE": float(np.mean(mine["mape"])),
+        "FLIP": float(np.mean(mine["flip"])) if mine["flip"] else None,
+        "mean ratio": float(np.mean(mine["mean_ratio"])),
+        "bias2": parts and parts.bias2,
+        "variance": parts and parts.variance,
+        "bias share": parts and parts.bias_share,
+        "efficiency": parts and efficiency(parts.variance, seconds),
+        "MSE ratio": float(np.mean(mine["mse"]) / np.mean(base["mse"])),
+        "relMSE ratio": error_ratio.value,
+        "relMSE ratio low": error_ratio.low,
+        "relMSE ratio high": error_ratio.high,
+        "relMSE ratio error": log_ratio_error(mine["relmse"], base["relmse"]),
+        "trimmed ratio": trimmed.value,
+        "trimmed ratio low": trimmed.low,
+        "trimmed ratio high": trimmed.high,
+        "trimmed ratio error": log_ratio_error(mine["relmse_trimmed"], base["relmse_trimmed"]),
+        "trimmed by seed": " ".join(f"{value:.6g}" for value in mine["relmse_trimmed"]),
+        "cost ratio": cost.value,
+        "cost ratio low": cost.low,
+        "cost ratio high": cost.high,
+        "cost ratio error": log_ratio_error(mine["cost"], base["cost"]),
+        "settings": chosen(measured.runs[-1].settings),
+        "references": measurement.references.origin,
+    }
+
+
+def told_apart(row: Row, better: Row) -> bool:
+    """Whether a method's error (relMSE without the worst 0.1 %) is beyond the noise above that of a better one: by pairs of seeds, 95 %."""
+    mine, other = ([float(value) for value in one["trimmed by seed"].split()] for one in (row, better))
+    return ratio_interval(mine, other).low > 1
+
+
+def winners(rows: list[Row]) -> list[Row]:
+    """One row a scene: its least error, in ratios to the base, and the methods that are about as good or cannot be told apart."""
+    found: list[Row] = []
+    for scene in dict.fromkeys(row["scene"] for row in rows):
+        mine = [row for row in rows if row["scene"] == scene]
+        best = min(mine, key=lambda row: row["trimmed ratio"])
+        close = [row["method"] for row in mine
+                 if row is not best and (row["trimmed ratio"] <= CLOSE * best["trimmed ratio"] or not told_apart(row, best))]
+        found.append({"scene": scene, "best": best["method"], "error over path's": best["trimmed ratio"], "about as good": ", ".join(close) or "-"})
+    return found
 
 
 def chosen(settings: dict) -> str:
@@ -90,3 +157,9 @@ def chosen(settings: dict) -> str:
         for name, value in settings.items()
         if "." in name
     )
+
+
+def _with_interval(row: Row, name: str) -> str:
+    if np.isnan(row[f"{name} low"]):
+        return f"{row[name]:.3g}"
+    return f"{row[name]:.3g} ({row[f'{name} low']:.3g} to {row[f'{name} high']:.3g})"

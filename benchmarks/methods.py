@@ -4,15 +4,26 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, field
+from typing import Sequence
 
 import mitsuba as mi
 
-from mis_integrators import loading
+from mis_integrators import _plugins, loading
 from mis_integrators.session import MitsubaSession, Session
 from scene_files import OpenScene
 
 PASS_SECONDS = 0.2
 """What one pass of one of Mitsuba's own integrators should take: short, but long beside its start."""
+
+# All defaults: what this package does not register is left out, so a plugin may be named here before it exists.
+COMPARED = ("path", "ptracer", "bdpm:bdd=0", "bdpm:bdd=1", "bdpm_balance", "bdpm_opt2", "bdpm_opt3", "bdpt", "vcm", "pcbpt", "bdpt_ris")
+"""What is compared unless said otherwise; ratios are to the first."""
+VARIED = ("bdpm:bdd=0", "bdpm:bdd=1", "bdpm:bdd=2", "bdpm_balance", "bdpm_opt3", "bdpm_opt2:mix_diffuse=true", "bdpm_opt3:mix_diffuse=true")
+"""What variance maps are made of unless said otherwise: strategies that merge, alone and together."""
+BASE = "path"
+"""What ratios are to, if it is among the methods; else the first of them."""
+MITSUBAS = ("path", "ptracer", "volpath", "volpathmis", "direct", "prb")
+"""Mitsuba's own integrators that defaults may name."""
 
 
 @dataclass(frozen=True)
@@ -41,20 +52,35 @@ def parse_method(text: str) -> Method:
     return Method(text, plugin, parameters)
 
 
+def registered(labels: Sequence[str]) -> list[Method]:
+    """The methods among these whose plugins exist."""
+    methods = [parse_method(label) for label in labels]
+    return [method for method in methods if method.plugin in _plugins.PLUGINS or method.plugin in MITSUBAS]
+
+
+def base_of(methods: Sequence[Method]) -> int:
+    """Number of the method that ratios are to."""
+    return next((number for number, method in enumerate(methods) if method.label == BASE), 0)
+
+
 class SessionMaker:
     """Makes sessions of one integrator on one scene, after having compiled what they need."""
 
-    def __init__(self, method: Method, opened: OpenScene, seconds: float):
-        """``seconds``: what each session will be given; a session may plan with it."""
+    def __init__(self, method: Method, opened: OpenScene, seconds: float, spp: int | None = None, warm_up: bool = True):
+        """``seconds``: what each session will be given; a session may plan with it. ``spp``: or the samples per pixel that each will
+        take; a pass of one of Mitsuba's own integrators then divides them. ``warm_up``: compile now, with a session to throw away."""
         self.method, self.opened, self.seconds = method, opened, seconds
         self._integrator = method.integrator(opened)
         self._spp = 0
         if not hasattr(self._integrator, "session"):
             self._spp = self._samples_per_pass()
+            if spp:
+                self._spp = max(n for n in range(1, min(self._spp, spp) + 1) if spp % n == 0)
         start = time.perf_counter()
-        throw_away = self.make(seed=2**31)
-        for _ in range(3):
-            throw_away.iterate()
+        if warm_up:
+            throw_away = self.make(seed=2**31)
+            for _ in range(3):
+                throw_away.iterate()
         self.warm_up_seconds = time.perf_counter() - start
 
     def make(self, seed: int) -> Session:
@@ -62,7 +88,7 @@ class SessionMaker:
         if self._spp:
             return MitsubaSession(self._integrator, self.opened.scene, self.opened.sensor, seed, self._spp)
         session = self._integrator.session(self.opened.scene, self.opened.sensor, seed=seed, spp=0)
-        if hasattr(session, "plan_time"):
+        if hasattr(session, "plan_time") and self.seconds:
             session.plan_time(self.seconds)
         return session
 

@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from mis_integrators.analysis.metrics import TRIMMED_SHARE, References, relative_squared_errors
 from compare import chosen
-from errors import TRIMMED_SHARE, References
 from methods import Method, SessionMaker
 from references import colours, find_references
 from reports import Row, save, show, tell
@@ -99,9 +99,8 @@ def law(contender: Contender, references: References) -> ErrorLaw:
     """What a rendering tells about its error at other times."""
     session = contender.session
     variance = session.image()[..., [session.channels.index(name) for name in ("var.R", "var.G", "var.B")]]
-    image, divisor = colours(session).astype(np.float64), references.divisor()
-    noise = (variance / divisor).mean(axis=-1).ravel()
-    bias = ((image - references.first) * (image - references.second) / divisor).mean(axis=-1).ravel() - noise
+    noise = (variance / references.divisor()).mean(axis=-1).ravel()
+    bias = relative_squared_errors(colours(session), references).ravel() - noise
     kept = np.argsort(noise)[: round(noise.size * (1 - TRIMMED_SHARE))]
     n, seconds = session.iterations, float(np.median(contender.seconds[1:]))
     return ErrorLaw(

@@ -12,31 +12,38 @@ import numpy as np
 import OpenEXR
 
 import mis_integrators
+from mis_integrators.analysis.metrics import References
 from mis_integrators.output import write_exr
-from errors import References
 from methods import Method, SessionMaker, parse_method
 from scene_files import OpenScene, fingerprint
 
 COLOURS = ("R", "G", "B")
 
-BEYOND_PATH = {
-    "caustics": "bdpm:bdd=0,initial_radius=0.005,photon_count=200000",
-    "sds": "bdpm:bdd=0,initial_radius=0.005,photon_count=200000",
-}
-"""Bundled scenes that path cannot render in reasonable time, and what makes their references: the blur of
-that radius is smaller than a pixel's image on the surfaces."""
+RECIPE = json.loads(Path(__file__).with_name("references.json").read_text())
+"""Scenes that path cannot render in reasonable time: what makes their references, and which other methods must agree with them."""
 
 
 def add_options(command: argparse.ArgumentParser) -> None:
     """The options that ``find_references`` reads."""
-    command.add_argument("--references", type=Path, default=Path("out/references"), metavar="DIR",
-                         help="where references are kept that do not lie beside the scene "
-                         "(default: out/references)")
-    command.add_argument("--reference-time", type=float, default=60, metavar="SECONDS",
-                         help="rendering seconds of each of the two references (default: 60)")
+    add_folder(command)
+    command.add_argument("--reference-time", type=float, default=30, metavar="SECONDS",
+                         help="rendering seconds of each of the two references (default: 30)")
     command.add_argument("--reference-method", type=parse_method, metavar="PLUGIN[:...]",
                          help="what renders them (default: path, or for the scenes that it cannot do bdpm "
                          "with a radius below the pixels' size)")
+
+
+def add_folder(command: argparse.ArgumentParser) -> None:
+    """The option that names where references are kept."""
+    command.add_argument("--references", type=Path, default=Path("out/references"), metavar="DIR",
+                         help="where references are kept that do not lie beside the scene "
+                         "(default: out/references)")
+
+
+def recipe(opened: OpenScene) -> dict:
+    """How the references of a scene are made, ``method``, and the methods that must agree, ``opinions``: path unless `references.json` knows
+    better."""
+    return RECIPE.get(opened.name, {"method": "path", "opinions": []})
 
 
 def find_references(
@@ -44,30 +51,52 @@ def find_references(
 ) -> References:
     """References beside the scene (``NAME.exr`` and ``NAME_2.exr``, if of the film's size), else those kept
     from an earlier run, else new ones, which are then kept. ``options``: see ``add_options``."""
-    method = options.reference_method or parse_method(BEYOND_PATH.get(opened.name, "path"))
-    directory, seconds = options.references, options.reference_time
-    beside = _paths(opened.path.parent, opened.path.stem)
-    if all(path.exists() for path in beside):
-        images = [read_colours(path) for path in beside]
-        if all(image.shape[1::-1] == opened.size for image in images):
-            return References(*images, origin="beside the scene", noisy=False)
-    width, height = opened.size
-    kept = _paths(directory, f"{opened.name}_{width}x{height}")
-    record = kept[0].with_suffix(".json")
-    made_with = {
-        "scene": opened.name,
-        "fingerprint": fingerprint(opened.path),
-        "size": [width, height],
-        "method": method.label,
-        "inherited": opened.inherited,
-        "seconds_at_least": seconds,
-    }
+    beside = _beside(opened)
+    if beside:
+        return References(*beside, origin="beside the scene", noisy=False)
+    method = _method(opened, options)
+    kept, record, made_with = _wanted(opened, options)
     if not _usable(record, made_with):
-        directory.mkdir(parents=True, exist_ok=True)
-        iterations = _make(opened, method, seconds, kept, tell)
+        options.references.mkdir(parents=True, exist_ok=True)
+        iterations = _make(opened, method, options.reference_time, kept, tell)
         made_with |= {"iterations": iterations, "version": mis_integrators.__version__}
         record.write_text(json.dumps(made_with, indent=1) + "\n")
     return References(*(read_colours(path) for path in kept), origin=method.label, noisy=True)
+
+
+def are_there(opened: OpenScene, options: argparse.Namespace) -> bool:
+    """Whether `find_references` has nothing to render."""
+    _, record, made_with = _wanted(opened, options)
+    return _beside(opened) is not None or _usable(record, made_with)
+
+
+def _beside(opened: OpenScene) -> list[np.ndarray] | None:
+    """The references beside the scene; ``None`` if there are none of the film's size."""
+    if not opened.path:
+        return None
+    paths = _paths(opened.path.parent, opened.path.stem)
+    if not all(path.exists() for path in paths):
+        return None
+    images = [read_colours(path) for path in paths]
+    return images if all(image.shape[1::-1] == opened.size for image in images) else None
+
+
+def _method(opened: OpenScene, options: argparse.Namespace) -> Method:
+    return options.reference_method or parse_method(recipe(opened)["method"])
+
+
+def _wanted(opened: OpenScene, options: argparse.Namespace) -> tuple[list[Path], Path, dict]:
+    """Where the kept references of a scene lie, their record, and what must stand in it."""
+    width, height = opened.size
+    kept = _paths(options.references, f"{opened.name}_{width}x{height}")
+    return kept, kept[0].with_suffix(".json"), {
+        "scene": opened.name,
+        "fingerprint": fingerprint(opened),
+        "size": [width, height],
+        "method": _method(opened, options).label,
+        "inherited": opened.inherited,
+        "seconds_at_least": options.reference_time,
+    }
 
 
 def read_colours(path: Path) -> np.ndarray:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import csv
 import json
+import math
 import os
 import platform
+import subprocess
 import time
 from pathlib import Path
 from typing import Mapping, Sequence
@@ -20,6 +22,8 @@ import mis_integrators
 Row = Mapping[str, str | int | float | None]
 
 console = Console(highlight=False)
+if not console.is_terminal:
+    console = Console(highlight=False, width=200)
 
 
 def show(title: str, rows: Sequence[Row], columns: Sequence[str] | None = None) -> None:
@@ -42,12 +46,29 @@ def save(directory: Path, name: str, rows: Sequence[Row], settings: Mapping) -> 
         writer = csv.DictWriter(file, fieldnames=list(rows[0]) if rows else [])
         writer.writeheader()
         writer.writerows(rows)
-    document = {"settings": settings, "machine": machine(), "rows": rows}
-    (directory / f"{name}.json").write_text(json.dumps(document, indent=1, default=str) + "\n")
+    (directory / f"{name}.json").write_text(json.dumps(document(rows, settings), indent=1, default=str) + "\n")
 
 
-def machine() -> dict[str, str | int]:
-    """What the figures depend on besides the code."""
+def document(rows: Sequence[Row], settings: Mapping) -> dict:
+    """What JSON files hold: the rows, how they were asked for, and the class of machine; figures that are no numbers become null."""
+    kept = {name: value for name, value in settings.items() if not callable(value)}
+    kept = {name: [_plain(one) for one in value] if isinstance(value, list) else _plain(value) for name, value in kept.items()}
+    numbers = [{key: None if isinstance(value, float) and not math.isfinite(value) else value for key, value in row.items()} for row in rows]
+    return {"settings": kept, "machine": machine(), "rows": numbers}
+
+
+def commit() -> str | None:
+    """The commit of this checkout, with a "+" if files differ from it; ``None`` outside a repository."""
+    def git(*arguments):
+        return subprocess.run(["git", *arguments], cwd=Path(__file__).parent, capture_output=True, text=True, check=True).stdout.strip()
+    try:
+        return git("rev-parse", "--short=12", "HEAD") + ("+" if git("status", "--porcelain", "--untracked-files=no") else "")
+    except (OSError, subprocess.CalledProcessError):
+        return None
+
+
+def machine() -> dict[str, str | int | None]:
+    """What the figures depend on: the code and the class of machine, not its name."""
     return {
         "date": time.strftime("%Y-%m-%d %H:%M"),
         "processor": _processor(),
@@ -58,6 +79,7 @@ def machine() -> dict[str, str | int]:
         "drjit": dr.__version__,
         "variant": mi.variant(),
         "mis_integrators": mis_integrators.__version__,
+        "commit": commit(),
     }
 
 
@@ -65,6 +87,13 @@ def tell(text: str) -> None:
     """Show progress: over the last line on a terminal, nothing elsewhere."""
     if console.is_terminal:
         console.print(f"{text:<100}", end="\r")
+
+
+def _plain(value):
+    """A setting without the folders of this machine: a method's label, a file's name."""
+    if isinstance(value, Path):
+        return value.name
+    return getattr(value, "label", value)
 
 
 def _processor() -> str:

@@ -12,13 +12,18 @@ import mitsuba as mi
 mi.set_variant("llvm_ad_rgb")
 
 import compare  # noqa: E402
+import converge  # noqa: E402
 import freezing  # noqa: E402
+import opinions  # noqa: E402
+import overview  # noqa: E402
 import radius  # noqa: E402
 import references  # noqa: E402
+import stability  # noqa: E402
 import throughput  # noqa: E402
 import variance  # noqa: E402
-from methods import parse_method  # noqa: E402
+from methods import COMPARED, VARIED, parse_method, registered  # noqa: E402
 from scene_files import bundled  # noqa: E402
+from sweeps import SWEEPS  # noqa: E402
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -44,25 +49,41 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument("--time", type=float, default=3, metavar="SECONDS",
                          help="what bdpm, bdpm with edge probes, and path have each (default: 3)")
 
+    command = _measuring(commands, "page", overview)
+    _renders(command, None)
+    _compares_with_references(command, seeds=3)
+    command.add_argument("--minutes", type=float, default=26, metavar="MINUTES", help="what all should take, if --time is not given (default: 26)")
+    command.add_argument("--snapshots", type=int, default=5, metavar="N", help="at times T, T/2, T/4, ... (default: 5)")
+    command.add_argument("--varied", nargs="+", type=parse_method, default=registered(VARIED), metavar="PLUGIN[:...]",
+                         help=f"methods of the variance maps (default: {' '.join(method.label for method in registered(VARIED))})")
+    command.add_argument("--variance-scale", type=float, default=0.5, metavar="SCALE", help="film size of variance maps (default: 0.5)")
+    _variance(command, 16)
+    _sweeps(command, 0.4)
+    command.add_argument("--every-value", dest="coarse", action="store_false", help="all values of the sweeps instead of every other")
+
     command = _measuring(commands, "compare", compare)
-    command.add_argument("--integrators", nargs="+", type=parse_method, metavar="PLUGIN[:name=value,...]",
-                         default=[parse_method(text) for text in ("path", "bdpm:bdd=0", "bdpm:bdd=1")],
-                         help="methods; ratios are to the first (default: path bdpm:bdd=0 bdpm:bdd=1)")
-    command.add_argument("--time", type=float, default=10, metavar="SECONDS",
-                         help="rendering seconds of each (default: 10)")
-    _compares_with_references(command)
+    _renders(command, 10)
+    _compares_with_references(command, seeds=3)
+    command.add_argument("--baseline", type=Path, metavar="FILE",
+                         help="figures of an earlier run (compare.json or benchmarks/history/*.json): print what became slower or noisier")
+    command.add_argument("--record", action="store_true", help="keep the figures in benchmarks/history")
+
+    command = _measuring(commands, "converge", converge)
+    _renders(command, 16)
+    _compares_with_references(command, seeds=3)
+    command.add_argument("--snapshots", type=int, default=6, metavar="N", help="at times T, T/2, T/4, ... (default: 6)")
 
     command = _measuring(commands, "variance", variance)
-    command.add_argument("--integrators", nargs="+", type=parse_method, metavar="PLUGIN[:name=value,...]",
-                         default=[parse_method(text) for text in ("bdpm:bdd=0", "bdpm:bdd=1", "bdpm:bdd=2", "bdpm_balance",
-                                                                  "bdpm_opt2", "bdpm_opt3", "bdpm_opt3:weights=full")],
-                         help="methods, some of them bdpm: ratios are to the best of these (default: bdpm with bdd 0, 1, 2, "
-                         "bdpm_balance, bdpm_opt2, bdpm_opt3 with local and with full weights)")
-    command.add_argument("--iterations", type=int, default=24, help="(default: 24)")
+    _chooses(command, VARIED, "some of them bdpm: ratios are to the best of these")
     command.add_argument("--camera-paths", type=int, nargs="+", default=[1], metavar="N", help="N_B (default: 1)")
-    command.add_argument("--radius", type=float, metavar="R", help="merge radius (default: a share of the scene's diagonal)")
-    command.add_argument("--radius-share", type=float, default=0.005, metavar="SHARE", help="(default: 0.005)")
+    _variance(command, 24)
     command.add_argument("--scale", type=float, default=1, help="film size, scene's own = 1 (default: 1)")
+
+    command = _measuring(commands, "stability", stability, scenes=False)
+    _chooses(command, COMPARED, "each swept where it knows the parameter")
+    _sweeps(command, 0.6)
+    command.add_argument("--coarse", action="store_true", help="only every other value of a sweep")
+    references.add_folder(command)
 
     command = _measuring(commands, "radius", radius)
     command.add_argument("--bdd", type=int, nargs="+", default=[0, 1], help="(default: 0 1)")
@@ -74,25 +95,69 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument("--scale", type=float, default=1, help="film size, scene's own = 1 (default: 1)")
     references.add_options(command)
 
+    command = _measuring(commands, "references", opinions)
+    command.add_argument("--integrators", nargs="+", type=parse_method, metavar="PLUGIN[:name=value,...]",
+                         help="methods that must agree (default: those of references.json that there are)")
+    command.add_argument("--again", action="store_true", help="ask them about references that were there before, too")
+    command.add_argument("--time", type=float, default=20, metavar="SECONDS", help="rendering seconds of each of their two renders (default: 20)")
+    command.add_argument("--scale", type=float, default=1, help="film size, scene's own = 1 (default: 1)")
+    references.add_options(command)
+    _sweeps(command, 0.4)
+    command.add_argument("--every-value", dest="coarse", action="store_false", help="all values of the sweeps instead of every other")
+
     for name, function in (("freeze-scenes", freezing.freeze), ("check-scenes", freezing.check)):
         command = commands.add_parser(name, help=function.__doc__, description=function.__doc__)
         command.set_defaults(run=function)
     return parser
 
 
-def _measuring(commands, name: str, module) -> argparse.ArgumentParser:
+def _measuring(commands, name: str, module, scenes: bool = True) -> argparse.ArgumentParser:
     """A sub-command with the options that all measurements have."""
     command = commands.add_parser(name, help=module.__doc__, description=module.__doc__)
-    command.add_argument("--scenes", nargs="+", type=Path, default=bundled(), metavar="FILE.xml",
-                         help="scene files (default: the bundled ones)")
+    if scenes:
+        command.add_argument("--scenes", nargs="+", type=Path, default=bundled(), metavar="FILE.xml",
+                             help="scene files (default: the bundled ones)")
     command.add_argument("--out", type=Path, default=Path("out/benchmarks"), metavar="DIR",
                          help="where CSV and JSON files go (default: out/benchmarks)")
     command.set_defaults(run=module.run)
     return command
 
 
-def _compares_with_references(command: argparse.ArgumentParser) -> None:
-    command.add_argument("--seeds", type=int, default=1, help="renders of each method (default: 1)")
+def _chooses(command: argparse.ArgumentParser, labels: tuple[str, ...], what: str) -> None:
+    """Which methods; by default those of the labels whose plugins there are."""
+    methods = registered(labels)
+    command.add_argument("--integrators", nargs="+", type=parse_method, metavar="PLUGIN[:name=value,...]", default=methods,
+                         help=f"methods, {what} (default: {' '.join(method.label for method in methods)})")
+
+
+def _variance(command: argparse.ArgumentParser, iterations: int) -> None:
+    """How variance is measured."""
+    command.add_argument("--iterations", type=int, default=iterations, help=f"for variances (default: {iterations})")
+    command.add_argument("--radius", type=float, metavar="R", help="merge radius of variance maps (default: a share of the scene's diagonal)")
+    command.add_argument("--radius-share", type=float, default=0.005, metavar="SHARE", help="(default: 0.005)")
+
+
+def _sweeps(command: argparse.ArgumentParser, seconds: float) -> None:
+    """Which parameters are swept, and how carefully."""
+    names = [sweep.name for sweep in SWEEPS]
+    command.add_argument("--sweeps", nargs="*", choices=names, default=names, metavar="NAME", help=f"(default: {' '.join(names)})")
+    command.add_argument("--size", type=int, default=64, metavar="PIXELS", help="edge of the film (default: 64)")
+    command.add_argument("--point-time", type=float, default=seconds, metavar="SECONDS",
+                         help=f"rendering seconds of each point (default: {seconds})")
+    command.add_argument("--room-reference-time", type=float, default=10, metavar="SECONDS",
+                         help="rendering seconds of each of the two references of the scene swept (default: 10)")
+
+
+def _renders(command: argparse.ArgumentParser, seconds: float | None) -> None:
+    """What is rendered, and how long."""
+    _chooses(command, COMPARED, "ratios are to path, or to the first where it is not among them")
+    command.add_argument("--time", type=float, default=seconds, metavar="SECONDS",
+                         help=f"rendering seconds of each (default: {seconds or 'as fits'})")
+    command.add_argument("--spp", type=int, metavar="N", help="samples per pixel of each, instead of equal time")
+
+
+def _compares_with_references(command: argparse.ArgumentParser, seeds: int = 1) -> None:
+    command.add_argument("--seeds", type=int, default=seeds, help=f"renders of each method (default: {seeds})")
     command.add_argument("--scale", type=float, default=1, help="film size, scene's own = 1 (default: 1)")
     references.add_options(command)
 

@@ -18,13 +18,20 @@ BUNDLED = Path(__file__).resolve().parent.parent / "scenes"
 class OpenScene:
     """A loaded scene: its file, what its own integrator hands on to others, its sensor and film size."""
 
-    path: Path
+    path: Path | None
+    """``None`` for a scene that no file holds."""
     scene: mi.Scene
     inherited: dict[str, loading.Value]
+    made: str = ""
+    """What a scene without a file was made from: it tells it from all others."""
+    title: str = ""
+    """Its name."""
 
     @property
     def name(self) -> str:
         """The file's name, or its folder's where all files are called ``scene.xml``."""
+        if self.path is None:
+            return self.title
         return self.path.resolve().parent.name if self.path.stem == "scene" else self.path.stem
 
     @property
@@ -84,6 +91,7 @@ def digests(path: Path) -> dict[str, str]:
     }
 
 
-def fingerprint(path: Path) -> str:
-    """One SHA-256 for all of the scene's files."""
-    return hashlib.sha256(repr(sorted(digests(path).items())).encode()).hexdigest()
+def fingerprint(opened: OpenScene) -> str:
+    """One SHA-256 for all of the scene's files, or for what it was made from."""
+    content = repr(sorted(digests(opened.path).items())) if opened.path else opened.made
+    return hashlib.sha256(content.encode()).hexdigest()

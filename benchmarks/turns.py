@@ -8,10 +8,23 @@ from dataclasses import dataclass, field
 from typing import Callable, Sequence
 
 import drjit as dr
+import numpy as np
 
 from mis_integrators.session import Session
+from references import colours
 
 SLICE_SECONDS = 0.5
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """The picture after some rendering time."""
+
+    seconds: float
+    iterations: int
+    samples_per_pixel: int
+    image: np.ndarray
+    """Colours, (H, W, 3)."""
 
 
 @dataclass
@@ -27,13 +40,16 @@ class Contender:
     compiling: float = 0.0
     observe: Callable[[list[dict], float], None] | None = None
     """Called after each iteration with its kernels (as in Dr.Jit's kernel history) and its seconds."""
+    marks: list[float] = field(default_factory=list)
+    """Rendering seconds, ascending, after which a snapshot is wanted."""
+    snapshots: list[Snapshot] = field(default_factory=list)
 
     @classmethod
-    def begin(cls, label: str, make: Callable[[int], Session], seed: int) -> "Contender":
+    def begin(cls, label: str, make: Callable[[int], Session], seed: int, marks: Sequence[float] = ()) -> "Contender":
         """Make a session; the time that it takes counts."""
         start = time.perf_counter()
         session = make(seed)
-        return cls(label, session, setting_up=time.perf_counter() - start)
+        return cls(label, session, setting_up=time.perf_counter() - start, marks=list(marks))
 
     @property
     def rendering(self) -> float:
@@ -57,9 +73,20 @@ class Contender:
         self.seconds.append(seconds - compiling)
         if self.observe:
             self.observe(kernels, seconds)
+        if self.marks and self.rendering >= self.marks[0]:
+            self.marks = [mark for mark in self.marks if mark > self.rendering]
+            self.take_snapshot()
 
-    def wants(self, seconds: float) -> bool:
-        """Whether one more iteration brings the time used closer to ``seconds``."""
+    def take_snapshot(self) -> None:
+        """Keep the picture as it is now; the time that it takes does not count."""
+        session = self.session
+        samples = session.iterations * session.samples_per_iteration
+        self.snapshots.append(Snapshot(self.rendering, session.iterations, samples, colours(session)))
+
+    def wants(self, seconds: float, spp: int | None = None) -> bool:
+        """Whether one more iteration brings the time used closer to ``seconds``, or is needed for ``spp`` samples per pixel."""
+        if spp:
+            return self.session.iterations * self.session.samples_per_iteration < spp
         return not self.seconds or self.rendering + 0.5 * self.seconds[-1] < seconds
 
 
@@ -69,17 +96,17 @@ def compile_seconds(kernels: Sequence[dict]) -> float:
 
 
 def take_turns(
-    contenders: Sequence[Contender], seconds: float, tell: Callable[[str], None] = lambda text: None
+    contenders: Sequence[Contender], seconds: float, tell: Callable[[str], None] = lambda text: None, spp: int | None = None
 ) -> None:
-    """Let each contender use ``seconds`` of rendering time, in slices, in an order that rotates."""
+    """Let each contender use ``seconds`` of rendering time, or take ``spp`` samples per pixel, in slices, in an order that rotates."""
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         turn = 0
-        while unfinished := [c for c in contenders if c.wants(seconds)]:
+        while unfinished := [c for c in contenders if c.wants(seconds, spp)]:
             turn += 1
             shift = turn % len(unfinished)
             for contender in unfinished[shift:] + unfinished[:shift]:
                 end = contender.rendering + SLICE_SECONDS
-                while contender.rendering < end and contender.wants(seconds):
+                while contender.rendering < end and contender.wants(seconds, spp):
                     contender.iterate()
             tell(f"{min(c.rendering for c in contenders):.1f} of {seconds:g} s each")
         dr.kernel_history_clear()

@@ -19,12 +19,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import lru_cache
 from statistics import NormalDist
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+
+from mis_integrators.analysis.confidence import t_quantile
 
 FALSE_ALARM = 1e-6
 POWER = 0.95
@@ -33,43 +34,6 @@ WHOLE, BLOCK = 0.01, 0.03
 
 
 # --- Distributions (no SciPy) -----------------------------------------------------------------------
-
-
-def _beta_fraction(a, b, x):
-    """Continued fraction of the incomplete beta function (Lentz)."""
-    c, d = 1.0, 1 - (a + b) * x / (a + 1)
-    d = 1 / (d or 1e-300)
-    result = d
-    for m in range(1, 500):
-        for step in (m * (b - m) * x / ((a + 2 * m - 1) * (a + 2 * m)),
-                     -(a + m) * (a + b + m) * x / ((a + 2 * m) * (a + 2 * m + 1))):
-            d = 1 / ((1 + step * d) or 1e-300)
-            c = (1 + step / c) or 1e-300
-            result *= d * c
-        if abs(d * c - 1) < 1e-12:
-            break
-    return result
-
-
-def t_two_sided(t: float, freedom: float) -> float:
-    """Probability that Student's t exceeds `t` in absolute value."""
-    a, b, x = freedom / 2, 0.5, freedom / (freedom + t * t)
-    front = math.exp(a * math.log(x) + b * math.log1p(-x) - math.lgamma(a) - math.lgamma(b) + math.lgamma(a + b)) if x < 1 else 0
-    if x >= 1:
-        return 1.0
-    if x < (a + 1) / (a + b + 2):
-        return front * _beta_fraction(a, b, x) / a
-    return 1 - front * _beta_fraction(b, a, 1 - x) / b
-
-
-@lru_cache(maxsize=None)
-def t_quantile(tail: float, freedom: float) -> float:
-    """The t > 0 with `t_two_sided(t) = tail`."""
-    low, high = 0.0, 1e3
-    for _ in range(80):
-        middle = (low + high) / 2
-        low, high = (middle, high) if t_two_sided(middle, freedom) > tail else (low, middle)
-    return high
 
 
 def chi2_tail(x: float, freedom: int) -> float:

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from comparing import (BLOCK, WHOLE, Estimate, assert_frequencies, assert_powerful, block_means, chi2_tail, differences, extrapolate,
-                       smallest_visible, t_quantile, t_two_sided)
+                       smallest_visible)
+from mis_integrators.analysis.confidence import t_quantile, t_two_sided
 
 
 def batches(rng, count, noise, blocks=9, channels=3):

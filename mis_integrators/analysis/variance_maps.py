@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from .metrics import trimmed_mean
+
 DARKEST = 0.1
 """Relative variances divide by the squared radiance plus the square of this share of the image's usual radiance."""
 
@@ -17,12 +19,6 @@ def relative_variance(variance: np.ndarray, mean: np.ndarray) -> np.ndarray:
     grey = mean.mean(axis=-1)
     usual = np.minimum(grey, np.quantile(grey, 0.95)).mean()
     return variance.mean(axis=-1) / (grey ** 2 + (DARKEST * usual) ** 2 + 1e-30)
-
-
-def trimmed_mean(values: np.ndarray, share: float = 1e-3) -> float:
-    """Mean without the given share of largest values."""
-    values = np.sort(values, axis=None)
-    return float(values[:len(values) - int(np.ceil(share * len(values)))].mean())
 
 
 def share_worse(values: np.ndarray, best: np.ndarray, size: int = 8) -> float:

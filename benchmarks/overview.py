@@ -1,0 +1,92 @@
+"""Everything on one page: pictures and errors after equal time, convergence, variance maps, stability; within a given time."""
+
+from __future__ import annotations
+
+import argparse
+import time
+
+import compare
+import converge
+import stability
+import variance
+from reports import Row, console, save, show
+from scene_files import open_scene, scaled_size
+from sweeps import SWEEPS
+
+COMPILING_SECONDS = 3.0
+"""Rough guess of what kernels and set-up cost for a method and scene on an idle machine; only the plan depends on it."""
+SHORTEST = 2.0
+"""Least rendering seconds of a method, whatever the plan."""
+VARIANCE_SECONDS = 12.0
+"""Rough guess for the variance maps of a scene."""
+
+
+def run(options: argparse.Namespace) -> None:
+    """The sub-command ``page``."""
+    import pages
+
+    start = time.perf_counter()
+    options.time = options.time or planned_time(options)
+    expected = overhead(options) + rendering(options, options.time)
+    console.print(f"{len(options.scenes)} scenes, {len(options.integrators)} methods, {options.seeds} seeds, {options.time:.1f} s each: about "
+                  f"{expected / 60:.0f} minutes, references not counted", highlight=False)
+    console.print(f"(rendering {rendering(options, options.time) / 60:.0f}, compiling, variance maps and sweeps {overhead(options) / 60:.0f})")
+
+    rows: list[Row] = []
+    failures: dict[str, dict[str, str]] = {}
+    page = pages.Page("Speed against accuracy", options.out / "index.html")
+    scenes: list[str] = []
+    points: list[Row] = []
+    slopes: list[Row] = []
+    varied: list[Row] = []
+    for path in options.scenes:
+        measurement = compare.measure_scene(path, options, converge.marks(options.time, options.snapshots))
+        name = measurement.opened.name
+        found = compare.compare(measurement)
+        compare.show_comparison(found, measurement, options)
+        curve = converge.converge(measurement)
+        fitted = converge.fit_slopes(measurement, curve)
+        rows, points, slopes, failures[name] = rows + found, points + curve, slopes + fitted, measurement.failures
+        small = open_scene(path, scaled_size(path, options.variance_scale))
+        maps = argparse.Namespace(**{**vars(options), "integrators": options.varied})
+        varied += variance.compare(small, 1, maps)
+        for kind, kept in (("compare", rows), ("converge", points), ("slopes", slopes), ("variance", varied)):
+            save(options.out, kind, kept, vars(options))
+        scenes.append(f'<h2 id="{name}">{name}</h2>' + pages.pictures(measurement, found, options.out)
+                      + pages.convergence(measurement, curve, fitted, options.out)
+                      + pages.variance(name, variance.picture_of(small, 1, options)))
+        write(page, pages, rows, failures, scenes, "", options)
+    show("Variance of one iteration, best single strategy = 1", varied, variance.COLUMNS)
+    sweeps = pages.stability(stability.sweep_all(options), options.out, options.integrators) if options.sweeps else ""
+    write(page, pages, rows, failures, scenes, pages.choices(compare.winners(rows)) + sweeps, options)
+    (options.out / "which_scene.md").write_text(stability.as_markdown(compare.winners(rows)))
+    console.print(f"page: {page.path} after {(time.perf_counter() - start) / 60:.1f} minutes")
+
+
+def write(page, pages, rows, failures, scenes, sweeps: str, options: argparse.Namespace) -> None:
+    """The page as far as it has come."""
+    much = f"at {options.spp} samples per pixel" if options.spp else f"after {options.time:.1f} s of rendering"
+    links = '<nav><a href="#stability">stability</a></nav>' if sweeps else ""
+    page.sections = [pages.summary(rows, failures, f"{much}, {options.seeds} seeds"), links, *scenes, sweeps]
+    page.write()
+
+
+def rendering(options: argparse.Namespace, seconds: float) -> float:
+    """Seconds of the scenes' renders."""
+    return len(options.scenes) * len(options.integrators) * options.seeds * seconds
+
+
+def overhead(options: argparse.Namespace) -> float:
+    """Seconds of everything else: compiling, variance maps, sweeps."""
+    methods = len(options.integrators)
+    scenes = len(options.scenes) * (methods * COMPILING_SECONDS + VARIANCE_SECONDS)
+    values = [(sweep, len(sweep.values[::2] if options.coarse else sweep.values)) for sweep in SWEEPS if sweep.name in options.sweeps]
+    points = sum(count for _, count in values) * methods * options.point_time
+    compiling = sum((0.3 if sweep.of_method else 1.0) * count for sweep, count in values) * methods * 0.5 * COMPILING_SECONDS
+    return scenes + points + compiling
+
+
+def planned_time(options: argparse.Namespace) -> float:
+    """Rendering seconds of each method and seed that fit into the minutes asked for."""
+    left = 60 * options.minutes - overhead(options)
+    return max(SHORTEST, left / rendering(options, 1.0))

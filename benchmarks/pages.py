@@ -1,0 +1,238 @@
+"""The self-contained HTML page of a run: summary, pictures, charts; images are embedded, and lie beside it as PNG."""
+
+from __future__ import annotations
+
+import html
+from pathlib import Path
+from string import Template
+from typing import Sequence
+
+import mitsuba as mi
+import numpy as np
+
+from compare import told_apart
+from measuring import Measurement
+from methods import Method
+from mis_integrators.analysis import charts
+from mis_integrators.analysis.zooms import telling_windows
+from mis_integrators.output import write_png
+from reports import Row, machine
+
+TEMPLATE = Path(__file__).with_name("page.html")
+ZOOM = 40
+"""Edge of what is shown enlarged, in pixels."""
+FRAMES = ((1.0, 0.75, 0.0), (0.0, 0.75, 1.0))
+"""Colours of the frames that show in the reference where the enlarged parts are."""
+
+
+class Page:
+    """Sections, and the file that they are written to."""
+
+    def __init__(self, title: str, path: Path):
+        self.title, self.path, self.sections = title, path, []
+
+    @property
+    def folder(self) -> Path:
+        """Where PNG files go."""
+        return self.path.parent
+
+    def add(self, section: str) -> None:
+        self.sections.append(section)
+
+    def write(self) -> None:
+        about = machine()
+        gradient = ", ".join("#%02x%02x%02x" % tuple(int(255 * c) for c in charts.heat(np.array(i / 8))) for i in range(9))
+        text = "{date} · {processor}, {threads} threads · mis_integrators {mis_integrators} ({commit}), Mitsuba {mitsuba}, Dr.Jit {drjit}"
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        self.path.write_text(Template(TEMPLATE.read_text()).substitute(
+            title=html.escape(self.title), machine=html.escape(text.format(**about)), gradient=gradient, body="\n".join(self.sections)))
+
+
+def styles_of(labels: Sequence[str]) -> dict[str, charts.Style]:
+    """Styles of all methods of a page."""
+    return charts.styles(list(dict.fromkeys(labels)))
+
+
+def chip(label: str, style: charts.Style) -> str:
+    """A method's name with its colour."""
+    return f'<span class="chip" style="background:{charts.colour_name(style)}"></span>{html.escape(label)}'
+
+
+# --- Summary --------------------------------------------------------------------------------------------
+
+
+def summary(rows: Sequence[Row], failures: dict[str, dict[str, str]], what: str) -> str:
+    """The table on top: for each scene each method's error as a ratio to the base's, the winner marked."""
+    labels = list(dict.fromkeys(row["method"] for row in rows))
+    style = styles_of(labels)
+    base = next(row["method"] for row in rows if row["trimmed ratio"] == 1)
+    lines, ratios = [], {label: [] for label in labels}
+    for scene in dict.fromkeys(row["scene"] for row in rows):
+        mine = {row["method"]: row for row in rows if row["scene"] == scene}
+        best = min(mine.values(), key=lambda row: row["trimmed ratio"])
+        cells = []
+        for label in labels:
+            row = mine.get(label)
+            if row is None:
+                cells.append(f'<td title="{html.escape(failures.get(scene, {}).get(label, ""))}">cannot</td>')
+                continue
+            ratios[label].append(row["trimmed ratio"])
+            kind = "win" if row is best else "worse" if row["trimmed ratio"] > 3 else ""
+            almost = " ≈" if row is not best and not told_apart(row, best) else ""
+            cells.append(f'<td class="{kind}" title="{_interval(row, "trimmed ratio")}">{_short(row["trimmed ratio"])}{almost}</td>')
+        lines.append(f'<tr><td><a href="#{scene}">{scene}</a></td><td class="text">{chip(best["method"], style[best["method"]])}</td>'
+                     f'<td>{1 / best["trimmed ratio"]:.1f} ×</td>{"".join(cells)}</tr>')
+    means = [np.exp(np.mean(np.log(np.maximum(values, 1e-9)))) if values else None for values in ratios.values()]
+    total = "".join("<td>-</td>" if mean is None else f"<td>{_short(mean)}</td>" for mean in means)
+    head = "".join(f"<th>{chip(label, style[label])}</th>" for label in labels)
+    return f"""<p>Error of each method {html.escape(what)}, over that of <b>{base}</b> in the same run: below 1 is better. Relative mean
+square error without the worst 0.1 % of the pixels; green: least error; red: more than three times {base}'s; ≈: not told apart from the winner
+(95 %, by pairs of seeds). Tooltips: 95 % intervals.</p>
+<div class="wide"><table><tr><th>scene</th><th class="text">winner</th><th>less error<br>than {base}</th>{head}</tr>
+{"".join(lines)}<tr class="total"><td>geometric mean</td><td></td><td></td>{total}</tr></table></div>"""
+
+
+# --- Scenes ---------------------------------------------------------------------------------------------
+
+
+def pictures(measurement: Measurement, rows: Sequence[Row], folder: Path) -> str:
+    """Each method's picture, its error map, two enlarged parts, and its figures; the reference first."""
+    references, name = measurement.references, measurement.opened.name
+    style = styles_of([row["method"] for row in rows])
+    white = max(float(np.quantile(references.mean, 0.97)), 1e-9)
+    found = [measured.perceived(references) for measured in measurement.methods]
+    with_flip = all(found)
+    maps = [one[1] for one in found] if with_flip else [_relative(measured.images[0], references) for measured in measurement.methods]
+    windows = telling_windows(maps, ZOOM)
+    framed = references.mean / white
+    for (y, x), colour in zip(windows, FRAMES):
+        framed[y:y + ZOOM, [x, min(x + ZOOM, framed.shape[1]) - 1]] = framed[[y, min(y + ZOOM, framed.shape[0]) - 1], x:x + ZOOM] = colour
+    best = min(rows, key=lambda row: row["trimmed ratio"])
+    cards = [_card("reference", "", framed, None, references.mean / white, windows, folder / f"{name}_reference",
+                   f"{references.origin}; frames: enlarged parts")]
+    for measured, row, error_map in zip(measurement.methods, rows, maps):
+        label = row["method"]
+        seen = f"FLIP {row['FLIP']:.3f}, " if row["FLIP"] is not None else ""
+        bias = f", bias {max(row['bias share'], 0):.0%}" if row["bias share"] is not None else ""
+        caption = (f"<b>{_interval(row, 'trimmed ratio')} × {measurement.base.method.label}</b>{seen}{row['samples_per_pixel']} spp "
+                   f"in {row['seconds']:.1f} s, relMSE {row['relMSE']:.3g}{bias}")
+        image = measured.images[0] / white
+        cards.append(_card(chip(label, style[label]), "best" if row is best else "", image, error_map, image, windows,
+                           folder / f"{name}_{_file_name(label)}", caption))
+    scale = "HDR-FLIP" if with_flip else "relative error |x - r| / (r + 0.1)"
+    failures = "".join(f"<p class='soft'>{html.escape(label)} cannot render it: {html.escape(why)}</p>"
+                       for label, why in measurement.failures.items())
+    return (f'<p class="soft">Picture, error map ({scale}: 0 <span class="scale"></span> 1), enlarged parts. {measurement.asked} each.</p>'
+            f'<div class="pictures">{"".join(cards)}</div>{failures}')
+
+
+def _card(title: str, kind: str, image, error_map, source, windows, path: Path, caption: str) -> str:
+    parts = [f'<img alt="" src="{_embed(image, path.with_suffix(".png"))}">']
+    if error_map is not None:
+        parts.append(f'<img alt="error map" src="{_embed(charts.heat(error_map) ** 2.2, path.with_name(path.name + "_error.png"))}">')
+    zooms = "".join(f'<img alt="" style="border-bottom:3px solid rgb({",".join(str(int(255 * c)) for c in colour)})" '
+                    f'src="{_embed(source[y:y + ZOOM, x:x + ZOOM], None)}">' for (y, x), colour in zip(windows, FRAMES))
+    return f'<figure class="{kind}"><b>{title}</b>{"".join(parts)}<div class="zooms">{zooms}</div><figcaption>{caption}</figcaption></figure>'
+
+
+def _embed(image: np.ndarray, path: Path | None) -> str:
+    """A linear image as a JPEG in a data URI; as PNG at `path`, too, if there is one."""
+    image = np.ascontiguousarray(np.nan_to_num(image, posinf=1), dtype=np.float32)
+    if path:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_png(path, image, ("R", "G", "B"))
+    stream = mi.MemoryStream()
+    mi.Bitmap(image, mi.Bitmap.PixelFormat.RGB).convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.UInt8, srgb_gamma=True).write(
+        stream, mi.Bitmap.FileFormat.JPEG, 90)
+    return charts.data_uri(stream.raw_buffer(), "image/jpeg")
+
+
+def _relative(image: np.ndarray, references) -> np.ndarray:
+    """|x - r| / (r + 0.1), mean of the channels."""
+    return (np.abs(image - references.mean) / (np.abs(references.level()) + 0.1)).mean(axis=-1)
+
+
+def convergence(measurement: Measurement, points: Sequence[Row], fitted: Sequence[Row], folder: Path) -> str:
+    """Error against time with slopes, and the Pareto front, of one scene."""
+    name = measurement.opened.name
+    labels = [row["method"] for row in fitted]
+    style = styles_of(labels)
+    curves, clouds = {}, {}
+    for label, fit in zip(labels, fitted):
+        mine = [row for row in points if row["method"] == label]
+        curves[label] = charts.Curve(*([row[key] for row in mine] for key in ("seconds", "relMSE", "relMSE low", "relMSE high")), _slope(fit))
+        clouds[label] = [(row["seconds"], row["relMSE trimmed"], row["on the front"]) for row in mine]
+    time_chart = charts.save(charts.error_against_time(curves, style), folder / f"{name}_time.png")
+    front_chart = charts.save(charts.front(clouds, style), folder / f"{name}_front.png")
+    return f"""<h3>{name}: error against time, and the front of speed and accuracy</h3><div class="charts">
+<figure><img alt="error against time" src="{time_chart}"><figcaption>Lower is better. Slope: relMSE is proportional to the samples, that is to time
+without the pilot before the first, to that power (-1: noise alone; flatter: bias), ± half the 95 % interval over seeds.</figcaption></figure>
+<figure><img alt="front" src="{front_chart}"><figcaption>Nothing is both faster and more accurate than
+the points on the grey staircase.</figcaption></figure></div>"""
+
+
+def _slope(fit: Row) -> str:
+    if not np.isfinite(fit["slope"]):
+        return ""
+    half = 0.5 * (fit["slope high"] - fit["slope low"])
+    return f"{fit['slope']:.2f}" + (f" ± {half:.2f}" if np.isfinite(half) else "")
+
+
+def variance(name: str, picture: Path) -> str:
+    """The variance maps of one scene, from the PNG that holds them."""
+    uri = charts.data_uri(picture.read_bytes(), "image/png")
+    return (f'<h3>{name}: variance of one iteration at equal merge radius</h3><figure class="chart"><img alt="variance maps" src="{uri}">'
+            "<figcaption>Below each picture the relative variance of its pixels, all on one scale; in the title its mean over that of the "
+            "best single strategy.</figcaption></figure>")
+
+
+# --- Stability ------------------------------------------------------------------------------------------
+
+
+def choices(rows: Sequence[Row]) -> str:
+    """The best method of each scene, as a table."""
+    return f'<h3>Which method for which scene</h3>{table(rows)}'
+
+
+def stability(results, folder: Path, methods: Sequence[Method]) -> str:
+    """The sweeps' charts, and the table of choices that follows from them."""
+    from stability import choice_rows
+
+    style = styles_of([method.label for method in methods])
+    figures, rows = [], []
+    for sweep, points in results:
+        if points:
+            uri = charts.save(charts.sweep(sweep.what, points, style), folder / f"stability_{sweep.name}.png")
+            figures.append(f'<figure><img alt="{sweep.name}" src="{uri}"></figure>')
+            rows += choice_rows(sweep, points)
+    return f"""<h2 id="stability">Where methods break</h2>
+<p>Error in a small room against one parameter, the others fixed; the first iteration of each (pilots, compiling) is free. A method breaks, ringed and
+crossed, where its error exceeds three times its own median over the sweep, or its mean is off by more than 5 % and four standard errors.</p>
+<div class="charts">{"".join(figures)}</div>
+<h3>Which method where</h3>{table(rows)}"""
+
+
+def table(rows: Sequence[Row]) -> str:
+    """Rows as a table."""
+    if not rows:
+        return ""
+    head = "".join(f'<th class="text">{html.escape(name)}</th>' for name in rows[0])
+    body = "".join("<tr>" + "".join(
+        f"<td>{value:.3g}</td>" if isinstance(value, (int, float)) else f'<td class="text">{html.escape(str(value))}</td>' for value in row.values()
+    ) + "</tr>" for row in rows)
+    return f'<div class="wide"><table><tr>{head}</tr>{body}</table></div>'
+
+
+def _interval(row: Row, name: str) -> str:
+    if not np.isfinite(row[f"{name} low"]) or row[f"{name} low"] == row[f"{name} high"]:
+        return _short(row[name])
+    return f"{_short(row[name])} ({_short(row[f'{name} low'])} to {_short(row[f'{name} high'])})"
+
+
+def _short(value: float) -> str:
+    """A ratio with two or three digits."""
+    return f"{value:.3f}" if value < 0.095 else f"{value:.2f}" if value < 9.95 else f"{value:.0f}" if value < 1e4 else f"{value:.0e}"
+
+
+def _file_name(label: str) -> str:
+    return "".join(c if c.isalnum() else "_" for c in label)

@@ -1,0 +1,140 @@
+"""Sweeps in which methods fail: error against one parameter of a small scene or of the methods, where each breaks, which to choose."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Sequence
+
+import mitsuba as mi
+
+from methods import Method, SessionMaker
+from mis_integrators import loading
+from mis_integrators.analysis.metrics import References
+from mis_integrators.analysis.stability import Point, breaks, choose, judge
+from references import colours, find_references
+from reports import Row, console, save, show, tell
+from scene_files import OpenScene
+from sweeps import SWEEPS, Sweep, room, rooms
+from turns import Contender, take_turns
+
+Points = dict[str, list[Point]]
+"""A method's points, by its label, at the sweep's values."""
+
+
+def run(options: argparse.Namespace) -> None:
+    """The sub-command ``stability``."""
+    import pages
+
+    page = pages.Page("Stability", options.out / "stability.html")
+    results = sweep_all(options)
+    page.add(pages.stability(results, page.folder, options.integrators))
+    page.write()
+    console.print(f"page: {page.path}")
+
+
+def sweep_all(options: argparse.Namespace) -> list[tuple[Sweep, Points]]:
+    """All sweeps that the options name; tables, CSV and JSON on the way."""
+    rows: list[Row] = []
+    choices: list[Row] = []
+    results = []
+    for sweep in SWEEPS:
+        if sweep.name in options.sweeps:
+            points = measure_sweep(sweep, options.integrators, options)
+            results.append((sweep, points))
+            rows += point_rows(sweep, points)
+            choices += choice_rows(sweep, points)
+            save(options.out, "stability", rows, vars(options))
+            save(options.out, "choices", choices, vars(options))
+    show("Which method where", choices)
+    options.out.mkdir(parents=True, exist_ok=True)
+    (options.out / "which_method.md").write_text(as_markdown(choices))
+    return results
+
+
+def measure_sweep(sweep: Sweep, methods: Sequence[Method], options: argparse.Namespace) -> Points:
+    """Errors of all methods that the sweep concerns, `point_time` seconds of rendering each after a first iteration that is free (pilots,
+    recording: this is about what a method can do, not about how soon it starts)."""
+    seconds = options.point_time
+    values = rooms(sweep, options.coarse)
+    points: Points = {}
+    opened = None
+    for value, change in values:
+        if opened is None or change:
+            opened = room(options.size, **change)
+            references = room_references(opened, options)
+        contenders = []
+        for method in methods:
+            tried = _with_value(method, sweep, value)
+            if tried is None:
+                continue
+            tell(f"{sweep.name} = {value:g}: compiling {method.label}")
+            try:
+                contender = Contender.begin(method.label, SessionMaker(tried, opened, seconds, warm_up=False).make, seed=7)
+                contender.session.iterate()
+            except loading.SCENE_ERRORS as error:
+                console.print(f"{sweep.name} = {value:g}: {method.label} left out: {loading.one_line(error)}")
+                continue
+            contender.setting_up = 0.0
+            contenders.append(contender)
+        take_turns(contenders, seconds, lambda text: tell(f"{sweep.name} = {value:g}: {text}"))
+        for contender in contenders:
+            points.setdefault(contender.label, []).append(judge(value, colours(contender.session), references))
+    return {label: found for label, found in points.items() if len(found) == len(values)}
+
+
+def _with_value(method: Method, sweep: Sweep, value: float) -> Method | None:
+    """The method at a value of the sweep; ``None`` if the sweep is about a parameter that its plugin does not know."""
+    if not sweep.of_method:
+        return method
+    changed = Method(method.label, method.plugin, {**method.parameters, sweep.parameter: value})
+    return changed if knows(method.plugin, sweep.parameter, value) else None
+
+
+def knows(plugin: str, parameter: str, value: float) -> bool:
+    """Whether a plugin has a parameter."""
+    try:
+        mi.load_dict({"type": plugin, parameter: value})
+    except loading.SCENE_ERRORS:
+        return False
+    return True
+
+
+def room_references(opened: OpenScene, options: argparse.Namespace) -> References:
+    """Two halves by `path`, kept like those of scenes."""
+    how = argparse.Namespace(references=options.references, reference_time=options.room_reference_time, reference_method=None)
+    return find_references(opened, how, tell)
+
+
+def prepare(options: argparse.Namespace) -> None:
+    """Make the references of all sweeps that the options name, where they are missing."""
+    for sweep in SWEEPS:
+        if sweep.name in options.sweeps:
+            for _, change in rooms(sweep, options.coarse):
+                room_references(room(options.size, **change), options)
+
+
+def point_rows(sweep: Sweep, points: Points) -> list[Row]:
+    """One row a method and value."""
+    return [
+        {"sweep": sweep.name, "value": point.value, "method": label, "relMSE trimmed": point.error, "mean deviation": point.deviation,
+         "deviation error": point.deviation_error, "mean is off": point.mean_is_off, "breaks": broken}
+        for label, mine in points.items() for point, broken in zip(mine, breaks(mine))
+    ]
+
+
+def choice_rows(sweep: Sweep, points: Points) -> list[Row]:
+    """One row a range of values with the same best method."""
+    return [
+        {"parameter": sweep.what, "from": choice.low, "to": choice.high, "best": choice.best, "about as good": ", ".join(choice.close) or "-",
+         "breaks": ", ".join(choice.broken) or "-"}
+        for choice in choose(points)
+    ] if points else []
+
+
+def as_markdown(rows: list[Row]) -> str:
+    """A Markdown table."""
+    if not rows:
+        return ""
+    names = list(rows[0])
+    body = ["| " + " | ".join(f"{row[name]:.3g}" if isinstance(row[name], (int, float)) else f"{row[name]}" for name in names) + " |" for row in rows]
+    return "\n".join(["| " + " | ".join(names) + " |", "|" + "---|" * len(names), *body]) + "\n"
