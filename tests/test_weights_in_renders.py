@@ -343,6 +343,17 @@ def test_presets_fix_the_number_of_strategies(rgb, plugin, strategies):
         mi.load_dict({"type": plugin, "strategies": 2})
 
 
+@pytest.mark.parametrize("radius, mixes", [(0.003, True), (0.3, False), (0.0, False)])
+def test_diffuse_surfaces_mix_where_photons_are_few(rgb, radius, mixes):
+    scene = tray("lambertian", "rectangle")
+    session = mi.load_dict({"type": "bdpm_opt2", "initial_radius": radius, "frozen_photons": 20000}).session(scene, seed=1)
+    session.iterate()
+    assert session.settings["mix_diffuse"] is mixes
+    for given in (True, False):
+        session = mi.load_dict({"type": "bdpm_opt2", "initial_radius": radius, "mix_diffuse": given}).session(scene, seed=1)
+        assert session.settings["mix_diffuse"] is given and bool(session.mixes()) is given
+
+
 @pytest.mark.parametrize("name, value, allowed", [("strategies", 0, "from 1 to 6"), ("strategies", 2.0, "an integer"),
                                                   ("weights", "best", '"full" or "local"'), ("first_vertex", -1, "at least 0"),
                                                   ("frozen_photons", -1, "at least 0"), ("bdd", 1, "unknown parameter")])

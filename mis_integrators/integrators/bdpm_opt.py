@@ -15,6 +15,8 @@ from .weighted import WeightedBDPM, WeightedSession
 
 USUAL_FROZEN_PATHS = 1 << 17
 USUAL_PHOTONS = 10
+FEW_PHOTONS = 1.0
+"""Photons a merge disk, fewer than which make mixing on diffuse surfaces worth its time."""
 PHOTONS_A_PATH = 5
 """Room for photons of the frozen pass; it grows where that is not enough."""
 
@@ -41,8 +43,9 @@ class BDPMOpt(WeightedBDPM):
          is cheaper and on diffuse scenes as good. (Default: ``local``)
      * - mix_diffuse
        - |bool|
-       - Whether strategies go on beyond vertices that scatter as Lambertians do. They gain little there, and cost as much as elsewhere; by
-         default a path's first Lambertian vertex is its last strategy. (Default: no, i.e. |false|)
+       - Whether strategies go on beyond vertices that scatter as Lambertians do; else a path's first Lambertian vertex is its last strategy. It
+         pays only where a merge disk holds few photons. (Default: where ``initial_radius`` is given, and a typical disk of that radius
+         holds less than one photon)
      * - frozen_photons
        - |int|
        - Light sub-paths of the pass from which the weights learn where light is; they do not contribute to the image. 0 stands for
@@ -78,11 +81,12 @@ class BDPMOpt(WeightedBDPM):
         self.strategies = self.fixed_strategies or parameters.integer("strategies", 3, 1, "from 1 to 6", high=6)
         self.first_vertex = self.bdd = parameters.integer("first_vertex", 0, 0, "at least 0")
         self.weights = parameters.choice("weights", "local", ("full", "local"))
-        self.mix_diffuse = parameters.boolean("mix_diffuse", False)
+        self.mix_diffuse = parameters.boolean("mix_diffuse", None)
         self.frozen_photons = parameters.integer("frozen_photons", 0, 0, "at least 0 (0: 131072)", high=2 ** 28)
 
     def settings(self):
-        return {**super().settings(), "first_vertex": self.first_vertex, "weights": self.weights, "mix_diffuse": self.mix_diffuse,
+        mixing = "automatic" if self.mix_diffuse is None else self.mix_diffuse
+        return {**super().settings(), "first_vertex": self.first_vertex, "weights": self.weights, "mix_diffuse": mixing,
                 "frozen_photons": self.frozen_photons}
 
     def new_session(self, scene, sensor, seed, iterations):
@@ -108,16 +112,34 @@ class BDPMOptSession(WeightedSession):
 
     def usual_radius(self):
         """The radius at which a typical lit point has `USUAL_PHOTONS` photons within its merge disk."""
-        flux = sum(self.cache.photon_flux) / len(self.cache.photon_flux)
-        area = USUAL_PHOTONS * flux / (self.light_paths * max(self.cache.mean, 1e-30))
+        area = USUAL_PHOTONS * self.cache.typical_flux / (self.light_paths * max(self.cache.mean, 1e-30))
         return dr.opaque(mi.Float, math.sqrt(area / math.pi))
 
+    def __init__(self, integrator, scene, sensor, seed, iterations):
+        self.cache = self.surroundings = None
+        super().__init__(integrator, scene, sensor, seed, iterations)
+        self.mix_diffuse = bool(integrator.mix_diffuse)
+        self.undecided = integrator.mix_diffuse is None and self.radii is not None
+
+    @property
+    def settings(self):
+        return {**super().settings, "mix_diffuse": self.mix_diffuse}
+
     def mixes(self):
-        return self.traits.has_rough or self.integrator.mix_diffuse
+        if self.undecided and self.integrator.strategies > 1:
+            self._learn(self._spectral(0))
+            photons = self.light_paths * math.pi * max(self.radii.values()) ** 2 * self.cache.mean / max(self.cache.typical_flux, 1e-30)
+            self.mix_diffuse, self.undecided = photons < FEW_PHOTONS, False
+        return self.traits.has_rough or self.mix_diffuse
 
     def prepare(self, spectral):
+        if self.cache is None:
+            self._learn(spectral)
+        if self.integrator.weights == "full":
+            self.surroundings = Surroundings(self.scene, self.weights({"n": mi.Spectrum(0), "caustic_cost": mi.Float(0)}))
+
+    def _learn(self, spectral):
         """One dense light pass, frozen: for the weights only."""
-        self.surroundings = None
         integrator = self.integrator
         paths = integrator.frozen_photons or USUAL_FROZEN_PATHS
         capacity, found = 0, PHOTONS_A_PATH * paths
@@ -129,8 +151,6 @@ class BDPMOptSession(WeightedSession):
             dr.eval(photons)
             found = int(photons[2][0])
         self.cache = IrradianceCache(self.scene, self.lights, *photons, paths, self.traits.bounds)
-        if integrator.weights == "full":
-            self.surroundings = Surroundings(self.scene, self.weights({"n": mi.Spectrum(0), "caustic_cost": mi.Float(0)}))
 
     def _freeze(self):
         super()._freeze()
@@ -141,7 +161,7 @@ class BDPMOptSession(WeightedSession):
         integrator = self.integrator
         return OptimalWeights(self.lights, self.traits, self.cache, self.surroundings, merging["n"], merging["caustic_cost"],
                               integrator.strategies, integrator.first_vertex, integrator.camera_paths, integrator.weights == "full",
-                              integrator.mix_diffuse)
+                              self.mix_diffuse)
 
     def merging(self, radii):
         cache = self.cache

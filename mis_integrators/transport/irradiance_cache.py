@@ -51,7 +51,7 @@ class IrradianceCache:
     """Irradiance by cell.
 
     Attributes: `cell` (edge of the cells, width one), `photon_flux` (flux of a typical photon that is merged, for one light sub-path, a list of one
-    number a channel), `mean` (irradiance of a typical lit point), `center` and `facing` (mean position and normal of the photons of each cell,
+    number a channel; `caustic_flux` that of caustic ones, `typical_flux` its mean over channels), `mean` (irradiance of a typical lit point), `center` and `facing` (mean position and normal of the photons of each cell,
     from cell number 1 on).
     """
 
@@ -73,6 +73,7 @@ class IrradianceCache:
                    for kind, mask in (("indirect", ~straight), ("caustic", straight & (unpack_depth(record.w) > 1)))}
         self.photon_flux = flux_of["indirect"] if any(flux_of["indirect"]) else flux_of["caustic"]
         self.caustic_flux = flux_of["caustic"]
+        self.typical_flux = sum(self.photon_flux) / len(self.photon_flux)
         place = self._choose_cells(position, normal, stored, int(count[0]), bounds)
         self._sum_cells(position, normal, place, stored)
         self.table = dr.zeros(mi.Float, self.words * (dr.width(self.center) + 1))
