@@ -51,8 +51,8 @@ class IrradianceCache:
     """Irradiance by cell.
 
     Attributes: `cell` (edge of the cells, width one), `photon_flux` (flux of a typical photon that is merged, for one light sub-path, a list of one
-    number a channel; `caustic_flux` that of caustic ones, `typical_flux` its mean over channels), `mean` (irradiance of a typical lit point), `center` and `facing` (mean position and normal of the photons of each cell,
-    from cell number 1 on).
+    number a channel; `caustic_flux` that of caustic ones, `typical_flux` its mean over channels), `mean` (irradiance of a typical lit point),
+    `center` and `facing` (mean position and normal of the photons of each cell, from cell number 1 on).
     """
 
     def __init__(self, scene, lights, surface, power, count, light_paths, bounds):
