@@ -181,8 +181,8 @@ def trace_camera_subpaths(scene, sensor, integrator, lights, traits, weights, se
     finds at each smooth vertex, weighted.
 
     Returns `(radiance, alpha, splat position, vertices, count)`: the kept vertices are those that a light sub-path may be joined with; `count` as in
-    `trace_light_subpaths`. `ledger`, if given, learns every contribution: `met(path, depth, value, mask)` and `direct(path, depth, value, mask)` with
-    the path's number in segments.
+    `trace_light_subpaths`. `ledger`, if given, learns every contribution: `met(path, depth, value, share, mask)` and `direct(...)`, with the length
+    of the joint path in segments, and the weight apart.
     """
     path, active, rng, ray, sensor_weight, splat, aperture = start_camera_paths(sensor, seed, first, 1, n_paths, camera_paths, wavelength_sample)
     lens = Lens(sensor)
@@ -223,10 +223,11 @@ def trace_camera_subpaths(scene, sensor, integrator, lights, traits, weights, se
                 shown &= (depth > 1) | si.is_valid()
             later = shown & (depth > 1)
             share = weights.met(state, lights.pdf_direct(origin, ds, later), lights.emission_ratio(origin, ds, later), density)
-            light = throughput * dr.select(later, share, 1) * ds.emitter.eval(si, shown)
-            radiance[shown] += light
+            share = dr.select(later, share, 1)
+            light = throughput * ds.emitter.eval(si, shown)
+            radiance[shown] += light * share
             if dr.hint(ledger is not None, mode='scalar'):
-                ledger.met(path, depth, light, shown)
+                ledger.met(path, depth, light, share, shown)
 
         active &= si.is_valid()
         if dr.hint(max_depth > 0, mode='scalar'):
@@ -252,10 +253,10 @@ def trace_camera_subpaths(scene, sensor, integrator, lights, traits, weights, se
             response, p_camera, p_light = junction.between(towards, direction, reached)
             facing = dr.abs(dr.dot(si.n, direction))
             share = weights.direct(state, light_pdf, facing * lights.emission_ratio(si, ds, reached), p_camera * facing, p_light, ds.delta)
-            light = dr.select(reached, throughput * share * response * light, 0)
-            radiance[reached] += light
+            light = throughput * response * light
+            radiance[reached] += light * share
             if dr.hint(ledger is not None, mode='scalar'):
-                ledger.direct(path, depth + 1, light, reached)
+                ledger.direct(path, depth + 1, light, share, reached)
 
         # ---- Keep the vertex: a light sub-path needs two more segments
         wanted = smooth & (dr.max(throughput) > 0)
