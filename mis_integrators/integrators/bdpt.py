@@ -24,6 +24,8 @@ from .pyramid import Ledger, camera_images, sensor_images, technique_channels, w
 CHUNK = 1 << 19
 """Camera paths, and as many light sub-paths, traced at once at most; larger films are traced in parts (bounds memory)."""
 
+THINNING = 0.1
+
 
 class BDPT(IterativeIntegrator):
     """(docs below)"""
@@ -100,22 +102,24 @@ class BDPTSession(IterativeSession):
     def _ledger(self, entries=None):
         return Ledger(self.chunk, self.integrator.techniques, self.integrator.technique_weights, entries)
 
-    def _list_pairs(self, light, camera, camera_count):
+    def _list_pairs(self, tables, light, radiance, camera, camera_count, seed):
         vertices, count, lengths = light
         start, order = by_path(vertices, count, lengths, self.capacity["light"])
-        return list_pairs(camera, camera_count, self.capacity["camera"], vertices, start, order, lengths, self.integrator.max_depth,
-                          self.capacity["pairs"])
+        level = dr.zeros(mi.Float, self.chunk) + dr.mean(dr.mean(radiance)) * THINNING
+        dr.eval(level, start, order)
+        return list_pairs(self.traits, self.weights(), camera, camera_count, self.capacity["camera"], vertices, start, order, lengths,
+                          self.integrator.max_depth, self.capacity["pairs"], level, seed)
 
     def _connect(self, scene, tables, radiance, camera, light, pairs, spectral, entries):
         """Radiance of camera paths with that of connections added."""
-        camera_place, light_place, count = pairs
+        camera_place, light_place, factor, count = pairs
         index = dr.arange(mi.UInt32, self.capacity["pairs"])
         active = index < dr.gather(mi.UInt32, count, 0)
         z = read_vertices(camera, dr.gather(mi.UInt32, camera_place, index, active), active)
         y = read_vertices(light, dr.gather(mi.UInt32, light_place, index, active), active)
         pair = join(self.traits, z, y, spectral["wavelengths"], active)
         seen = visible(scene, pair, z, active & (dr.max(pair.value) > 0))
-        share = self.weights().connected(pair, z, y)
+        share = self.weights().connected(pair, z, y) * dr.gather(mi.Float, factor, index, active)
         total = mi.Spectrum(radiance)
         dr.scatter_reduce(dr.ReduceOp.Add, total, pair.value * share, z["path"], seen)
         if entries:
@@ -176,8 +180,8 @@ class BDPTSession(IterativeSession):
                 break
         if self.bidirectional:
             while True:
-                pairs = self._pair_pass(light, camera, count)
-                if not self._grown("pairs", pairs[2]):
+                pairs = self._pair_pass(self._tables, light, radiance, camera, count, self._seed(iteration, THIN, chunk))
+                if not self._grown("pairs", pairs[-1]):
                     break
             radiance, entries = self._connection_pass(self.scene, self._tables, radiance, camera, light[0], pairs, spectral, entries)
             if self.lens:
@@ -205,5 +209,5 @@ class BDPTSession(IterativeSession):
         self.accumulator.put(film, self.pyramid)
 
 
-LIGHT, CAMERA, WAVELENGTH, APERTURE = range(4)
+LIGHT, CAMERA, WAVELENGTH, APERTURE, THIN = range(5)
 """Purposes of an iteration's random seeds."""

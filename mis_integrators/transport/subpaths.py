@@ -30,21 +30,26 @@ from .lenses import Lens
 from .light_pass import PATHS_PER_LANE, scatter_light
 from .packing import Store
 from .random import next_2d, streams
+from .records import Layout
 
 NO_PARENT = 0xffffffff
 STATES = ("near", "far")
 """What the buffers call the numbers of a state."""
 
 
+def vertex_layout(states=STATES):
+    """Fields of a kept vertex: position `p`, number of the sub-path `path`, `throughput` (light: flux; camera: importance) that arrives, `value` and
+    `density` as of `Junction`, the state of the weights, geometric normal `n`, direction `towards` the vertex before, `depth` in segments,
+    shading normal `ns`, `number` among the sub-path's kept vertices, `parent` (the place of the one before, or `NO_PARENT`)."""
+    return Layout({"p": mi.Point3f, "path": mi.UInt32, "throughput": mi.Spectrum, "density": mi.Float, "ns": mi.Vector3f, "depth": mi.UInt32,
+                   "towards": mi.Vector3f, "number": mi.UInt32, "value": mi.Spectrum, "parent": mi.UInt32, "n": mi.Vector3f,
+                   **{name: mi.Float for name in states}})
+
+
 def new_vertices(traits, capacity, states=STATES):
-    """Room for `capacity` vertices (a dictionary of arrays): position `p`, normals `n` (geometric) and `ns` (shading), direction `towards` the vertex
-    before, `throughput` (light: flux; camera: importance) that arrives, `value` and `density` as of `Junction`, number of the sub-path,
-    `depth` in segments, `number` among the sub-path's kept vertices, `parent`, the state of the weights; `hit` where surfaces are not
-    all Lambertian. Nothing is cleared: only the places below the count are valid."""
-    buffer = {name: dr.empty(mi.Float, capacity) for name in ("density", *states)}
-    buffer |= {name: dr.empty(mi.UInt32, capacity) for name in ("path", "depth", "number", "parent")}
-    buffer |= {name: dr.empty(mi.Spectrum, capacity) for name in ("throughput", "value")}
-    buffer |= {name: dr.empty(mi.Vector3f, capacity) for name in ("n", "ns", "towards")} | {"p": dr.empty(mi.Point3f, capacity)}
+    """Room for `capacity` vertices, a dictionary: `words` (records of `vertex_layout`), and where surfaces are not all Lambertian `hit`, from which
+    the surface interaction is made again. Only the places below the count are valid."""
+    buffer = {"words": vertex_layout(states).room(capacity)}
     if traits.has_rough:
         buffer["hit"] = dr.empty(mi.PreliminaryIntersection3f, capacity)
     return buffer
@@ -56,11 +61,18 @@ def _keep(store, junction, si, hit, towards, throughput, path, depth, number, pa
     keep = keep & (slot < capacity)
     values = {"p": si.p, "n": junction.n, "ns": junction.ns, "towards": towards, "throughput": throughput, "value": junction.value,
               "density": junction.density, "path": path, "depth": depth, "number": number, "parent": parent, **dict(zip(states, state))}
+    vertex_layout(states).write(store.vertices["words"], values, slot, keep)
     if "hit" in store.vertices:
-        values["hit"] = hit
-    for name, value in values.items():
-        dr.scatter(store.vertices[name], value, slot, keep)
+        dr.scatter(store.vertices["hit"], hit, slot, keep)
     return slot
+
+
+def read_vertices(vertices, index, active, only=None, states=STATES):
+    """The vertices at places `index`, a dictionary of all their fields (or those named in `only`); zero on inactive lanes."""
+    record = vertex_layout(states).read(vertices["words"], index, active, only)
+    if "hit" in vertices and (only is None or "hit" in only):
+        record["hit"] = dr.gather(mi.PreliminaryIntersection3f, vertices["hit"], index, active)
+    return record
 
 
 def _either(mask, yes, no):
@@ -68,15 +80,10 @@ def _either(mask, yes, no):
     return [dr.select(mask, a, b) for a, b in zip(yes, no)]
 
 
-def read_vertices(vertices, index, active, only=None):
-    """The vertices at places `index` (all their fields, or those of the list `only`); zero on inactive lanes."""
-    return {name: dr.gather(type(values), values, index, active) for name, values in vertices.items() if only is None or name in only}
-
-
 def junction_of(traits, record, wavelengths, active):
-    """The `Junction` of kept vertices, as read by `read_vertices`."""
+    """The `Junction` of kept vertices, as read by `read_vertices`; without `hit` only where they are Lambertian."""
     si = bsdf = None
-    if traits.has_rough:
+    if "hit" in record:
         hit, d = record["hit"], -record["towards"]
         hit.shape = dr.select(active, hit.shape, dr.zeros(mi.ShapePtr))
         rough = active & (record["density"] < 0)
