@@ -24,7 +24,7 @@ from .pyramid import Ledger, camera_images, sensor_images, technique_channels, w
 CHUNK = 1 << 19
 """Camera paths, and as many light sub-paths, traced at once at most; larger films are traced in parts (bounds memory)."""
 
-THINNING = 0.1
+THINNING = 0.05
 
 
 class BDPT(IterativeIntegrator):
@@ -105,7 +105,8 @@ class BDPTSession(IterativeSession):
     def _list_pairs(self, tables, light, radiance, camera, camera_count, seed):
         vertices, count, lengths = light
         start, order = by_path(vertices, count, lengths, self.capacity["light"])
-        level = dr.zeros(mi.Float, self.chunk) + dr.mean(dr.mean(radiance)) * THINNING
+        thinning = THINNING if self.integrator.technique_weights else 0
+        level = dr.zeros(mi.Float, self.chunk) + dr.mean(dr.mean(radiance)) * thinning
         dr.eval(level, start, order)
         return list_pairs(self.traits, self.weights(), camera, camera_count, self.capacity["camera"], vertices, start, order, lengths,
                           self.integrator.max_depth, self.capacity["pairs"], level, seed)
