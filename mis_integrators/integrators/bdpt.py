@@ -13,7 +13,7 @@ from ..transport.guide import EnvironmentGuide, infinite_emitters
 from ..transport.lenses import Lens
 from ..transport.lights import Lights
 from ..transport.packing import rounded_up
-from ..transport.random import mix, next_2d, streams
+from ..transport.random import mix, next_2d, vertex_streams
 from ..transport.recording import recorder
 from ..transport.subpaths import read_vertices, trace_camera_subpaths, trace_light_subpaths
 from ..transport.traits import SceneTraits
@@ -133,8 +133,9 @@ class BDPTSession(IterativeSession):
         vertices, count, _ = light
         index = dr.arange(mi.UInt32, self.capacity["light"])
         active = index < dr.gather(mi.UInt32, count, 0)
-        aperture = next_2d(streams(index, seed)) if sensor.needs_aperture_sample() else mi.Point2f(0.5)
         y = read_vertices(vertices, index, active)
+        rng = vertex_streams(y["path"], y["number"], seed)
+        aperture = next_2d(rng) if sensor.needs_aperture_sample() else mi.Point2f(0.5)
         joined = join_sensor(scene, self.integrator, self.traits, Lens(sensor), y, aperture, mi.Float(sensor.shutter_open()),
                              spectral["wavelengths"], self.integrator.hide_emitters, active)
         value = joined.value * (self.pixel_paths / self.light_paths)

@@ -13,7 +13,7 @@ import mitsuba as mi
 from .junctions import SMALLEST_COSINE
 from .lenses import unblocked, unblocked_by_visible
 from .packing import Store
-from .random import streams
+from .random import vertex_streams
 from .subpaths import STATES, junction_of, read_vertices
 
 
@@ -65,7 +65,7 @@ def by_path(vertices, count, lengths, capacity: int):
     return start, order
 
 
-LAMBERTIAN = ("p", "path", "throughput", "density", "ns", "depth", "towards", "value", "n", *STATES)
+LAMBERTIAN = ("p", "path", "throughput", "density", "ns", "depth", "towards", "number", "value", "n", *STATES)
 """Fields of a vertex that a connection of Lambertian vertices needs."""
 
 
@@ -81,8 +81,8 @@ def list_pairs(traits, weights, camera, camera_count, camera_capacity: int, ligh
                   count=dr.zeros(mi.UInt32, 1))
     index = dr.arange(mi.UInt32, camera_capacity)
     active = index < dr.gather(mi.UInt32, camera_count, 0)
-    rng = streams(index, seed)
     z = read_vertices(camera, index, active, LAMBERTIAN)
+    rng = vertex_streams(z["path"], z["number"], seed)
     level = dr.gather(mi.Float, level, z["path"], active)
     place = dr.gather(mi.UInt32, start, z["path"], active)
     left = dr.gather(mi.UInt32, lengths, z["path"], active)
