@@ -150,11 +150,10 @@ class BDPTSession(IterativeSession):
         """Block of the camera paths, and that of their techniques (or None)."""
         active = dr.arange(mi.UInt32, self.chunk) + first < self.path_count
         film, techniques = self.sensor.film(), None
-        shown = alpha > 0 if self.integrator.hide_emitters else mi.Bool(True)   # as `path`: what is behind nothing but null surfaces is hidden
         if entries:
             channels = camera_images(self._ledger(entries), spectral["matrix"])
-            techniques = splat_channels(film, position, [dr.select(shown, channel, 0) for channel in channels], active)
-        return splat_samples(film, position, dr.select(shown, radiance, 0), alpha, spectral["matrix"], active), techniques
+            techniques = splat_channels(film, position, channels, active)
+        return splat_samples(film, position, radiance, alpha, spectral["matrix"], active), techniques
 
     # ------------------------------------------------------------------ iterations
 
