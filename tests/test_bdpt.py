@@ -466,20 +466,27 @@ def test_seeds_and_iterations(thin_lens_box):
     assert np.abs(table).max() < 0.2, table.round(2)
 
 
-def test_full_buffers_and_parts_lose_nothing(thin_lens_box, monkeypatch):
-    """Buffers that are far too small grow; a film rendered in parts has the same mean."""
-    whole = render(thin_lens_box, 3, 8)
+def test_full_buffers_lose_nothing(thin_lens_box):
+    """Buffers that are far too small grow, and the passes run again with the same random numbers."""
+    whole = render(thin_lens_box, 3, 2)
     session = bdpt(camera_paths=1).session(thin_lens_box, 0, 3, 0)
     session.capacity = {"light": 40, "camera": 56, "pairs": 16}
     session._freeze()
-    for _ in range(8):
-        session.iterate()
+    session.iterate()
+    session.iterate()
     np.testing.assert_allclose(session.image(), whole, rtol=1e-4, atol=1e-5)
-    monkeypatch.setattr("mis_integrators.integrators.bdpt.CHUNK", 300)
-    parts = np.array([block_means(render(thin_lens_box, seed, 32), 2) for seed in range(8)])
-    monkeypatch.undo()
-    all_at_once = np.array([block_means(render(thin_lens_box, seed, 32), 2) for seed in range(8, 16)])
-    assert not differences(Estimate.of(parts), Estimate.of(all_at_once))
+
+
+def test_parts_lose_nothing(rgb, monkeypatch):
+    """A film rendered in parts, the last one incomplete, has the same mean."""
+    scene, batches = box_scene(24), []
+    for chunk in (1 << 19, 1700):
+        monkeypatch.setattr("mis_integrators.integrators.bdpt.CHUNK", chunk)
+        session = SessionBatches(bdpt(), scene, 3, seed=chunk)
+        session.add(32)
+        batches.append(session)
+    assert batches[1].session.chunks == 3 and batches[1].session.chunk * 3 > 24 * 24 * 8
+    assert_same(*collect_until(*batches))
 
 
 def test_pairs_are_thinned_without_bias(rgb, monkeypatch):
@@ -494,9 +501,10 @@ def test_pairs_are_thinned_without_bias(rgb, monkeypatch):
 
 
 def test_variance_is_that_of_the_mean(rgb):
-    images = np.array([render(box_scene(16, "gaussian"), seed, 8, variance=True) for seed in range(32)])
+    scene = box_scene(24, "gaussian")
+    images = np.array([render(scene, seed, 8, variance=True) for seed in range(12)])
     empirical, estimated = images[..., :3].var(axis=0, ddof=1).mean(), images[..., 3:].mean()
-    assert estimated == pytest.approx(empirical, rel=0.15)
+    assert estimated == pytest.approx(empirical, rel=0.2)
 
 
 # --- Parameters -----------------------------------------------------------------------------------------------
@@ -520,9 +528,9 @@ def test_darkness_and_refusals(rgb):
 
 
 def test_a_sensor_that_cannot_be_joined(rgb):
-    """Irradiance meters have no picture; light tracing is left out there, and nothing is missing."""
+    """Light tracing is left out under a `batch` sensor, and nothing is missing."""
+    views = {f"view{x}": {"type": "perspective", "fov": 40, "to_world": look((x, 0, 3), (0, 0, 0)), "film": film(8)} for x in (0, 1)}
     scene = mi.load_dict({"type": "scene", "light": {"type": "point", "position": [0, 0, 2], "intensity": 3.0},
                           "floor": {"type": "rectangle", "to_world": T().scale(5), "bsdf": diffuse(0.5)},
-                          "plate": {"type": "rectangle", "to_world": T().translate([0, 0, 1]).rotate([1, 0, 0], 180).scale(0.3),
-                                    "sensor": {"type": "irradiancemeter", "film": film(4)}}})
-    agree(bdpt(camera_paths=64), path(), scene, blocks=1)
+                          "sensor": {"type": "batch", **views, "film": {**film(16), "height": 8}}})
+    agree(bdpt(), path(), scene, blocks=2)
