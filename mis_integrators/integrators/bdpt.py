@@ -23,12 +23,68 @@ from .pyramid import Ledger, camera_images, sensor_images, technique_channels, w
 
 CHUNK = 1 << 19
 """Camera paths, and as many light sub-paths, traced at once at most; larger films are traced in parts (bounds memory)."""
-
 THINNING = 0.05
+"""Joined pairs that would bring less than this share of the mean radiance are left out by Russian roulette."""
 
 
 class BDPT(IterativeIntegrator):
-    """(docs below)"""
+    r"""
+    .. _integrator-bdpt:
+
+    Bidirectional path tracing (:monosp:`bdpt`)
+    -------------------------------------------
+
+    .. pluginparameters::
+
+     * - beta
+       - |float|
+       - Exponent of the heuristic, from 1 to 8: 1 is Veach's balance heuristic, 2 his power heuristic. (Default: 1)
+     * - techniques
+       - |int|
+       - Adds an image of its own for each technique (s, t), s vertices from the light and t from the camera, of paths of up to that many
+         segments: channels ``technique.s2.t1.R`` and so on (mono: ``.Y``), and ``technique.rest.*`` for all longer paths. From 0 (none) to 10.
+         (Default: 0)
+     * - technique_weights
+       - |bool|
+       - Those images show each technique's share, and their sum is the image; |false| shows each as if it were the only technique.
+         (Default: |true|)
+     * - camera_paths
+       - |int|
+       - Camera paths per pixel and iteration, each with a light sub-path of its own. (Default: 1)
+     * - variance
+       - |bool|
+       - Adds the channels ``var.R``, ``var.G``, ``var.B`` (mono: ``var.Y``): the estimated variance of the pixel mean over the
+         iterations, of which there must be two at least. (Default: no, i.e. |false|)
+     * - max_depth
+       - |int|
+       - Longest path in segments, both halves together (-1: unlimited). A value of 1 shows only directly visible emitters, 2 adds
+         direct light, and so on. (Default: -1)
+     * - rr_depth
+       - |int|
+       - Depth from which Russian roulette may end a sub-path, in each half. (Default: 5)
+     * - hide_emitters
+       - |bool|
+       - Hide directly visible emitters. (Default: no, i.e. |false|)
+
+    Each camera path is traced with a light sub-path. Light comes from emitters that the camera path meets, from next-event estimation,
+    from joining each of its vertices with each of the light sub-path's (few of those that would bring little), and from joining the latter's with
+    the sensor, on perspective, thin-lens and orthographic sensors. All techniques that could have made a path share it by Veach's
+    heuristic (1997, chapter 10).
+
+    Unbiased, without any parameter to choose. Participating media, polarised variants, gradients and the film ``specfilm`` are refused by name.
+
+    .. tabs::
+        .. code-tab:: xml
+
+            <integrator type="bdpt">
+                <integer name="max_depth" value="10"/>
+            </integrator>
+
+        .. code-tab:: python
+
+            'type': 'bdpt',
+            'max_depth': 10
+    """
 
     def read_parameters(self, parameters):
         self.beta = parameters.number("beta", 1.0, lambda beta: 1 <= beta <= 8, "from 1 (balance) to 8; 2 is the power heuristic")

@@ -55,7 +55,7 @@ def new_vertices(traits, capacity, states=STATES):
     return buffer
 
 
-def _keep(store, junction, si, hit, towards, throughput, path, depth, number, parent, state, states, capacity, keep):
+def keep_vertex(store, junction, si, hit, towards, throughput, path, depth, number, parent, state, states, capacity, keep):
     """Writes a vertex into the buffer; returns the place (valid if below the capacity)."""
     slot = dr.scatter_inc(store.count, mi.UInt32(0), keep)
     keep = keep & (slot < capacity)
@@ -155,7 +155,7 @@ def trace_light_subpaths(scene, lights, traits, weights, seed, n_paths: int, cap
         state = _either(first, weights.lit(si, source, ~unreachable, first), weights.arrived(state, arrival))
         smooth = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
         junction = Junction.at(traits, si, bsdf, smooth)
-        slot = _keep(store, junction, si, hit, towards, flux, path, depth, number, parent, state, weights.states, capacity, smooth)
+        slot = keep_vertex(store, junction, si, hit, towards, flux, path, depth, number, parent, state, weights.states, capacity, smooth)
         number = dr.select(smooth, number + 1, number)
         parent = dr.select(smooth, slot, parent)
         dr.scatter(store.lengths, number, path, smooth)
@@ -272,7 +272,7 @@ def trace_camera_subpaths(scene, sensor, integrator, lights, traits, weights, se
         wanted = smooth & (dr.max(throughput) > 0)
         if dr.hint(max_depth > 0, mode='scalar'):
             wanted &= depth + 2 <= max_depth
-        slot = _keep(store, junction, si, hit, towards, throughput, path, depth, number, parent, state, weights.states, capacity, wanted)
+        slot = keep_vertex(store, junction, si, hit, towards, throughput, path, depth, number, parent, state, weights.states, capacity, wanted)
         number = dr.select(wanted, number + 1, number)
         parent = dr.select(wanted, slot, parent)
 
