@@ -72,6 +72,12 @@ class ConnectionWeights:
         a_camera = self._nearer([camera[name] for name in self.states], connection.back_at_camera)
         return theory.connection(connection.density_at_light, a_light, connection.density_at_camera, a_camera, self.beta)
 
+    def merged(self, camera, state, back_at_light, back_at_camera):
+        """Weight of merging a camera vertex with a light vertex of that `state` (arguments as of `weigh` of `transport.merging.merge`)."""
+        a_light = theory.nearer(*state, back_at_light, self.beta)
+        a_camera = theory.nearer(camera["near"], camera["far"], back_at_camera, self.beta)
+        return theory.merging(a_light, a_camera, self.eta, self.beta)
+
     def seen_by_sensor(self, connection, light):
         """Weight of a `LensConnection` of a light vertex."""
         a_light = self._nearer([light[name] for name in self.states], connection.back)

@@ -71,7 +71,7 @@ LAMBERTIAN = ("p", "path", "throughput", "density", "ns", "depth", "towards", "n
 
 @dr.syntax
 def list_pairs(traits, weights, camera, camera_count, camera_capacity: int, light, start, order, lengths, max_depth: int, capacity: int, level, seed):
-    """Every camera vertex with every vertex of the light sub-path of its own number, as far as `max_depth` lets them.
+    """Every camera vertex with every vertex of the light sub-path of its own number (modulo theirs), as far as `max_depth` lets them.
 
     Pairs of Lambertian vertices are thinned out by what they would bring if nothing stood between (Russian roulette): those worth less than `level`
     [radiance, channel mean; an array with one number a camera path] stay with a probability in proportion. Returns `(camera places, light
@@ -84,8 +84,9 @@ def list_pairs(traits, weights, camera, camera_count, camera_capacity: int, ligh
     z = read_vertices(camera, index, active, LAMBERTIAN)
     rng = vertex_streams(z["path"], z["number"], seed)
     level = dr.gather(mi.Float, level, z["path"], active)
-    place = dr.gather(mi.UInt32, start, z["path"], active)
-    left = dr.gather(mi.UInt32, lengths, z["path"], active)
+    partner = z["path"] % dr.width(lengths)
+    place = dr.gather(mi.UInt32, start, partner, active)
+    left = dr.gather(mi.UInt32, lengths, partner, active)
 
     while dr.hint(left > 0, label="pairs"):
         vertex = dr.gather(mi.UInt32, order, place)

@@ -185,12 +185,12 @@ def trace_light_subpaths(scene, lights, traits, weights, seed, n_paths: int, cap
 
 @dr.syntax
 def trace_camera_subpaths(scene, sensor, integrator, lights, traits, weights, seed, first, n_paths: int, camera_paths: int, wavelength_sample,
-                          max_depth: int, rr_depth: int, hide_emitters: bool, capacity: int, ledger=None):
+                          max_depth: int, rr_depth: int, hide_emitters: bool, capacity: int, ledger=None, shortest: int = 2):
     """Traces `n_paths` camera paths, numbers `first`, `first + 1`, ... of `film_samples`, with the light that they meet and that next-event estimation
     finds at each smooth vertex, weighted.
 
-    Returns `(radiance, alpha, splat position, vertices, count)`: the kept vertices are those that a light sub-path may be joined with; `count` as in
-    `trace_light_subpaths`. `ledger`, if given, learns every contribution: `met(path, depth, value, share, mask)` and `direct(...)`, with the length
+    Returns `(radiance, alpha, splat position, vertices, count)`: the kept vertices are those that a light sub-path, of at least `shortest` segments with
+    what joins the two, may be joined with; `count` as in `trace_light_subpaths`. `ledger`, if given, learns every contribution: `met(path, depth, value, share, mask)` and `direct(...)`, with the length
     of the joint path in segments, and the weight apart.
     """
     path, active, rng, ray, sensor_weight, splat, aperture = start_camera_paths(sensor, seed, first, 1, n_paths, camera_paths, wavelength_sample)
@@ -268,10 +268,10 @@ def trace_camera_subpaths(scene, sensor, integrator, lights, traits, weights, se
             if dr.hint(ledger is not None, mode='scalar'):
                 ledger.direct(path, depth + 1, light, share, reached)
 
-        # ---- Keep the vertex: a light sub-path needs two more segments
+        # ---- Keep the vertex
         wanted = smooth & (dr.max(throughput) > 0)
         if dr.hint(max_depth > 0, mode='scalar'):
-            wanted &= depth + 2 <= max_depth
+            wanted &= depth + shortest <= max_depth
         slot = keep_vertex(store, junction, si, hit, towards, throughput, path, depth, number, parent, state, weights.states, capacity, wanted)
         number = dr.select(wanted, number + 1, number)
         parent = dr.select(wanted, slot, parent)
