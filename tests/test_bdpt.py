@@ -288,6 +288,18 @@ def test_each_technique_in_a_sphere(rgb):
     assert_each(estimates, lambda st: 0 if st[0] == 0 else rho ** (st[0] + st[1] - 2) * intensity / np.pi, 0.06)
 
 
+def test_no_technique_makes_longer_paths(rgb):
+    """`max_depth` is exact for each of them, whatever its share."""
+    scene = inside_sphere({"light": {"type": "point", "position": [0, 0, 0], "intensity": 2.0}}, diffuse(0.6))
+    for max_depth in (2, 3, 4):
+        session = bdpt(max_depth=max_depth, techniques=5, technique_weights=False).session(scene, 0, 1, 0)
+        session.iterate()
+        image, names = session.image(), session.channels
+        for s, t in technique_names(5):
+            value = image[:, :, names.index(f"technique.s{s}.t{t}.R")].mean()
+            assert (value > 0) == (s > 0 and s + t - 1 <= max_depth), (s, t)
+
+
 def test_each_technique_in_an_emitting_sphere(rgb):
     """Walls of albedo rho that emit L: rho^(k - 1) L for k segments; techniques that meet the light, too."""
     scene = inside_sphere({}, diffuse(0.5), {"type": "area", "radiance": 0.7}, size=32)
@@ -512,14 +524,14 @@ def test_parts_lose_nothing(rgb, monkeypatch):
 
 
 def test_pairs_are_thinned_without_bias(rgb, monkeypatch):
-    scene = box_scene(24)
-    batches = []
-    for thinning in (0, 2.0):
+    """What connections alone bring, with all pairs and with most of them left out, to 5 % (6 standard errors)."""
+    scene, estimates = box_scene(24), []
+    for thinning in (0, 1.0):
         monkeypatch.setattr("mis_integrators.integrators.bdpt.THINNING", thinning)
-        session = SessionBatches(bdpt(), scene, 3, seed=5 + int(thinning))
-        session.add(32)
-        batches.append(session)
-    assert_same(*collect_until(*batches))
+        found = technique_estimates(scene, bdpt(techniques=3, camera_paths=32, max_depth=3), 32)
+        estimates.append(found[2, 2])
+    assert not differences(*estimates)
+    assert 6 * np.sqrt(sum(e.error2[0, 0] for e in estimates)) < 0.05 * estimates[0].mean[0, 0]
 
 
 def test_variance_is_that_of_the_mean(rgb):
