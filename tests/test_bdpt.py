@@ -349,9 +349,8 @@ def test_pyramid_adds_up(rgb):
 DEFAULT = [
     ("rectangle", "mixed0", "perspective", SPECTRAL, "box"),
     ("envmap rotated", "mixed2", "thinlens", RGB, "gaussian"),
-    ("several", "smooth1", "orthographic", RGB, "box"),
+    ("several", "mixed1", "orthographic", RGB, "box"),
     ("textured", "smooth0", "perspective", MONO, "tent"),
-    ("sphere", "mixed1", "perspective", RGB, "box"),
 ]
 
 
@@ -451,13 +450,15 @@ def test_hidden_emitters_and_alpha(rgb, hide):
     assert np.abs(mine - truth).mean() < 0.01
 
 
-@pytest.mark.parametrize("max_depth", [0, 1, 2, 3])
-def test_max_depth(rgb, max_depth):
+def test_max_depth(rgb):
+    """Means of the image and of its quarters, to 2 %; what each depth adds is more."""
     scene = lamp_scene()
-    if max_depth == 0:
-        assert (np.array(mi.render(scene, integrator=bdpt(max_depth=0), spp=16))[:, :, :3] == 0).all()
-    else:
-        agree(bdpt(max_depth=max_depth), path(max_depth=max_depth), scene, block=0.04)
+    means = []
+    for max_depth in range(5):
+        mine, truth = (block_means(np.array(mi.render(scene, integrator=i(max_depth=max_depth), spp=512))[:, :, :3], 2) for i in (bdpt, path))
+        np.testing.assert_allclose(mine, truth, rtol=0.02, atol=1e-6)
+        means.append(truth[0, 0])
+    assert means[0] == 0 and all(b > 1.03 * a for a, b in zip(means, means[1:4]))
 
 
 def test_roulette_and_unlimited_depth_leave_the_mean(rgb):
@@ -492,7 +493,7 @@ def test_seeds_and_iterations(thin_lens_box):
         images.append(count * session.image() - total)
         total = total + images[-1]
     np.testing.assert_allclose(total / 4, render(scene, 7, 4), rtol=1e-4, atol=1e-5)
-    mean = render(scene, 1000, 256).mean(axis=2)
+    mean = render(scene, 1000, 128).mean(axis=2)
     images = [i.mean(axis=2) for i in images] + [render(scene, seed, 1).mean(axis=2) for seed in (8, 9)]
     noise = [(i - mean).ravel() for i in images]
     noise = [np.clip(n, *np.quantile(n, [0.02, 0.98])) for n in noise]
