@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 
 def colour_matrix(wavelengths):
@@ -14,6 +15,16 @@ def colour_matrix(wavelengths):
     count = dr.size_v(mi.Spectrum)
     units = [mi.Spectrum(*[float(i == j) for j in range(count)]) for i in range(count)]
     return [mi.Color3f(mi.spectrum_to_srgb(unit, wavelengths)) for unit in units]
+
+
+def shared_wavelengths(sensor, number):
+    """The wavelengths that all sub-paths of an iteration share, the sample that makes them (from `number`, 32 random bits), and their conversion
+    to colour: a dictionary of opaque arrays `sample`, `wavelengths`, `matrix`."""
+    sample = dr.opaque(mi.Float, number / 2 ** 32)
+    wavelengths, _ = sensor.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), sample)
+    spectral = {"sample": sample, "wavelengths": wavelengths, "matrix": colour_matrix(wavelengths)}
+    dr.make_opaque(spectral)
+    return spectral
 
 
 def colour_channels(radiance, matrix):
@@ -28,14 +39,49 @@ def colour_channels(radiance, matrix):
 def splat_samples(film, position, radiance, alpha, matrix, active):
     """Reconstructs one pass: an image tensor (height, width, channels), border included, that holds sums of filter weight
     times (R, G, B, [alpha,] 1); `matrix` as for `colour_channels`."""
-    channels = 5 if mi.has_flag(film.flags(), mi.FilmFlags.Alpha) else 4
-    block = mi.ImageBlock(film.crop_size(), film.crop_offset(), channels, film.rfilter(), border=True, coalesce=False)
-    colour = colour_channels(radiance, matrix)
-    values = [colour.x, colour.y, colour.z]
+    values = list(colour_channels(radiance, matrix))
     if mi.has_flag(film.flags(), mi.FilmFlags.Alpha):
         values.append(alpha)
-    block.put(position, values + [mi.Float(1)], active)
+    return splat_channels(film, position, values + [mi.Float(1)], active)
+
+
+def splat_channels(film, position, channels, active):
+    """Image tensor (height, width, channels), border included, of sums of filter weight times the values `channels`."""
+    block = mi.ImageBlock(film.crop_size(), film.crop_offset(), len(channels), film.rfilter(), border=True, coalesce=False)
+    block.put(position, channels, active)
     return block.tensor()
+
+
+def expected_weight(film, camera_paths):
+    """Expected sum of filter weights that `camera_paths` samples a pixel leave in each pixel of a block, border included: a tensor (height, width, 1).
+
+    What light sub-paths bring to the sensor is divided by this, not by the weights that the camera's samples happen to have."""
+    rfilter = film.rfilter()
+    radius, border = float(rfilter.radius()), rfilter.border_size()
+    steps = 4096
+    x = (np.arange(steps) + 0.5) * (2 * radius / steps) - radius
+    cumulative = np.concatenate([[0], np.cumsum(np.array(rfilter.eval(mi.Float(x)), dtype=np.float64)) * (2 * radius / steps)])
+    spread = border if film.sample_border() else 0
+
+    def along(size):
+        middle = np.arange(-border, size + border) + 0.5
+        low, high = (np.clip(edge - middle, -radius, radius) for edge in (-spread, size + spread))
+        return np.interp(high, np.linspace(-radius, radius, steps + 1), cumulative) - \
+            np.interp(low, np.linspace(-radius, radius, steps + 1), cumulative)
+
+    width, height = film.crop_size()
+    return mi.TensorXf((camera_paths * np.outer(along(height), along(width)))[:, :, None].astype(np.float32))
+
+
+def as_camera_weights(light, block, expected):
+    """Sums of filter weight times light that meets the sensor (`splat_channels`), times the camera samples' own weights in `block` (`splat_samples`)
+    over the `expected_weight`: then both are divided by the same, and the mean over iterations stays unbiased."""
+    return light * dr.select(expected > 1e-6, block[:, :, -1:] / dr.maximum(expected, 1e-6), 0)
+
+
+def with_colour(block, colour):
+    """A block of camera samples with `colour` (height, width, 3) added to its own."""
+    return dr.concat([block[:, :, :3] + colour, block[:, :, 3:]], axis=2)
 
 
 class Accumulator:
@@ -77,8 +123,9 @@ class Accumulator:
         spread = self.square - 2 * mean * self.cross + mean * mean * self.weight_square
         return dr.maximum(spread, 0) * (n / ((n - 1) * safe * safe))
 
-    def put(self, film):
-        """Writes the accumulated image, with variance channels where kept, into a film prepared with matching AOVs."""
+    def put(self, film, extra=None):
+        """Writes the accumulated image, with variance channels where kept, into a film prepared with matching AOVs. `extra`: a tensor of more
+        channels, summed with the same weights."""
         tensor = self.total
         if self.with_variance:
             weight = tensor[:, :, -1:]
@@ -86,6 +133,8 @@ class Accumulator:
             if mi.is_monochromatic:
                 variance = variance[:, :, :1]
             tensor = dr.concat([tensor, variance], axis=2)
+        if extra is not None:
+            tensor = dr.concat([tensor, extra], axis=2)
         film.put_block(mi.ImageBlock(tensor, film.crop_offset(), film.rfilter(), border=True))
 
 
