@@ -31,7 +31,7 @@ def _activate(variant: str) -> str:
 
 
 def pytest_addoption(parser):
-    parser.addoption("--vectors", metavar="DIR", help="folder with test vectors (optimal_weights.json), used instead of generated worlds")
+    parser.addoption("--vectors", metavar="DIR", help="folder with test vectors (optimal_weights.json, shifts.json), used instead of generated worlds")
 
 
 def pytest_configure(config):
