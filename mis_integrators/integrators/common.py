@@ -39,6 +39,10 @@ class IterativeIntegrator(mi.AdjointIntegrator):
         """The object that runs iterations; see `mis_integrators.session.Session`. Every subclass has its own."""
         raise TypeError(f"{type(self).__name__} does not define new_session")
 
+    def check(self, scene, sensor):
+        """Raises `UnsupportedScene` for a scene that this integrator cannot render."""
+        check_scene(scene, sensor, self.plugin)
+
     def aov_names(self):
         return variance_channels() if self.variance else []
 
@@ -54,9 +58,13 @@ class IterativeIntegrator(mi.AdjointIntegrator):
     def session(self, scene, sensor=0, seed=0, spp=0):
         """Prepares a rendering of `scene` with `spp` camera paths a pixel, or without a planned end if `spp` is 0."""
         sensor = self._sensor(scene, sensor)
-        check_scene(scene, sensor, self.plugin)
+        self.check(scene, sensor)
+        return self.new_session(scene, sensor, _scalar(seed), self.planned_iterations(spp))
+
+    def planned_iterations(self, spp):
+        """Iterations that make `spp` camera paths a pixel; None (no planned end) if `spp` is 0."""
         if not spp:
-            return self.new_session(scene, sensor, _scalar(seed), None)
+            return None
         iterations = math.ceil(spp / self.camera_paths)
         if iterations * self.camera_paths != spp:
             mi.Log(mi.LogLevel.Warn, f"{self.plugin}: {spp} samples per pixel rounded up to {iterations} iterations of "
@@ -64,7 +72,7 @@ class IterativeIntegrator(mi.AdjointIntegrator):
         if self.variance and iterations < 2:
             raise ValueError(f'{self.plugin}: parameter "variance" needs at least two iterations; ask for spp > '
                              f'{self.camera_paths}')
-        return self.new_session(scene, sensor, _scalar(seed), iterations)
+        return iterations
 
     def _sensor(self, scene, sensor):
         check_variant(scene, self.plugin)

@@ -1,0 +1,290 @@
+"""Plugin `volpath_multiview`: volumetric path tracing of several views that use each other's paths."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..transport.film import colour_channels, colour_matrix
+from ..transport.lights import Lights
+from ..transport.random import mix, streams
+from ..transport.recording import recorder
+from ..transport.traits import UnsupportedScene
+from ..volume.films import OWN, SHARED, ViewAccumulator, own_values, splat, write_film
+from ..volume.lines import connect, own_line
+from ..volume.pivots import ON_SURFACE, OWN as OWN_BRANCH, pivot_surface, trace_first_segments
+from ..volume.shifts import SHIFTS
+from ..volume.suffixes import continue_paths, scattered_to
+from ..volume.traits import VolumeTraits, check_volume_scene
+from ..volume.views import Views, views_of
+from ..weights.multiview import HEURISTICS, gain, summand
+from .common import IterativeIntegrator, IterativeSession
+
+PAIRS = 1 << 21
+"""Connections of paths to views that are made at once at most; more are made in parts (bounds memory)."""
+PATHS, WAVELENGTH = range(2)
+"""Purposes of an iteration's random seeds."""
+
+
+class VolpathMultiview(IterativeIntegrator):
+    r"""
+    .. _integrator-volpath_multiview:
+
+    Volumetric path tracing of several views (:monosp:`volpath_multiview`)
+    ----------------------------------------------------------------------
+
+    .. pluginparameters::
+
+     * - shift
+       - |string|
+       - How null interactions are moved from one view's line of sight to another's: ``majorant_optical_depth``, ``raw_depth`` or ``primary_sample``
+         stretch the depth, the same names with ``_copy`` keep it. (Default: ``majorant_optical_depth``)
+     * - weights
+       - |string|
+       - ``mis`` (balance heuristic), ``power`` (power heuristic, exponent 2), ``mwis`` (``mis`` divided by the sum of the weights that arrived
+         at each pixel: consistent, biased at few samples), or ``none`` (the same weight for every view that can make the path: unbiased and
+         noisy, for comparison). (Default: ``mis``)
+     * - camera_paths
+       - |int|
+       - Camera paths per pixel and iteration. (Default: 1)
+     * - variance
+       - |bool|
+       - Adds the channels ``var.R``, ``var.G``, ``var.B`` (mono: ``var.Y``): the estimated variance of the pixel mean over the
+         iterations, of which there must be two at least. (Default: no, i.e. |false|)
+     * - max_depth
+       - |int|
+       - Longest path in segments (-1: unlimited). A value of 1 shows only directly visible emitters, 2 adds single scattering, and so
+         on. (Default: -1)
+     * - rr_depth
+       - |int|
+       - Depth from which Russian roulette may end a path. (Default: 5)
+     * - hide_emitters
+       - |bool|
+       - Hide directly visible emitters. (Default: no, i.e. |false|)
+
+    The views are the children of a ``batch`` sensor, side by side on its film, or one sensor, or any list of sensors through
+    ``mis_integrators.render_views``. Each view's camera paths are traced to the first vertex that scatters, in a medium or on a surface. Every other
+    view that sees it joins there: the null interactions of the first segment are shifted onto its own line of sight, and all views share the rest of the path.
+
+    With the weights ``mis`` the result is unbiased. Perspective and thin lens sensors are supported; polarised variants, gradients and the film
+    ``specfilm`` are refused by name.
+
+    .. tabs::
+        .. code-tab:: xml
+
+            <integrator type="volpath_multiview">
+                <string name="shift" value="majorant_optical_depth"/>
+                <integer name="max_depth" value="64"/>
+            </integrator>
+
+        .. code-tab:: python
+
+            'type': 'volpath_multiview',
+            'shift': 'majorant_optical_depth',
+            'max_depth': 64
+    """
+
+    def read_parameters(self, parameters):
+        self.shift = parameters.choice("shift", "majorant_optical_depth", tuple(SHIFTS))
+        self.weights = parameters.choice("weights", "mis", HEURISTICS)
+
+    def settings(self):
+        return {**super().settings(), "shift": self.shift, "weights": self.weights}
+
+    def check(self, scene, sensor):
+        check_volume_scene(scene, self.plugin)
+        for view in views_of(sensor):
+            Views.check_sensor(view, self.plugin)
+
+    def new_session(self, scene, sensor, seed, iterations):
+        return MultiViewSession(self, scene, sensor, seed, iterations)
+
+    def views_session(self, scene, sensors, seed=0, spp=0):
+        """Prepares a rendering of views that share no film; `sensors` as for `render_views`."""
+        sensors = [view for sensor in sensors for view in views_of(sensor)]
+        check_volume_scene(scene, self.plugin)
+        return MultiViewSession(self, scene, sensors, seed, self.planned_iterations(spp))
+
+
+class MultiViewSession(IterativeSession):
+    """Iterations of `volpath_multiview`: first segments, connections, suffixes, splats.
+
+    `sensor` is a sensor of the scene or a list of sensors. `views` (N), `statistics` (what became of all connections so far, by name).
+    """
+
+    def __init__(self, integrator, scene, sensor, seed, iterations):
+        sensors = sensor if isinstance(sensor, list) else views_of(sensor)
+        super().__init__(integrator, scene, sensor, seed, iterations)
+        self.views = Views(sensors, integrator.camera_paths, integrator.plugin)
+        self.traits = VolumeTraits(scene, sensors)
+        self.lights = Lights(scene, integrator.plugin)
+        self.accumulator = ViewAccumulator(self.views, integrator.variance, integrator.weights == "mwis")
+        self.slots = 1
+        # Whole packets of one view where it can be; a part of the paths at a time.
+        self.paths = min(self.views.paths, max(PAIRS // self.views.count, 1 << 12))
+        self.statistics = {"tried": 0, "reached": 0, "lost": 0}
+        self.recorded = recorder()
+        self._freeze()
+
+    @property
+    def settings(self):
+        return {**super().settings, "views": self.views.count}
+
+    def _freeze(self):
+        """Records the passes anew."""
+        self._tables = [self.views.table, *([] if self.lights.dark else self.lights.tables())]
+        self._first_pass, self._connection_pass, self._suffix_pass, self._splat_pass = map(
+            self.recorded, (self._trace_first, self._connect, self._continue, self._splat))
+
+    # ------------------------------------------------------------------ passes
+
+    def _trace_first(self, scene, tables, number, seed, spectral):
+        integrator = self.integrator
+        active = number < self.views.paths
+        pivot, radiance, rng = trace_first_segments(scene, self.views, self.traits, number, seed, streams(number, seed), spectral["sample"],
+                                                    integrator.hide_emitters, active)
+        line, found = {}, mi.UInt32(0)
+        if self.views.count > 1:
+            shared = active & pivot["in_window"] & (pivot["branch"] != OWN_BRANCH)
+            line, found = own_line(scene, self.views, self.traits, pivot, self.slots, integrator.hide_emitters, shared)
+        return pivot, radiance, line, dr.max(found)
+
+    def _connect(self, scene, tables, pivots, lines, numbers, seed):
+        q = dr.arange(mi.UInt32, self.paths * self.views.count)
+        view, path = q // self.paths, q % self.paths
+        pivot, line = (dr.gather(type(record), record, path) if not isinstance(record, dict) else _gather(record, path) for record in (pivots, lines))
+        number = dr.gather(mi.UInt32, numbers, path)
+        active = (number < self.views.paths) & (view != pivot["view"])
+        connection, found = connect(scene, self.views, self.traits, SHIFTS[self.integrator.shift], pivot, line, view, number, seed, self.slots,
+                                    self.integrator.hide_emitters, active)
+        return connection, dr.max(found)
+
+    def _continue(self, scene, tables, pivot, connections, number, seed):
+        integrator = self.integrator
+        return continue_paths(scene, self.lights, self.traits, partial(summand, integrator.weights), pivot, connections, number, seed, self.views.count,
+                              integrator.max_depth, integrator.rr_depth, number < self.views.paths)
+
+    def _splat(self, scene, tables, pivots, radiance, connections, suffixes, value, numbers, spectral):
+        views, weights, matrix = self.views, self.integrator.weights, spectral["matrix"]
+        active = numbers < views.paths
+        own = own_values(radiance, pivots["visible"], value, gain(weights, mi.Float(1), suffixes["total"]), suffixes["alone"], matrix)
+        image = splat(views, [(pivots["view"], pivots["position"], own)], OWN + SHARED, [active])
+        if views.count == 1:
+            return image[:, :, :OWN], image[:, :, OWN:]
+        q = dr.arange(mi.UInt32, self.paths * views.count)
+        view, path = q // self.paths, q % self.paths
+        pivot, suffix = _gather(pivots, path), _gather(suffixes, path)
+        # The path's own view was served above.
+        reached = (connections["ratio"] > 0) & ~suffix["alone"]
+        surface = pivot_surface(pivot, reached & (pivot["kind"] == ON_SURFACE))
+        brought = scattered_to(suffix, pivot, surface, connections["d"], reached) * connections["tint"]
+        weight = gain(weights, connections["ratio"], suffix["total"])
+        colour = colour_channels(brought * weight, matrix)
+        shared = splat(views, [(view, connections["position"], [*colour, weight])], SHARED, [reached])
+        return image[:, :, :OWN], image[:, :, OWN:] + shared
+
+    # ------------------------------------------------------------------ iterations
+
+    def _spectral(self, iteration):
+        """The wavelengths that all paths of an iteration share, and their conversion to colour."""
+        sample = dr.opaque(mi.Float, mix(self.seed, iteration, WAVELENGTH) / 2 ** 32)
+        wavelengths, _ = self.views.sensors[0].sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), sample)
+        spectral = {"sample": sample, "matrix": colour_matrix(wavelengths)}
+        dr.make_opaque(spectral)
+        return spectral
+
+    def iterate(self):
+        """Runs one iteration to its end."""
+        with dr.suspend_grad():
+            seed, spectral = self._seed(self.iterations, PATHS), self._spectral(self.iterations)
+            layers = [self._part(first, seed, spectral) for first in range(0, self.views.paths, self.paths)]
+            self.accumulator.add(*(sum(layer[1:], layer[0]) for layer in zip(*layers)))
+            dr.eval(self.accumulator.own, self.accumulator.shared)
+            dr.sync_thread()
+
+    def _part(self, first, seed, spectral):
+        """One part of an iteration: its own and its shared layer."""
+        numbers = dr.arange(mi.UInt32, self.paths) + dr.opaque(mi.UInt32, first)
+        dr.eval(numbers)
+        while True:
+            pivots, radiance, lines, found = self._first_pass(self.scene, self._tables, numbers, seed, spectral)
+            connections = None
+            if self.views.count > 1:
+                dr.eval(pivots, radiance, lines, found)
+                connections, more = self._connection_pass(self.scene, self._tables, pivots, lines, numbers, seed)
+                dr.eval(connections, more)
+                found = dr.maximum(found, more)
+            needed = int(found[0])
+            if needed <= self.slots:
+                break
+            self.slots = needed
+            self._freeze()
+        if connections is not None:
+            self._count(connections["ratio"])
+        suffixes, value = self._suffix_pass(self.scene, self._tables, pivots, connections, numbers, seed)
+        dr.eval(suffixes, value)
+        own, shared = self._splat_pass(self.scene, self._tables, pivots, radiance, connections, suffixes, value, numbers, spectral)
+        dr.eval(own, shared)
+        return own, shared
+
+    def _count(self, ratio):
+        reached, lost = dr.count(ratio > 0), dr.count(ratio < 0)
+        self.statistics["tried"] += dr.width(ratio) - self.paths
+        self.statistics["reached"] += int(reached[0]) if hasattr(reached, "__len__") else int(reached)
+        self.statistics["lost"] += int(lost[0]) if hasattr(lost, "__len__") else int(lost)
+
+    # ------------------------------------------------------------------ results
+
+    def view_images(self):
+        """The images so far, one a view: float32, (height, width, channels)."""
+        return [np.array(tensor, dtype=np.float32) for tensor in self.view_tensors()]
+
+    def view_tensors(self):
+        """The images so far, one tensor a view, developed by the view's own film."""
+        developed = []
+        for sensor, picture in zip(self.views.sensors, self.accumulator.pictures()):
+            film = sensor.film()
+            self._fill(film, picture)
+            developed.append(film.develop())
+        return developed
+
+    def _fill(self, film, picture):
+        film.clear()
+        film.prepare(self.integrator.aov_names())
+        write_film(film, picture)
+
+    def fill_film(self):
+        """Hands what has been rendered so far to the sensor's film, side by side for a `batch`."""
+        pictures = self.accumulator.pictures()
+        self._fill(self.sensor.film(), pictures[0] if len(pictures) == 1 else dr.concat(pictures, axis=1))
+
+
+def _gather(record, index):
+    """The entries `index` of every array of a dictionary (and of lists in it)."""
+    return {name: [dr.gather(type(v), v, index) for v in value] if isinstance(value, list) else dr.gather(type(value), value, index)
+            for name, value in record.items()}
+
+
+def render_views(scene, integrator=None, spp=0, seed=0):
+    """Renders all views of `scene` together: the children of its `batch` sensors, and its other sensors, in their order.
+
+    `integrator` is a `volpath_multiview` (default: the scene's own if it is one, else one with its default parameters), `spp` the samples per pixel (0:
+    those of the first sensor's sampler). Returns a list of tensors (height, width, channels), one a view, as each view's film develops
+    it; films may differ in size. Raises `UnsupportedScene` for what cannot be rendered.
+    """
+    if integrator is None:
+        own = scene.integrator()
+        integrator = own if hasattr(own, "views_session") else mi.load_dict({"type": "volpath_multiview"})
+    if not hasattr(integrator, "views_session"):
+        raise UnsupportedScene(f"render_views: the integrator must be a volpath_multiview, not {integrator.class_name()}")
+    sensors = scene.sensors()
+    if not sensors:
+        raise UnsupportedScene(f"{integrator.plugin}: the scene has no sensor")
+    with dr.suspend_grad():
+        session = integrator.views_session(scene, sensors, seed, spp or sensors[0].sampler().sample_count())
+        for _ in range(session.iterations_planned):
+            session.iterate()
+        return session.view_tensors()
