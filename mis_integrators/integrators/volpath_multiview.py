@@ -6,7 +6,6 @@ from functools import partial
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from ..transport.film import colour_channels, colour_matrix
 from ..transport.lights import Lights
@@ -19,7 +18,7 @@ from ..volume.pivots import ON_SURFACE, OWN as OWN_BRANCH, pivot_surface, trace_
 from ..volume.shifts import SHIFTS
 from ..volume.suffixes import continue_paths, scattered_to
 from ..volume.traits import VolumeTraits, check_volume_scene
-from ..volume.views import Views, views_of
+from ..volume.views import Views
 from ..weights.multiview import HEURISTICS, gain, summand
 from .common import IterativeIntegrator, IterativeSession
 
@@ -96,38 +95,43 @@ class VolpathMultiview(IterativeIntegrator):
 
     def check(self, scene, sensor):
         check_volume_scene(scene, self.plugin)
-        for view in views_of(sensor):
-            Views.check_sensor(view, self.plugin)
+        Views.check_sensor(sensor, self.plugin)
 
     def new_session(self, scene, sensor, seed, iterations):
-        return MultiViewSession(self, scene, sensor, seed, iterations)
+        return MultiViewSession(self, scene, [sensor], seed, iterations)
 
-    def views_session(self, scene, sensors, seed=0, spp=0):
-        """Prepares a rendering of views that share no film; `sensors` as for `render_views`."""
-        sensors = [view for sensor in sensors for view in views_of(sensor)]
+    def views_session(self, scene, seed=0, spp=0):
+        """Prepares a rendering of all views of a scene; see `render_views`."""
         check_volume_scene(scene, self.plugin)
-        return MultiViewSession(self, scene, sensors, seed, self.planned_iterations(spp))
+        if not scene.sensors():
+            raise UnsupportedScene(f"{self.plugin}: the scene has no sensor")
+        return MultiViewSession(self, scene, scene.sensors(), seed, self.planned_iterations(spp))
 
 
 class MultiViewSession(IterativeSession):
     """Iterations of `volpath_multiview`: first segments, connections, suffixes, splats.
 
-    `sensor` is a sensor of the scene or a list of sensors. `views` (N), `statistics` (what became of all connections so far, by name).
+    `sensors` are sensors of the scene, alone or batches; films and images of the session itself are the first one's. Attributes: `views`
+    and `statistics`: connections `tried` so far, how many `reached` their view, and how many a shift has `lost`.
     """
 
-    def __init__(self, integrator, scene, sensor, seed, iterations):
-        sensors = sensor if isinstance(sensor, list) else views_of(sensor)
-        super().__init__(integrator, scene, sensor, seed, iterations)
+    def __init__(self, integrator, scene, sensors, seed, iterations):
+        super().__init__(integrator, scene, sensors[0], seed, iterations)
         self.views = Views(sensors, integrator.camera_paths, integrator.plugin)
         self.traits = VolumeTraits(scene, sensors)
         self.lights = Lights(scene, integrator.plugin)
-        self.accumulator = ViewAccumulator(self.views, integrator.variance, integrator.weights == "mwis")
+        self.restart(seed)
         self.slots = 1
         # Whole packets of one view where it can be; a part of the paths at a time.
         self.paths = min(self.views.paths, max(PAIRS // self.views.count, 1 << 12))
-        self.statistics = {"tried": 0, "reached": 0, "lost": 0}
         self.recorded = recorder()
         self._freeze()
+
+    def restart(self, seed):
+        """Forgets what has been rendered, and goes on with another seed."""
+        self.seed = seed
+        self.accumulator = ViewAccumulator(self.views, self.integrator.variance, self.integrator.weights == "mwis")
+        self.statistics = {"tried": 0, "reached": 0, "lost": 0}
 
     @property
     def settings(self):
@@ -144,13 +148,13 @@ class MultiViewSession(IterativeSession):
     def _trace_first(self, scene, tables, number, seed, spectral):
         integrator = self.integrator
         active = number < self.views.paths
-        pivot, radiance, rng = trace_first_segments(scene, self.views, self.traits, number, seed, streams(number, seed), spectral["sample"],
-                                                    integrator.hide_emitters, active)
+        pivot, radiance, rng = trace_first_segments(scene, self.views, self.traits, number, seed, streams(number, seed), spectral["wavelengths"],
+                                                    spectral["weight"], integrator.hide_emitters, active)
         line, found = {}, mi.UInt32(0)
         if self.views.count > 1:
             shared = active & pivot["in_window"] & (pivot["branch"] != OWN_BRANCH)
             line, found = own_line(scene, self.views, self.traits, pivot, self.slots, integrator.hide_emitters, shared)
-        return pivot, radiance, line, dr.max(found)
+        return pivot, radiance, line, found
 
     def _connect(self, scene, tables, pivots, lines, numbers, seed):
         q = dr.arange(mi.UInt32, self.paths * self.views.count)
@@ -160,7 +164,7 @@ class MultiViewSession(IterativeSession):
         active = (number < self.views.paths) & (view != pivot["view"])
         connection, found = connect(scene, self.views, self.traits, SHIFTS[self.integrator.shift], pivot, line, view, number, seed, self.slots,
                                     self.integrator.hide_emitters, active)
-        return connection, dr.max(found)
+        return connection, found
 
     def _continue(self, scene, tables, pivot, connections, number, seed):
         integrator = self.integrator
@@ -171,9 +175,9 @@ class MultiViewSession(IterativeSession):
         views, weights, matrix = self.views, self.integrator.weights, spectral["matrix"]
         active = numbers < views.paths
         own = own_values(radiance, pivots["visible"], value, gain(weights, mi.Float(1), suffixes["total"]), suffixes["alone"], matrix)
-        image = splat(views, [(pivots["view"], pivots["position"], own)], OWN + SHARED, [active])
+        image = splat(views, [(pivots["view"], pivots["position"], own)], SHARED + OWN, [active])
         if views.count == 1:
-            return image[:, :, :OWN], image[:, :, OWN:]
+            return image[:, :, :SHARED], image[:, :, SHARED:]
         q = dr.arange(mi.UInt32, self.paths * views.count)
         view, path = q // self.paths, q % self.paths
         pivot, suffix = _gather(pivots, path), _gather(suffixes, path)
@@ -184,15 +188,15 @@ class MultiViewSession(IterativeSession):
         weight = gain(weights, connections["ratio"], suffix["total"])
         colour = colour_channels(brought * weight, matrix)
         shared = splat(views, [(view, connections["position"], [*colour, weight])], SHARED, [reached])
-        return image[:, :, :OWN], image[:, :, OWN:] + shared
+        return image[:, :, :SHARED] + shared, image[:, :, SHARED:]
 
     # ------------------------------------------------------------------ iterations
 
     def _spectral(self, iteration):
         """The wavelengths that all paths of an iteration share, and their conversion to colour."""
         sample = dr.opaque(mi.Float, mix(self.seed, iteration, WAVELENGTH) / 2 ** 32)
-        wavelengths, _ = self.views.sensors[0].sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), sample)
-        spectral = {"sample": sample, "matrix": colour_matrix(wavelengths)}
+        wavelengths, weight = self.views.sensors[0].sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), sample)
+        spectral = {"wavelengths": wavelengths, "weight": weight, "matrix": colour_matrix(wavelengths)}
         dr.make_opaque(spectral)
         return spectral
 
@@ -202,11 +206,11 @@ class MultiViewSession(IterativeSession):
             seed, spectral = self._seed(self.iterations, PATHS), self._spectral(self.iterations)
             layers = [self._part(first, seed, spectral) for first in range(0, self.views.paths, self.paths)]
             self.accumulator.add(*(sum(layer[1:], layer[0]) for layer in zip(*layers)))
-            dr.eval(self.accumulator.own, self.accumulator.shared)
+            dr.eval(self.accumulator.shared, self.accumulator.own)
             dr.sync_thread()
 
     def _part(self, first, seed, spectral):
-        """One part of an iteration: its own and its shared layer."""
+        """One part of an iteration: its layers."""
         numbers = dr.arange(mi.UInt32, self.paths) + dr.opaque(mi.UInt32, first)
         dr.eval(numbers)
         while True:
@@ -216,7 +220,7 @@ class MultiViewSession(IterativeSession):
                 dr.eval(pivots, radiance, lines, found)
                 connections, more = self._connection_pass(self.scene, self._tables, pivots, lines, numbers, seed)
                 dr.eval(connections, more)
-                found = dr.maximum(found, more)
+                found = dr.maximum(dr.max(found), dr.max(more))
             needed = int(found[0])
             if needed <= self.slots:
                 break
@@ -226,40 +230,40 @@ class MultiViewSession(IterativeSession):
             self._count(connections["ratio"])
         suffixes, value = self._suffix_pass(self.scene, self._tables, pivots, connections, numbers, seed)
         dr.eval(suffixes, value)
-        own, shared = self._splat_pass(self.scene, self._tables, pivots, radiance, connections, suffixes, value, numbers, spectral)
-        dr.eval(own, shared)
-        return own, shared
+        layers = self._splat_pass(self.scene, self._tables, pivots, radiance, connections, suffixes, value, numbers, spectral)
+        dr.eval(layers)
+        return layers
 
     def _count(self, ratio):
-        reached, lost = dr.count(ratio > 0), dr.count(ratio < 0)
+        reached, lost = (dr.sum(dr.select(kind, mi.UInt32(1), mi.UInt32(0))) for kind in (ratio > 0, ratio < 0))
         self.statistics["tried"] += dr.width(ratio) - self.paths
-        self.statistics["reached"] += int(reached[0]) if hasattr(reached, "__len__") else int(reached)
-        self.statistics["lost"] += int(lost[0]) if hasattr(lost, "__len__") else int(lost)
+        self.statistics["reached"] += int(reached[0])
+        self.statistics["lost"] += int(lost[0])
 
     # ------------------------------------------------------------------ results
 
-    def view_images(self):
-        """The images so far, one a view: float32, (height, width, channels)."""
-        return [np.array(tensor, dtype=np.float32) for tensor in self.view_tensors()]
-
     def view_tensors(self):
-        """The images so far, one tensor a view, developed by the view's own film."""
-        developed = []
-        for sensor, picture in zip(self.views.sensors, self.accumulator.pictures()):
-            film = sensor.film()
-            self._fill(film, picture)
-            developed.append(film.develop())
-        return developed
+        """The images so far, one tensor a view, as films develop them."""
+        images, first = [], 0
+        pictures = self.accumulator.pictures()
+        for sensor, members in zip(self.views.groups, self.views.members):
+            image = self._fill(sensor.film(), pictures[first:first + members]).develop()
+            width = self.views.sizes[first][0]
+            images += [image[:, i * width:(i + 1) * width] for i in range(members)]
+            first += members
+        dr.eval(images)
+        return images
 
-    def _fill(self, film, picture):
+    def _fill(self, film, pictures):
+        """Writes pictures side by side into a film."""
         film.clear()
         film.prepare(self.integrator.aov_names())
-        write_film(film, picture)
+        write_film(film, pictures[0] if len(pictures) == 1 else dr.concat(pictures, axis=1))
+        return film
 
     def fill_film(self):
         """Hands what has been rendered so far to the sensor's film, side by side for a `batch`."""
-        pictures = self.accumulator.pictures()
-        self._fill(self.sensor.film(), pictures[0] if len(pictures) == 1 else dr.concat(pictures, axis=1))
+        self._fill(self.sensor.film(), self.accumulator.pictures()[:self.views.members[0]])
 
 
 def _gather(record, index):
@@ -272,7 +276,7 @@ def render_views(scene, integrator=None, spp=0, seed=0):
     """Renders all views of `scene` together: the children of its `batch` sensors, and its other sensors, in their order.
 
     `integrator` is a `volpath_multiview` (default: the scene's own if it is one, else one with its default parameters), `spp` the samples per pixel (0:
-    those of the first sensor's sampler). Returns a list of tensors (height, width, channels), one a view, as each view's film develops
+    the most that a sensor's sampler asks for). Returns a list of tensors (height, width, channels), one a view, as each view's film develops
     it; films may differ in size. Raises `UnsupportedScene` for what cannot be rendered.
     """
     if integrator is None:
@@ -280,11 +284,9 @@ def render_views(scene, integrator=None, spp=0, seed=0):
         integrator = own if hasattr(own, "views_session") else mi.load_dict({"type": "volpath_multiview"})
     if not hasattr(integrator, "views_session"):
         raise UnsupportedScene(f"render_views: the integrator must be a volpath_multiview, not {integrator.class_name()}")
-    sensors = scene.sensors()
-    if not sensors:
-        raise UnsupportedScene(f"{integrator.plugin}: the scene has no sensor")
     with dr.suspend_grad():
-        session = integrator.views_session(scene, sensors, seed, spp or sensors[0].sampler().sample_count())
+        spp = spp or max((sensor.sampler().sample_count() for sensor in scene.sensors()), default=1)
+        session = integrator.views_session(scene, seed, spp)
         for _ in range(session.iterations_planned):
             session.iterate()
         return session.view_tensors()

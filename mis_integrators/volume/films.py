@@ -1,7 +1,9 @@
 """Pictures of several views: samples splatted into one common image, sums over iterations, and each view's own film at the end.
 
-A picture has two layers. What a view's own paths bring alone is divided by the sum of its own filter weights, as everywhere in Mitsuba. What views share
-arrives anywhere on the film; it is divided by the expected sum of filter weights, or (MWIS) by the sum of the weights of what arrived.
+A sample comes with a weight: one for a path that its own view traces alone, and for paths that views share the share that each view has in them. The
+weights' expected sum at a pixel, W, is known; their actual sum D fluctuates with the number of samples that happen to arrive, and so does the sum Y of the
+weighted values. What both have in common is taken away without bias: the even iterations' m = Y/D is independent of the odd iterations' sums, so
+Y + m (W - D) has the expectation of Y, and the noise of Y - m D. (Or Y/D itself: MWIS.)
 """
 
 from __future__ import annotations
@@ -12,10 +14,10 @@ import numpy as np
 
 from ..transport.film import colour_channels
 
-OWN = 5
-"""Channels of the own layer: colour, alpha, weight."""
 SHARED = 4
-"""Channels of the shared layer: colour, weight."""
+"""Channels of what all paths bring: colour, weight."""
+OWN = 5
+"""Channels of what a view's own paths bring besides: colour of emitters seen directly where the path is shared, alpha, filter weight."""
 
 
 def splat(views, block, channels, active):
@@ -27,10 +29,11 @@ def splat(views, block, channels, active):
 
 
 def own_values(radiance, visible, value, weight, alone, matrix):
-    """Channels of a camera path: own layer, then its part of the shared layer. `value` is what the path brings by its suffix, `weight` its weight there."""
-    lonely = colour_channels(radiance + dr.select(alone, value, 0), matrix)
-    joint = colour_channels(dr.select(alone, 0, value * weight), matrix)
-    return [*lonely, visible, mi.Float(1), *joint, dr.select(alone, 1, weight)]
+    """The channels of a camera path, `SHARED` and then `OWN`: `radiance` is what it saw on the way to its pivot, `value` what it brings from there, and
+    `weight` its share, one if its view is `alone`."""
+    brought = colour_channels(dr.select(alone, radiance + value, value * weight), matrix)
+    seen = colour_channels(dr.select(alone, 0, radiance), matrix)
+    return [*brought, dr.select(alone, 1, weight), *seen, visible, mi.Float(1)]
 
 
 def expected_weights(views):
@@ -57,64 +60,65 @@ def _line_weights(rfilter, size, border, steps=512):
 class ViewAccumulator:
     """Sums of the iterations' common images and, for the variance, of their squares. Its size does not grow with iterations.
 
-    `ratio`: the shared layer is divided by the sum of its own weights (MWIS) instead of their expectation.
+    `ratio`: pictures are Y/D (MWIS).
     """
 
     def __init__(self, views, with_variance, ratio):
         self.views, self.with_variance, self.ratio = views, with_variance, ratio
         self.expected = expected_weights(views) * views.camera_paths
         self.iterations = 0
-        self.own = self.shared = self.square = self.cross = self.weight_square = self.sum = None
+        self.shared = self.own = self.square = self.cross = self.weight_square = None
 
-    def add(self, own, shared):
-        """Adds one iteration's layers, tensors (height, width, `OWN`) and (height, width, `SHARED`)."""
+    def add(self, shared, own):
+        """Adds one iteration's layers, tensors (height, width, `SHARED`) and (height, width, `OWN`)."""
         if self.iterations == 0:
-            self.own, self.shared = dr.zeros(mi.TensorXf, own.shape), dr.zeros(mi.TensorXf, shared.shape)
             height, width, _ = own.shape
+            self.own = dr.zeros(mi.TensorXf, own.shape)
+            self.shared = [dr.zeros(mi.TensorXf, shared.shape) for _ in range(2)]
             if self.with_variance:
-                self.sum, self.square, self.cross = (dr.zeros(mi.TensorXf, (height, width, 3)) for _ in range(3))
+                self.square, self.cross = (dr.zeros(mi.TensorXf, (height, width, 3)) for _ in range(2))
                 self.weight_square = dr.zeros(mi.TensorXf, (height, width, 1))
         self.own += own
-        self.shared += shared
+        self.shared[self.iterations % 2] += shared
         if self.with_variance:
-            colour, weight = own[:, :, :3] * self._scale(own[:, :, 4:], 1) + shared[:, :, :3], shared[:, :, 3:]
-            self.sum += colour
+            colour, weight = shared[:, :, :3], shared[:, :, 3:]
             self.square += colour * colour
             self.cross += colour * weight
             self.weight_square += weight * weight
         self.iterations += 1
-        dr.schedule(self.own, self.shared, self.sum, self.square, self.cross, self.weight_square)
+        dr.schedule(self.own, self.shared, self.square, self.cross, self.weight_square)
 
-    def _scale(self, weight, iterations):
-        """What turns sums over a view's own paths into sums of the expected weight."""
-        expected = self.expected * iterations
-        return dr.select(weight > 0.05 * expected, expected / weight, 1)
+    def _mean(self, shared):
+        """Y/D, zero where nothing arrived."""
+        weight = shared[:, :, 3:]
+        return dr.select(weight > 0.01 * self.expected, shared[:, :, :3] / dr.select(weight > 0, weight, 1), 0)
 
-    def _divisor(self):
-        """What the shared layer is divided by, over the number of iterations."""
-        if not self.ratio:
-            return self.expected
-        weight = self.shared[:, :, 3:] / self.iterations
-        return dr.select(weight > 0, weight, 1)
+    def _colour(self):
+        even, odd = self.shared
+        n = self.iterations
+        if self.ratio:
+            return self._mean(even + odd)
+        total = even[:, :, :3] + odd[:, :, :3]
+        for mine, other, count in ((even, odd, (n + 1) // 2), (odd, even, n // 2)):
+            total += self._mean(other) * (self.expected * count - mine[:, :, 3:])
+        return total / (self.expected * n)
 
     def picture(self):
         """The common image so far (height, width, 5): colour, alpha, 1."""
-        n = self.iterations
-        scale = self._scale(self.own[:, :, 4:], n) / (self.expected * n)
-        colour = self.own[:, :, :3] * scale + self.shared[:, :, :3] / (self._divisor() * n)
-        return dr.concat([colour, self.own[:, :, 3:4] * scale, dr.ones(mi.TensorXf, (*colour.shape[:2], 1))], axis=2)
+        weight = self.own[:, :, 4:]
+        weight = dr.select(weight > 0, weight, 1)
+        return dr.concat([self._colour() + self.own[:, :, :3] / weight, self.own[:, :, 3:4] / weight,
+                          dr.ones(mi.TensorXf, self.own.shape[:2] + (1,))], axis=2)
 
     def variance(self):
-        """Estimated variance of each pixel's mean (height, width, 3) from the iterations. With a ratio, by the delta method: of colour - m weight, m the
-        mean of the shared layer."""
-        n, divisor = self.iterations, self._divisor()
-        if not self.ratio:
-            spread = self.square - self.sum * self.sum / n
-        else:
-            mean = self.shared[:, :, :3] / (divisor * n)
-            rest = self.sum - mean * self.shared[:, :, 3:]
-            spread = self.square - 2 * mean * self.cross + mean * mean * self.weight_square - rest * rest / n
-        return dr.maximum(spread, 0) / (n * (n - 1) * divisor * divisor)
+        """Estimated variance of each pixel's mean (height, width, 3) from the iterations: that of Y - m D over W, or over the mean of D (delta method).
+        The noise of emitters seen directly, if any, is not in it."""
+        n, total = self.iterations, self.shared[0] + self.shared[1]
+        mean = self._mean(total)
+        rest = total[:, :, :3] - mean * total[:, :, 3:]
+        spread = self.square - 2 * mean * self.cross + mean * mean * self.weight_square - rest * rest / n
+        divisor = total[:, :, 3:] / n if self.ratio else self.expected
+        return dr.maximum(spread, 0) / (n * (n - 1) * dr.square(dr.select(divisor > 0, divisor, 1)))
 
     def pictures(self):
         """Each view's picture (height, width, channels): colour, alpha, weight one, then variances where kept."""

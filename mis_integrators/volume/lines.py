@@ -99,9 +99,7 @@ def own_line(scene, views, traits, pivot, slots, hide_emitters, active):
     `log_probability`, in the domain where null interactions have unit density (see `shifts`)."""
     active = active & (pivot["kind"] != NOWHERE)
     surface = pivot_surface(pivot, active & (pivot["kind"] == ON_SURFACE))
-    it = dr.zeros(mi.Interaction3f)
-    it.p, it.time, it.wavelengths = pivot["p"], pivot["time"], pivot["wavelengths"]
-    d, distance, density, _ = views.connect(pivot["view"], it, pivot["aperture"], active)
+    d, distance, density, _ = views.connect(pivot["view"], pivot["p"], pivot["aperture"], active)
     sees = active & (density > 0)
     clear, sections, _, found, _, _ = line_of_sight(scene, pivot, surface, d, distance, slots, hide_emitters, sees)
     density, _ = arrival(pivot, surface, d, density, traits, active)
@@ -122,9 +120,7 @@ def connect(scene, views, traits, shift, pivot, line, view, number, seed, slots:
     - `d`: direction from the pivot to the view; `position`: on the view's film.
     """
     surface = pivot_surface(pivot, active & (pivot["kind"] == ON_SURFACE))
-    it = dr.zeros(mi.Interaction3f)
-    it.p, it.time, it.wavelengths = pivot["p"], pivot["time"], pivot["wavelengths"]
-    d, distance, density, position = views.connect(view, it, pivot["aperture"], active)
+    d, distance, density, position = views.connect(view, pivot["p"], pivot["aperture"], active)
     active = active & (density > 0) & (line["density"] > 0)
     clear, target, media, found, tint, log_passed = line_of_sight(scene, pivot, surface, d, distance, slots, hide_emitters, active)
     active &= clear
@@ -137,7 +133,8 @@ def connect(scene, views, traits, shift, pivot, line, view, number, seed, slots:
     tau = mi.Float(0)
     left = mi.UInt32(pivot["nulls"])
     lost = mi.Bool(False)                            # the shift has no place for an interaction
-    empty = mi.Bool(False)                           # it has, but there is no null interaction there
+    empty = mi.Bool(False)                           # no medium, or no null interaction where the shift puts it
+    has_media = total_optical_depth(target) > 0
     shifting = active & (left > 0)
     if dr.hint(traits.has_null_media, mode='scalar'):
         while dr.hint(shifting, label="shifts"):
@@ -150,7 +147,9 @@ def connect(scene, views, traits, shift, pivot, line, view, number, seed, slots:
                 here = (shifted.t >= target.tmin[slot]) & (shifted.t <= target.tmax[slot]) & (target.majorant[slot] > 0)
                 medium = dr.select(here, media[slot], medium)
                 majorant = dr.select(here, target.majorant[slot], majorant)
-            lost |= shifting & ~shifted.valid
+            failed = shifting & ~shifted.valid
+            lost |= failed & has_media
+            empty |= failed & ~has_media
             evaluated = shifting & shifted.valid
             null, _, probability = collision(medium, pivot["p"] + d * (distance - shifted.t), majorant, pivot["time"], pivot["wavelengths"], evaluated)
             empty |= evaluated & (probability <= 0)

@@ -35,7 +35,7 @@ def passing(bsdf, surface, active):
 
 
 @dr.syntax
-def trace_first_segments(scene, views, traits, number, seed, rng, wavelength_sample, hide_emitters: bool, active):
+def trace_first_segments(scene, views, traits, number, seed, rng, wavelengths, sensor_weight, hide_emitters: bool, active):
     """Traces camera paths to their pivots.
 
     Media scatter by delta tracking against their majorants, null surfaces let paths pass with the mean of their transmission, and what stops is a
@@ -49,7 +49,7 @@ def trace_first_segments(scene, views, traits, number, seed, rng, wavelength_sam
     - `log_passed`: logarithm of the probabilities with which it passed null interactions and null surfaces; `nulls`: how many null interactions;
     - `visible`: what the alpha channel shows.
     """
-    view, ray, sensor_weight, position, aperture, in_window = views.sample(number, wavelength_sample, rng, active)
+    view, ray, position, aperture, in_window = views.sample(number, wavelengths, rng, active)
     ray = mi.Ray3f(ray)
     medium = views.medium(view, active)
     gaps = null_stream(number, seed)

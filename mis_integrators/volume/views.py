@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -36,19 +38,68 @@ def _pointers(objects, pointer_type):
     return mi.UInt32([int(dr.reinterpret_array(mi.UInt32, pointer_type(o))[0]) if o is not None else 0 for o in objects])
 
 
+CAMERA = ("origin", "forward", "corner", "across", "down", "across_dual", "down_dual", "area", "lens_x", "lens_y", "focus", "near", "far")
+
+
+@dataclass
+class Camera:
+    """A perspective or thin lens camera as vectors in world space. The film's image at unit depth has the `corner` (from the `origin`) and the edges
+    `across` and `down`, whose dual basis turns points there into film coordinates in [0, 1]^2; it covers the `area`. `lens_x` and `lens_y` are half
+    axes of the lens, sharp at depth `focus`; `near` and `far` are depths.
+
+    Mitsuba's sensors are not asked while rendering: calls through arrays of sensors reach the batch, too, which remembers what it last saw.
+    """
+
+    origin: np.ndarray
+    forward: np.ndarray
+    corner: np.ndarray
+    across: np.ndarray
+    down: np.ndarray
+    across_dual: np.ndarray
+    down_dual: np.ndarray
+    area: float
+    lens_x: np.ndarray
+    lens_y: np.ndarray
+    focus: float
+    near: float
+    far: float
+
+    @staticmethod
+    def of(sensor):
+        """Reads a sensor; where its film lies is learned from three of its rays, so that all its parameters count."""
+        matrix = np.array(sensor.world_transform().matrix, dtype=np.float64).reshape(4, 4)
+        axes = matrix[:3, :3] / np.linalg.norm(matrix[:3, :3], axis=0)
+        ray, _ = sensor.sample_ray(mi.Float(sensor.shutter_open()), mi.Float(0.5), mi.Point2f([0, 1, 0], [0, 0, 1]), mi.Point2f(0.5))
+        d = np.array(ray.d, dtype=np.float64).reshape(3, 3)
+        corners = d / (axes[:, 2] @ d)
+        across, down = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+        dual = np.linalg.pinv(np.stack([across, down], axis=1))
+        parameters = mi.traverse(sensor)
+        lens, focus = (float(parameters[name]) if name in parameters else value for name, value in (("aperture_radius", 0), ("focus_distance", 1)))
+        return Camera(matrix[:3, 3], axes[:, 2], corners[:, 0], across, down, dual[0], dual[1], float(np.linalg.norm(np.cross(across, down))),
+                      lens * axes[:, 0], lens * axes[:, 1], focus, float(parameters["near_clip"]), float(parameters["far_clip"]))
+
+
 class Views:
     """N views in one list, paths numbered view by view, pixel by pixel.
 
-    Attributes: `sensors`, `count` (N), `sizes` (N pairs, cropped width and height), `paths` (camera paths an iteration), `rfilter`.
+    They are made of `groups`, sensors of the scene; a `batch` stands for its children, whose films have a share of its own film's width and nothing
+    else that counts. Attributes: `sensors` (of the views), `members` (numbers of views of each group), `count` (N), `sizes` (N pairs, cropped width and height), `paths` (camera paths an iteration), `rfilter`.
     The views' pictures lie one above the other in an image of `atlas_size`, each with a margin that its reconstruction filter does not leave.
     """
 
-    def __init__(self, sensors, camera_paths, plugin):
-        self.sensors, self.count, self.camera_paths = sensors, len(sensors), camera_paths
-        self._check(plugin)
-        films = [s.film() for s in sensors]
+    def __init__(self, groups, camera_paths, plugin):
+        self.groups, self.camera_paths = groups, camera_paths
+        members = [views_of(group) for group in groups]
+        self.members = [len(m) for m in members]
+        self.sensors = sensors = [sensor for m in members for sensor in m]
+        self.count = len(sensors)
+        films = [group.film() for group, m in zip(groups, members) for _ in m]
+        for group in groups:
+            self.check_sensor(group, plugin)
+        self._check(films, plugin)
         self.rfilter = films[0].rfilter()
-        self.sizes = [tuple(int(x) for x in f.crop_size()) for f in films]
+        self.sizes = [tuple(int(x) for x in s.film().crop_size()) for s in sensors]
         self.borders = [self.rfilter.border_size() if f.sample_border() else 0 for f in films]
         self.margin = 2 * self.rfilter.border_size() + 1
         rows = np.cumsum([0] + [h + 2 * self.margin for _, h in self.sizes])
@@ -59,16 +110,14 @@ class Views:
         if self.paths >= 1 << 32:
             raise UnsupportedScene(f"{plugin}: the views have more than 2^32 pixels together")
 
-        matrices = [np.array(s.world_transform().matrix, dtype=np.float64).reshape(4, 4) for s in sensors]
-        parameters = [mi.traverse(s) for s in sensors]
+        cameras = [Camera.of(s) for s in sensors]
         self.table = {
             "first": mi.UInt32(np.cumsum([0] + counts[:-1])), "width": mi.UInt32([w for w, _ in self.sizes]),
             "height": mi.UInt32([h for _, h in self.sizes]), "border": mi.UInt32(self.borders), "top": mi.UInt32(self.tops),
-            "sensor": _pointers(sensors, mi.SensorPtr), "medium": _pointers([s.get_medium() for s in sensors], mi.MediumPtr),
-            "near": mi.Float([float(p["near_clip"]) for p in parameters]),
-            "forward": mi.Float(np.concatenate([(m[:3, 2] / np.linalg.norm(m[:3, 2])) for m in matrices])),
+            "medium": _pointers([s.get_medium() for s in sensors], mi.MediumPtr),
             "pixels": mi.Float([float(w * h) for w, h in self.sizes]),
             "open": mi.Float([s.shutter_open() for s in sensors]), "shutter": mi.Float([s.shutter_open_time() for s in sensors]),
+            **{name: mi.Float(np.stack([getattr(c, name) for c in cameras]).astype(np.float32).ravel().tolist()) for name in CAMERA},
         }
         dr.make_opaque(self.table)
         self.needs_aperture = any(s.needs_aperture_sample() for s in sensors)
@@ -76,20 +125,22 @@ class Views:
         self.needs_border = any(self.borders)
 
     @staticmethod
-    def check_sensor(sensor, plugin):
-        """Raises `UnsupportedScene` for a sensor that cannot be a view."""
-        if sensor.class_name() not in SENSORS:
-            raise UnsupportedScene(f"{plugin}: sensor {sensor.class_name()} cannot be connected to; views are "
-                                   f"{' or '.join(SENSORS.values())} sensors, alone or in a batch")
-        if mi.has_flag(sensor.film().flags(), mi.FilmFlags.Special):
+    def check_sensor(group, plugin):
+        """Raises `UnsupportedScene` for a sensor that cannot be a view, or a batch of views."""
+        for sensor in views_of(group):
+            if sensor.class_name() not in SENSORS:
+                raise UnsupportedScene(f"{plugin}: sensor {sensor.class_name()} cannot be connected to; views are "
+                                       f"{' or '.join(SENSORS.values())} sensors, alone or in a batch")
+        film = group.film()
+        if mi.has_flag(film.flags(), mi.FilmFlags.Special):
             raise UnsupportedScene(f'{plugin}: film "specfilm" is not supported; use "hdrfilm"')
+        if len(views_of(group)) > 1 and tuple(film.size()) != tuple(film.crop_size()):
+            raise UnsupportedScene(f"{plugin}: the film of a batch cannot be cropped")
 
-    def _check(self, plugin):
-        for sensor in self.sensors:
-            self.check_sensor(sensor, plugin)
+    def _check(self, films, plugin):
         if self.count > MAX_VIEWS:
             raise UnsupportedScene(f"{plugin}: {self.count} views, at most {MAX_VIEWS} are supported")
-        if len({str(s.film().rfilter()) for s in self.sensors}) > 1:
+        if len({str(f.rfilter()) for f in films}) > 1:
             raise UnsupportedScene(f"{plugin}: the views' films must have the same reconstruction filter")
         responses = [[str(o) for o in scene_objects(s) if isinstance(o, mi.Texture)] for s in self.sensors]
         if any(r != responses[0] for r in responses):
@@ -99,11 +150,9 @@ class Views:
         """A view's entry of the table."""
         return dr.gather(type(self.table[name]), self.table[name], view, active)
 
-    def sensor(self, view, active=True):
-        """Sensor pointers."""
-        if self.count == 1:
-            return mi.SensorPtr(self.sensors[0])
-        return dr.reinterpret_array(mi.SensorPtr, self.read("sensor", view, active))
+    def read_vector(self, name, view, active=True):
+        """A view's vector in the table."""
+        return dr.gather(mi.Vector3f, self.table[name], view, active)
 
     def medium(self, view, active=True):
         """The medium that each view's sensor is declared to be in."""
@@ -116,8 +165,8 @@ class Views:
         table = self.table["first"]
         return dr.binary_search(0, self.count, lambda i: dr.gather(mi.UInt32, table, dr.minimum(i, self.count - 1)) <= number) - 1
 
-    def sample(self, number, wavelength_sample, rng, active):
-        """Camera rays of paths `number`: `(view, ray, weight, position, aperture, in_window)`, the position in pixels from the cropped film's corner,
+    def sample(self, number, wavelengths, rng, active):
+        """Camera rays of paths `number`: `(view, ray, position, aperture, in_window)`, the position in pixels from the cropped film's corner,
         and whether it lies in the crop window (films may sample a border around it)."""
         view = self.of_path(number)
         border, width = self.read("border", view, active), self.read("width", view, active)
@@ -126,28 +175,49 @@ class Views:
         row = dr.maximum(width + 2 * border, 1)
         corner = mi.Vector2f(mi.Float(pixel % row) - border, mi.Float(pixel // row) - border)
         position = corner + mi.Vector2f(next_2d(rng))
-        unit = mi.Point2f(position.x / dr.maximum(width, 1), position.y / dr.maximum(height, 1))
         aperture = next_2d(rng) if self.needs_aperture else mi.Point2f(0.5)
         time = self.read("open", view, active)
         if self.needs_time:
             time += rng.next_float32() * self.read("shutter", view, active)
-        ray, weight = self.sensor(view, active).sample_ray(time, wavelength_sample, unit, aperture, active)
+        u, v = position.x / dr.maximum(width, 1), position.y / dr.maximum(height, 1)
+        lens = self._lens(view, aperture, active)
+        focus, forward = self.read("focus", view, active), self.read_vector("forward", view, active)
+        on_plane = self.read_vector("corner", view, active) + u * self.read_vector("across", view, active) + v * self.read_vector("down", view, active)
+        d = dr.normalize(on_plane * focus - lens)
+        per_depth = dr.rcp(dr.dot(d, forward))
+        near = self.read("near", view, active) * per_depth
+        ray = mi.Ray3f(mi.Point3f(self.read_vector("origin", view, active) + lens + d * near), d, time, wavelengths)
+        ray.maxt = self.read("far", view, active) * per_depth - near
         in_window = (position.x >= 0) & (position.y >= 0) & (position.x < width) & (position.y < height)
         # A box filter must not lose the rare sample that rounding moves to the next pixel.
         splat = corner + 0.5 if self.rfilter.is_box_filter() else position
-        return view, ray, weight, splat, aperture, in_window
+        return view, ray, splat, aperture, in_window
 
-    def connect(self, view, it, aperture, active):
-        """The line from `it` to a view: `(d, distance, density, position)`, the direction to the sensor, the distance to its near plane, the density of
-        the view's camera rays through `it` per area across them [1/m^2] (zero where the view does not see that way), and the position on the film in pixels."""
-        ds, weight = self.sensor(view, active).sample_direction(it, aperture, active)
-        forward = dr.gather(mi.Vector3f, self.table["forward"], view, active)
-        cosine = -dr.dot(forward, ds.d)
-        near = self.read("near", view, active) * dr.rcp(dr.maximum(cosine, 1e-6))
-        distance = ds.dist - near
-        density = dr.mean(weight) * self.read("pixels", view, active)
-        seen = active & (ds.pdf > 0) & (cosine > 1e-6) & (distance > 0) & (density > 0)
-        return ds.d, dr.select(seen, distance, 0), dr.select(seen, density, 0), ds.uv
+    def _lens(self, view, aperture, active):
+        """Offset on the lens of the sample `aperture` (world space)."""
+        if not self.needs_aperture:
+            return mi.Vector3f(0)
+        disk = mi.warp.square_to_uniform_disk_concentric(aperture)
+        return disk.x * self.read_vector("lens_x", view, active) + disk.y * self.read_vector("lens_y", view, active)
+
+    def connect(self, view, p, aperture, active):
+        """The line from `p` to a view: `(d, distance, density, position)`, the direction to the sensor, the distance to its near plane, the density of
+        the view's camera rays through `p` per area across them [1/m^2], for paths a pixel (zero where the view does not see that way: density = pixels /
+        (A cos^3 r^2), A the area of the film's image at unit depth), and the position on the film in pixels."""
+        lens, forward = self._lens(view, aperture, active), self.read_vector("forward", view, active)
+        line = mi.Vector3f(p - self.read_vector("origin", view, active)) - lens
+        depth = dr.dot(line, forward)
+        ahead = active & (depth >= self.read("near", view, active)) & (depth <= self.read("far", view, active))
+        on_plane = line * dr.rcp(dr.select(ahead, depth, 1)) + lens * dr.rcp(self.read("focus", view, active))
+        from_corner = on_plane - self.read_vector("corner", view, active)
+        u, v = (dr.dot(from_corner, self.read_vector(name, view, active)) for name in ("across_dual", "down_dual"))
+        length = dr.norm(line)
+        cosine = depth * dr.rcp(dr.maximum(length, 1e-30))
+        distance = length - self.read("near", view, active) * dr.rcp(dr.select(ahead, cosine, 1))
+        seen = ahead & (u >= 0) & (u < 1) & (v >= 0) & (v < 1) & (distance > 0)
+        density = self.read("pixels", view, active) * dr.rcp(self.read("area", view, active) * cosine * dr.square(depth))
+        position = mi.Point2f(u * self.read("width", view, active), v * self.read("height", view, active))
+        return line * -dr.rcp(dr.maximum(length, 1e-30)), dr.select(seen, distance, 0), dr.select(seen, density, 0), position
 
     def place(self, view, position, active=True):
         """Film positions in the common image."""
