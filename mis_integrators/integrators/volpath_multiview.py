@@ -24,6 +24,8 @@ from .common import IterativeIntegrator, IterativeSession
 
 PAIRS = 1 << 21
 """Connections of paths to views that are made at once at most; more are made in parts (bounds memory)."""
+FEWEST = 1 << 12
+"""Camera paths that a part has at least."""
 PATHS, WAVELENGTH = range(2)
 """Purposes of an iteration's random seeds."""
 
@@ -122,8 +124,7 @@ class MultiViewSession(IterativeSession):
         self.lights = Lights(scene, integrator.plugin)
         self.restart(seed)
         self.slots = 1
-        # Whole packets of one view where it can be; a part of the paths at a time.
-        self.paths = min(self.views.paths, max(PAIRS // self.views.count, 1 << 12))
+        self.paths = min(self.views.paths, max(PAIRS // self.views.count, FEWEST))
         self.recorded = recorder()
         self._freeze()
 

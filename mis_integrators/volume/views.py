@@ -9,28 +9,31 @@ import mitsuba as mi
 import numpy as np
 
 from ..transport.random import next_2d
-from ..transport.traits import UnsupportedScene, scene_objects
+from ..transport.traits import UnsupportedScene
 
 SENSORS = {"PerspectiveCamera": "perspective", "ThinLensCamera": "thinlens"}
 MAX_VIEWS = 1024
 
 
-def views_of(sensor):
-    """The sensors that make a view each: the children of a `batch`, in its order, or the sensor itself."""
-    if sensor.class_name() != "BatchSensor":
-        return [sensor]
-
-    class Children(mi.TraversalCallback):
-        found = []
+def _children(parent, kind):
+    """Objects of a class that `parent` holds itself, in its order."""
+    class Collector(mi.TraversalCallback):
+        def __init__(self):
+            super().__init__()
+            self.found = []
 
         def put(self, name, value, *flags):
-            if isinstance(value, mi.Sensor):
+            if isinstance(value, kind):
                 self.found.append(value)
 
-    children = Children()
-    children.found = []
-    sensor.traverse(children)
-    return children.found
+    collector = Collector()
+    parent.traverse(collector)
+    return collector.found
+
+
+def views_of(sensor):
+    """The sensors that make a view each: the children of a `batch`, in its order, or the sensor itself."""
+    return _children(sensor, mi.Sensor) if sensor.class_name() == "BatchSensor" else [sensor]
 
 
 def _pointers(objects, pointer_type):
@@ -142,7 +145,7 @@ class Views:
             raise UnsupportedScene(f"{plugin}: {self.count} views, at most {MAX_VIEWS} are supported")
         if len({str(f.rfilter()) for f in films}) > 1:
             raise UnsupportedScene(f"{plugin}: the views' films must have the same reconstruction filter")
-        responses = [[str(o) for o in scene_objects(s) if isinstance(o, mi.Texture)] for s in self.sensors]
+        responses = [[str(o) for o in _children(s, mi.Texture)] for s in self.sensors]
         if any(r != responses[0] for r in responses):
             raise UnsupportedScene(f"{plugin}: the views must have the same sensor response function")
 
