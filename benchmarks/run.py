@@ -13,6 +13,7 @@ mi.set_variant("llvm_ad_rgb")
 
 import compare  # noqa: E402
 import freezing  # noqa: E402
+import multiview  # noqa: E402
 import radius  # noqa: E402
 import references  # noqa: E402
 import throughput  # noqa: E402
@@ -70,6 +71,14 @@ def _parser() -> argparse.ArgumentParser:
                          help="rendering seconds of each radius (default: 5 60)")
     command.add_argument("--radii", type=int, default=9, help="how many, factor sqrt 2 (default: 9)")
     _compares_with_references(command)
+
+    command = _measuring(commands, "multiview", multiview)
+    command.set_defaults(scenes=multiview.SCENES)
+    command.add_argument("--weights", nargs="+", default=["mis", "mwis"], help="weights of volpath_multiview (default: mis mwis)")
+    command.add_argument("--time", type=float, default=5, metavar="SECONDS", help="rendering seconds of each (default: 5)")
+    command.add_argument("--seeds", type=int, default=8, help="renders of each, at least two (default: 8)")
+    command.add_argument("--scale", type=float, default=1, help="film size, scene's own = 1 (default: 1)")
+    command.add_argument("--charts", action="store_true", help="draw the shifted densities (needs matplotlib)")
 
     for name, function in (("freeze-scenes", freezing.freeze), ("check-scenes", freezing.check)):
         command = commands.add_parser(name, help=function.__doc__, description=function.__doc__)
