@@ -18,6 +18,7 @@ from errors import RELATIVE_OFFSET
 from mis_integrators import loading
 from mis_integrators.session import PATHS_PER_PASS
 from mis_integrators.volume.shifts import SHIFTS, Sections, majorant_at, optical_depth
+from mis_integrators.volume.views import views_of
 from reports import Row, save, show, tell
 from scene_files import BUNDLED
 
@@ -100,7 +101,9 @@ def load(path: Path, options: argparse.Namespace):
     """A scene with smaller films, and what its integrator hands on."""
     loaded = loading.load(path, {}, None, {})
     if options.scale != 1:
-        size = [max(1, round(int(x) * options.scale)) for x in loaded.scene.sensors()[0].film().crop_size()]
+        sensor = loaded.scene.sensors()[0]
+        views, (width, height) = len(views_of(sensor)), sensor.film().crop_size()
+        size = [views * max(1, round(int(width) // views * options.scale)), max(1, round(int(height) * options.scale))]
         loaded = loading.load(path, {"resx": str(size[0]), "resy": str(size[1])}, None, {})
     return loaded.scene, {name: loaded.parameters[name] for name in loading.INHERITED if name in loaded.parameters}
 
@@ -129,9 +132,9 @@ def compare(path: Path, options: argparse.Namespace) -> list[Row]:
     for name in methods:
         views = methods[name].session.views.count
         ratios = [a.mean() / b.mean() for a, b in zip(*(np.array_split(noise[n].mean(axis=-1), views, axis=1) for n in (name, "volpath")))]
-        rows.append({"scene": path.stem, "views": views, "weights": name, "variance ratio": noise[name].mean() / noise["volpath"].mean(),
-                     "best view": min(ratios), "worst view": max(ratios), "mean ratio": np.mean(images[name]) / mean.mean(),
-                     "samples": np.mean([n for _, n in used[name]]), "volpath samples": np.mean([n for _, n in used["volpath"]]),
+        rows.append({"scene": path.stem, "views": views, "weights": name, "variance ratio": float(noise[name].mean() / noise["volpath"].mean()),
+                     "best view": float(min(ratios)), "worst view": float(max(ratios)), "mean ratio": float(np.mean(images[name]) / mean.mean()),
+                     "samples": round(np.mean([n for _, n in used[name]])), "volpath samples": round(np.mean([n for _, n in used["volpath"]])),
                      "time ratio": np.mean([s for s, _ in used[name]]) / np.mean([s for s, _ in used["volpath"]])})
     return rows
 

@@ -112,7 +112,7 @@ def smoke(n=24):
     away = np.hypot(x - sway_x, z - sway_z) / (0.10 + 0.26 * y)
     density = np.clip(1.35 - away + 0.9 * turbulence, 0, None) * np.clip((0.97 - y) / 0.25, 0, 1)
     density = np.clip(density - 0.15, 0, None)
-    return (density / density.max()).astype(np.float32)
+    return np.clip(density / (0.4 * density.max()), 0, 1).astype(np.float32)
 
 
 def orbit(count=16, radius=4.2, height=1.7):
@@ -142,7 +142,7 @@ def main():
     HERE.mkdir(exist_ok=True)
     grid = smoke()
     mi.VolumeGrid(grid[..., None]).write(str(HERE / "smoke.vol"))
-    thick = SMOKE.format(albedo="0.93, 0.92, 0.90", scale=14, g=0.3)
+    thick = SMOKE.format(albedo="0.93, 0.92, 0.90", scale=6, g=0.3)
     lamp = LAMP.format(size=0.8, origin="2.2, 4.5, 1.2", target="0, 0.8, 0", radiance="14, 13, 11")
     sky = SKY.format(radiance="0.35, 0.45, 0.6")
     write("smoke_orbit", ["Smoke over a textured floor, seen from 16 cameras all around it.", "",

@@ -113,15 +113,14 @@ class VolpathMultiview(IterativeIntegrator):
 class MultiViewSession(IterativeSession):
     """Iterations of `volpath_multiview`: first segments, connections, suffixes, splats.
 
-    `sensors` are sensors of the scene, alone or batches; films and images of the session itself are the first one's. Attributes: `views`
-    and `statistics`: connections `tried` so far, how many `reached` their view, and how many a shift has `lost`.
+    `sensors` are sensors of the scene, alone or batches; films and images of the session itself are the first one's.
     """
 
     def __init__(self, integrator, scene, sensors, seed, iterations):
         super().__init__(integrator, scene, sensors[0], seed, iterations)
         self.views = Views(sensors, integrator.camera_paths, integrator.plugin)
         self.traits = VolumeTraits(scene, sensors)
-        self.lights = Lights(scene, integrator.plugin)
+        self.lights = Lights(scene, integrator.plugin, by_power=False)
         self.restart(seed)
         self.slots = 1
         self.paths = min(self.views.paths, max(PAIRS // self.views.count, FEWEST))
@@ -132,7 +131,7 @@ class MultiViewSession(IterativeSession):
         """Forgets what has been rendered, and goes on with another seed."""
         self.seed = seed
         self.accumulator = ViewAccumulator(self.views, self.integrator.variance, self.integrator.weights == "mwis")
-        self.statistics = {"tried": 0, "reached": 0, "lost": 0}
+        self._counts = {name: mi.UInt64(0) for name in ("tried", "reached", "lost")}
 
     @property
     def settings(self):
@@ -216,30 +215,31 @@ class MultiViewSession(IterativeSession):
         dr.eval(numbers)
         while True:
             pivots, radiance, lines, found = self._first_pass(self.scene, self._tables, numbers, seed, spectral)
-            connections = None
+            connections, more = None, mi.UInt32(0)
             if self.views.count > 1:
                 dr.eval(pivots, radiance, lines, found)
                 connections, more = self._connection_pass(self.scene, self._tables, pivots, lines, numbers, seed)
                 dr.eval(connections, more)
-                found = dr.maximum(dr.max(found), dr.max(more))
-            needed = int(found[0])
+            suffixes, value = self._suffix_pass(self.scene, self._tables, pivots, connections, numbers, seed)
+            dr.eval(suffixes, value)
+            layers = self._splat_pass(self.scene, self._tables, pivots, radiance, connections, suffixes, value, numbers, spectral)
+            dr.eval(layers)
+            needed = int(dr.maximum(dr.max(found), dr.max(more))[0])
             if needed <= self.slots:
                 break
             self.slots = needed
             self._freeze()
         if connections is not None:
-            self._count(connections["ratio"])
-        suffixes, value = self._suffix_pass(self.scene, self._tables, pivots, connections, numbers, seed)
-        dr.eval(suffixes, value)
-        layers = self._splat_pass(self.scene, self._tables, pivots, radiance, connections, suffixes, value, numbers, spectral)
-        dr.eval(layers)
+            for name, kind in (("reached", connections["ratio"] > 0), ("lost", connections["ratio"] < 0)):
+                self._counts[name] += mi.UInt64(dr.sum(dr.select(kind, mi.UInt32(1), mi.UInt32(0))))
+            self._counts["tried"] += self.paths * (self.views.count - 1)
+            dr.schedule(self._counts)
         return layers
 
-    def _count(self, ratio):
-        reached, lost = (dr.sum(dr.select(kind, mi.UInt32(1), mi.UInt32(0))) for kind in (ratio > 0, ratio < 0))
-        self.statistics["tried"] += dr.width(ratio) - self.paths
-        self.statistics["reached"] += int(reached[0])
-        self.statistics["lost"] += int(lost[0])
+    @property
+    def statistics(self):
+        """Connections `tried` so far, how many `reached` their view, and how many a shift has `lost`."""
+        return {name: int(count[0]) for name, count in self._counts.items()}
 
     # ------------------------------------------------------------------ results
 

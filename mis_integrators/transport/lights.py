@@ -77,10 +77,11 @@ def _invariant_key(emitter):
 class Lights:
     """All emitters of a scene, chosen by power.
 
-    Parameters: `scene`; `guide`, an `EnvironmentGuide` or None (needed exactly if the scene has infinite emitters).
+    Parameters: `scene`; `guide`, an `EnvironmentGuide` or None (needed for light sub-paths exactly if the scene has infinite emitters); `by_power`: choose
+    emitters by power, or else evenly, as Mitsuba does (without a guide the power of infinite emitters says little).
     """
 
-    def __init__(self, scene, plugin="bdpm", guide=None):
+    def __init__(self, scene, plugin="bdpm", guide=None, by_power=True):
         self.scene = scene
         # Mitsuba loads a scene's objects in parallel, in no fixed order; random numbers must not depend on it.
         order = sorted(range(len(scene.emitters())), key=lambda i: _invariant_key(scene.emitters()[i]))
@@ -96,7 +97,7 @@ class Lights:
         if not self.emitters:
             return
         uniform = UNIFORM_SHARE * power.sum() / max(np.count_nonzero(power), 1)
-        weights = (1 - UNIFORM_SHARE) * power + uniform * (power > 0)
+        weights = (1 - UNIFORM_SHARE) * power + uniform * (power > 0) if by_power else power > 0
         self.choice = Choice(weights)
         self.numbers = registry_table(self.emitters, mi.EmitterPtr, range(len(self.emitters)), mi.UInt32)
         self.kind_table = mi.UInt32([_KINDS.index(k) for k in self.kinds])

@@ -16,7 +16,7 @@ BLOCKED, SHIFT_INVALID = 0.0, -1.0
 
 
 @dr.syntax
-def _walk(scene, ray, medium, slots: int, hide_emitters: bool, active):
+def _walk(scene, traits, ray, medium, slots: int, hide_emitters: bool, active):
     """Walks `ray` to its `maxt`. Returns `(clear, starts, ends, majorants, media, found, tint, log_passed)`: whether nothing opaque stands in between, the
     sections as lists of `slots` arrays in order from the ray's origin, how many there were (more than `slots`: the lists lack some), null transmission
     over passing probability, and the logarithm of the latter."""
@@ -33,7 +33,7 @@ def _walk(scene, ray, medium, slots: int, hide_emitters: bool, active):
     tint = mi.Spectrum(1)
     log_passed = mi.Float(0)
     while dr.hint(active, label="lines of sight"):
-        surface = scene.ray_intersect(ray, mi.RayFlags.All, False, active)
+        surface = scene.ray_intersect(ray, traits.boundary_flags, False, active)
         stretch = mi.Ray3f(ray)
         stretch.maxt = dr.minimum(ray.maxt, surface.t)
         inside = active & (medium != None)  # noqa: E711 (array comparison)
@@ -66,7 +66,7 @@ def _walk(scene, ray, medium, slots: int, hide_emitters: bool, active):
     return clear, starts, ends, majorants, media, found, tint, log_passed
 
 
-def line_of_sight(scene, pivot, surface, d, distance, slots, hide_emitters, active):
+def line_of_sight(scene, traits, pivot, surface, d, distance, slots, hide_emitters, active):
     """From the pivot along `d` over `distance`, which is where the view's near plane is. Returns `(clear, sections, media, found, tint,
     log_passed)` as `_walk` does, but the sections as seen from the view: distances from its near plane, nearest first."""
     on_surface = active & (pivot["kind"] == ON_SURFACE)
@@ -75,7 +75,7 @@ def line_of_sight(scene, pivot, surface, d, distance, slots, hide_emitters, acti
     ray.maxt = distance
     medium = mi.MediumPtr(pivot["medium"])
     medium[on_surface & surface.is_medium_transition()] = surface.target_medium(d)
-    clear, starts, ends, majorants, media, found, tint, log_passed = _walk(scene, ray, medium, slots, hide_emitters, active)
+    clear, starts, ends, majorants, media, found, tint, log_passed = _walk(scene, traits, ray, medium, slots, hide_emitters, active)
     sections = Sections([dr.maximum(distance - end, 0) for end in ends[::-1]], [distance - start for start in starts[::-1]], majorants[::-1])
     return clear, sections, media[::-1], found, tint, log_passed
 
@@ -101,7 +101,7 @@ def own_line(scene, views, traits, pivot, slots, hide_emitters, active):
     surface = pivot_surface(pivot, active & (pivot["kind"] == ON_SURFACE))
     d, distance, density, _ = views.connect(pivot["view"], pivot["p"], pivot["aperture"], active)
     sees = active & (density > 0)
-    clear, sections, _, found, _, _ = line_of_sight(scene, pivot, surface, d, distance, slots, hide_emitters, sees)
+    clear, sections, _, found, _, _ = line_of_sight(scene, traits, pivot, surface, d, distance, slots, hide_emitters, sees)
     density, _ = arrival(pivot, surface, d, density, traits, active)
     line = {"tmin": sections.tmin, "tmax": sections.tmax, "majorant": sections.majorant,
             "density": dr.select(sees & clear, density, 0), "log_probability": pivot["log_passed"] - total_optical_depth(sections)}
@@ -122,7 +122,7 @@ def connect(scene, views, traits, shift, pivot, line, view, number, seed, slots:
     surface = pivot_surface(pivot, active & (pivot["kind"] == ON_SURFACE))
     d, distance, density, position = views.connect(view, pivot["p"], pivot["aperture"], active)
     active = active & (density > 0) & (line["density"] > 0)
-    clear, target, media, found, tint, log_passed = line_of_sight(scene, pivot, surface, d, distance, slots, hide_emitters, active)
+    clear, target, media, found, tint, log_passed = line_of_sight(scene, traits, pivot, surface, d, distance, slots, hide_emitters, active)
     active &= clear
     density, own = arrival(pivot, surface, d, density, traits, active)
     base = Sections(line["tmin"], line["tmax"], line["majorant"])

@@ -38,7 +38,7 @@ def collision(medium, p, majorant, time, wavelengths, active):
 
 
 @dr.syntax
-def transmittance(scene, ray, medium, rng, has_grids: bool, active):
+def transmittance(scene, traits, ray, medium, rng, active):
     """Share of light that gets along `ray` (to its `maxt`) through media and null boundaries: exact in homogeneous media, in others estimated without
     bias by ratio tracking (Novak et al. 2014), with roulette once it is faint. Returns it and the advanced `rng`."""
     rng = mi.PCG32(rng)
@@ -50,7 +50,7 @@ def transmittance(scene, ray, medium, rng, has_grids: bool, active):
     fresh = mi.Bool(True)                            # the next surface is not known yet
     while dr.hint(active, label="transmittance"):
         look = active & fresh
-        surface[look] = scene.ray_intersect(ray, mi.RayFlags.All, False, look)
+        surface[look] = scene.ray_intersect(ray, traits.boundary_flags, False, look)
         fresh = mi.Bool(False)
         inside = active & (medium != None)  # noqa: E711 (array comparison)
         stretch = mi.Ray3f(ray)
@@ -58,7 +58,7 @@ def transmittance(scene, ray, medium, rng, has_grids: bool, active):
         near, far, majorant = section(medium, stretch, inside)
         collided = mi.Bool(False)
         t = mi.Float(far)
-        if dr.hint(has_grids, mode='scalar'):
+        if dr.hint(traits.has_grids, mode='scalar'):
             grid = inside & (majorant > 0) & ~medium.is_homogeneous()
             t[grid] = near - dr.log(1 - rng.next_float32(grid)) * dr.rcp(dr.maximum(majorant, 1e-30))
             collided = grid & (t < far)

@@ -27,7 +27,7 @@ def direct_light(scene, lights, traits, it, medium, transition, surface, rng, ac
     lit = active & (dr.max(light) > 0)
     medium = mi.MediumPtr(medium)
     medium[lit & transition] = surface.target_medium(ds.d)
-    kept, rng = transmittance(scene, lights.shadow_ray(it, ds, traits.has_infinite_lights), medium, rng, traits.has_grids, lit)
+    kept, rng = transmittance(scene, traits, lights.shadow_ray(it, ds, traits.has_infinite_lights), medium, rng, lit)
     return ds, dr.select(lit, light * kept, 0), pdf, rng
 
 
@@ -105,7 +105,7 @@ def incident_radiance(scene, lights, traits, ray, medium, origin, scatter_pdf, s
             beyond = mi.MediumPtr(medium)
             beyond[on_surface & surface.is_medium_transition()] = surface.target_medium(ds.d)
             shadow = lights.shadow_ray(reference, ds, traits.has_infinite_lights)
-            kept, rng = transmittance(scene, shadow, beyond, rng, traits.has_grids, lit)
+            kept, rng = transmittance(scene, traits, shadow, beyond, rng, lit)
             radiance[lit] += gain * kept
 
         # ---- Scattering in a medium

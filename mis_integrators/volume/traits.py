@@ -13,7 +13,7 @@ from .media import point_in
 class VolumeTraits:
     """Attributes: `has_grids` (media that are not homogeneous), `has_null_media` (media in which collisions may be null: grids, and media whose
     extinction depends on the channel), `has_infinite_lights`, `has_delta` (specular reflection or refraction), `has_mixed` (smooth and specular parts in
-    one BSDF), `has_null_vertices` (BSDFs that let part of the light pass straight on), `has_masks` (BSDFs that ignore the component mask)."""
+    one BSDF), `has_null_vertices` (BSDFs that let part of the light pass straight on), `has_masks` (BSDFs that ignore the component mask), `boundary_flags` (what must be known of surfaces that only let light pass)."""
 
     def __init__(self, scene, sensors):
         flag = mi.BSDFFlags
@@ -24,6 +24,8 @@ class VolumeTraits:
         self.has_mixed = any(f & specular and f & int(flag.Smooth) for f in flags)
         self.has_null_vertices = any(f & int(flag.Null) and f & (specular | int(flag.Smooth)) for f in flags)
         self.has_masks = any(b.class_name() == "MaskBSDF" for b in bsdfs)
+        # Where all boundaries are plain, neither textures nor shading frames matter there.
+        self.boundary_flags = mi.RayFlags.All if self.has_null_vertices else mi.RayFlags.Minimal
         self.has_infinite_lights = bool(infinite_emitters(scene))
         media = [o for root in (scene, *sensors) for o in scene_objects(root) if isinstance(o, mi.Medium)]
         self.has_grids = any(not m.is_homogeneous() for m in media)
@@ -34,7 +36,7 @@ def _is_coloured(medium):
     """Whether a homogeneous medium's extinction depends on the channel or wavelength."""
     if mi.is_spectral:
         return True
-    _, _, sigma_t = medium.get_scattering_coefficients(point_in(medium, mi.Point3f(0), mi.Float(0), mi.Color0f() if not mi.is_spectral else None))
+    _, _, sigma_t = medium.get_scattering_coefficients(point_in(medium, mi.Point3f(0), mi.Float(0), dr.zeros(mi.Ray3f).wavelengths))
     return bool((dr.max(sigma_t) > dr.min(sigma_t))[0])
 
 
