@@ -133,7 +133,7 @@ class OracleBatches:
         return Estimate.of(self.batches)
 
 
-def views_agree(integrator, oracle, scene, whole=0.01, block=0.04, iterations=2, oracle_spp=128, most=2000, blocks=2, seed=1):
+def views_agree(integrator, oracle, scene, whole=0.015, block=0.06, iterations=2, oracle_spp=128, most=600, blocks=2, seed=1):
     """Renders all views together and by an oracle until a difference of `whole` or `block` would be seen, and asserts that there is none.
 
     `oracle` is an integrator or an `Estimate`. Returns the batches of the former and the estimate of the latter, which can judge again.

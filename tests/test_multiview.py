@@ -1,6 +1,6 @@
 """`volpath_multiview` against Mitsuba's own integrators, view by view, and against closed forms.
 
-False-alarm rate 1e-6 a comparison; differences of 1 % of everything and of 4 % in each quarter of a view (where a test says nothing else) are
+False-alarm rate 1e-6 a comparison; differences of 1.5 % of everything and of 6 % in each quarter of a view (where a test says nothing else) are
 seen with a probability of 0.95 (`comparing`).
 """
 
@@ -33,7 +33,7 @@ def smoky(sensor, **objects):
 def reference():
     """Three views of the smoky world by `volpath`: computed once."""
     mi.set_variant("llvm_ad_rgb")
-    oracle = OracleBatches(volpath(), smoky(batch(orbit(3))), spp=256)
+    oracle = OracleBatches(volpath(), smoky(batch(orbit(3))), spp=128)
     oracle.add(24)
     return oracle.estimate()
 
@@ -41,7 +41,8 @@ def reference():
 # --- One view ------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("variant_name", ["llvm_ad_rgb", "llvm_ad_mono", "llvm_ad_spectral"])
+@pytest.mark.parametrize("variant_name", ["llvm_ad_rgb", pytest.param("llvm_ad_mono", marks=pytest.mark.full),
+                                          pytest.param("llvm_ad_spectral", marks=pytest.mark.full)])
 def test_one_view_is_volpath(variant_name):
     mi.set_variant(variant_name)
     sensor = view((0.5, 1.2, 4.5))
@@ -76,10 +77,10 @@ def test_shifts(rgb, reference, shift):
         assert shares["lost"] > 0.005
 
 
-@pytest.mark.parametrize("weights, block", [("power", 0.04), ("mwis", 0.04), ("none", 0.1)])
+@pytest.mark.parametrize("weights, block", [("power", 0.06), ("mwis", 0.06), ("none", 0.2)])
 def test_weights(rgb, reference, weights, block):
     """MWIS is consistent only: its bias is far below the resolution at the 32 samples a pixel used here."""
-    views_agree(multiview(weights=weights), reference, smoky(batch(orbit(3))), block=block, whole=block / 4)
+    views_agree(multiview(weights=weights), reference, smoky(batch(orbit(3))), block=block, whole=block / 4, most=200)
 
 
 def test_variants(monkeypatch):

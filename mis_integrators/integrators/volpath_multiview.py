@@ -11,7 +11,7 @@ from ..transport.film import colour_channels, colour_matrix
 from ..transport.lights import Lights
 from ..transport.random import mix, streams
 from ..transport.recording import recorder
-from ..transport.traits import UnsupportedScene
+from ..transport.traits import UnsupportedScene, check_variant
 from ..volume.films import OWN, SHARED, ViewAccumulator, own_values, splat, write_film
 from ..volume.lines import connect, own_line
 from ..volume.pivots import ON_SURFACE, OWN as OWN_BRANCH, pivot_surface, trace_first_segments
@@ -20,12 +20,14 @@ from ..volume.suffixes import continue_paths, scattered_to
 from ..volume.traits import VolumeTraits, check_volume_scene
 from ..volume.views import Views
 from ..weights.multiview import HEURISTICS, gain, summand
-from .common import IterativeIntegrator, IterativeSession
+from .common import IterativeIntegrator, IterativeSession, scalar_seed
 
 PAIRS = 1 << 21
 """Connections of paths to views that are made at once at most; more are made in parts (bounds memory)."""
 FEWEST = 1 << 12
 """Camera paths that a part has at least."""
+LAUNCH = 1 << 16
+"""Camera paths that are worth a launch: of fewer, the longest keep the others waiting."""
 PATHS, WAVELENGTH = range(2)
 """Purposes of an iteration's random seeds."""
 
@@ -50,7 +52,7 @@ class VolpathMultiview(IterativeIntegrator):
          noisy, for comparison). (Default: ``mis``)
      * - camera_paths
        - |int|
-       - Camera paths per pixel and iteration. (Default: 1)
+       - Camera paths per pixel and iteration; 0 stands for as many as keep the processor busy, in eight iterations at least. (Default: 0)
      * - variance
        - |bool|
        - Adds the channels ``var.R``, ``var.G``, ``var.B`` (mono: ``var.Y``): the estimated variance of the pixel mean over the
@@ -88,6 +90,8 @@ class VolpathMultiview(IterativeIntegrator):
             'max_depth': 64
     """
 
+    CAMERA_PATHS = 0, 0, "at least 0 (0: automatic)"
+
     def read_parameters(self, parameters):
         self.shift = parameters.choice("shift", "majorant_optical_depth", tuple(SHIFTS))
         self.weights = parameters.choice("weights", "mis", HEURISTICS)
@@ -95,19 +99,31 @@ class VolpathMultiview(IterativeIntegrator):
     def settings(self):
         return {**super().settings(), "shift": self.shift, "weights": self.weights}
 
-    def check(self, scene, sensor):
-        check_volume_scene(scene, self.plugin)
-        Views.check_sensor(sensor, self.plugin)
-
-    def new_session(self, scene, sensor, seed, iterations):
-        return MultiViewSession(self, scene, [sensor], seed, iterations)
+    def session(self, scene, sensor=0, seed=0, spp=0):
+        sensor = self._sensor(scene, sensor)
+        return self._session(scene, [sensor], seed, spp)
 
     def views_session(self, scene, seed=0, spp=0):
         """Prepares a rendering of all views of a scene; see `render_views`."""
-        check_volume_scene(scene, self.plugin)
+        check_variant(scene, self.plugin)
         if not scene.sensors():
             raise UnsupportedScene(f"{self.plugin}: the scene has no sensor")
-        return MultiViewSession(self, scene, scene.sensors(), seed, self.planned_iterations(spp))
+        return self._session(scene, scene.sensors(), seed, spp)
+
+    def _session(self, scene, sensors, seed, spp):
+        check_volume_scene(scene, self.plugin)
+        for sensor in sensors:
+            Views.check_sensor(sensor, self.plugin)
+        camera_paths = self.camera_paths or self._automatic(sensors, spp)
+        iterations = self.planned_iterations(spp, camera_paths)
+        return MultiViewSession(self, scene, sensors, scalar_seed(seed), iterations, camera_paths)
+
+    @staticmethod
+    def _automatic(sensors, spp):
+        """Camera paths a pixel and iteration that make a launch of about `LAUNCH` paths; a divisor of `spp`, and at most an eighth of it."""
+        pixels = sum(int(w) * int(h) for w, h in (sensor.film().crop_size() for sensor in sensors))
+        most = max(1, min(LAUNCH // max(pixels, 1), spp // 8 if spp else 16))
+        return max(n for n in range(1, most + 1) if spp % n == 0)
 
 
 class MultiViewSession(IterativeSession):
@@ -116,9 +132,10 @@ class MultiViewSession(IterativeSession):
     `sensors` are sensors of the scene, alone or batches; films and images of the session itself are the first one's.
     """
 
-    def __init__(self, integrator, scene, sensors, seed, iterations):
+    def __init__(self, integrator, scene, sensors, seed, iterations, camera_paths):
         super().__init__(integrator, scene, sensors[0], seed, iterations)
-        self.views = Views(sensors, integrator.camera_paths, integrator.plugin)
+        self.samples_per_iteration = camera_paths
+        self.views = Views(sensors, camera_paths, integrator.plugin)
         self.traits = VolumeTraits(scene, sensors)
         self.lights = Lights(scene, integrator.plugin, by_power=False)
         self.restart(seed)
@@ -135,7 +152,7 @@ class MultiViewSession(IterativeSession):
 
     @property
     def settings(self):
-        return {**super().settings, "views": self.views.count}
+        return {**super().settings, "camera_paths": self.samples_per_iteration, "views": self.views.count}
 
     def _freeze(self):
         """Records the passes anew."""
