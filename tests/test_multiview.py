@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 import mis_integrators
-from comparing import Estimate, assert_same, collect_until
-from foggy import (SIZE, MultiviewBatches, OracleBatches, batch, container, even, grid, lamp, multiview, orbit, pockets, regions, view, views_agree,
-                   volpath, world)
+from comparing import Estimate, assert_same, collect_until, differences, smallest_visible
+from foggy import (SIZE, MultiviewBatches, OracleBatches, batch, container, even, grid, lamp, multiview, orbit, pockets, view, views_agree, volpath,
+                   world)
 from mis_integrators.volume.shifts import SHIFTS
 from mis_integrators.volume.views import Views
 from worlds import bitmap, diffuse, film, grey, path, waves
@@ -181,7 +181,8 @@ def test_films(rgb, rfilter, options):
     for mine, theirs in zip(zip(*images), zip(*oracle)):
         a, b = (Estimate.of([np.concatenate([image.mean(axis=(0, 1))[None], image[[0, -1]].mean(axis=1), image[:, [0, -1]].mean(axis=0)]) for image in side])
                 for side in (mine, theirs))
-        assert_same(a, b, 0.05, 0.2)
+        assert not differences(a, b)
+        assert smallest_visible(a, b)[0] < 0.05 and np.median(smallest_visible(a, b)) < 0.25          # of the whole, and of a border pixel
 
 
 def test_variance(rgb):
@@ -248,7 +249,7 @@ def test_cameras_are_mitsubas(rgb):
         assert seen.mean() > 0.95 and ((np.array(density) > 0) == seen).mean() > 0.995
         seen &= np.array(density) > 0
         known = seen & (np.array(weight.x) > 0)             # 3.9.1 forgets the principal point in it: zero where the film is shifted to
-        assert known.mean() > (0.85 if number == 0 else 0.95)
+        assert known.mean() > (0.75 if number == 0 else 0.95)
         assert np.allclose(np.array(density)[known], np.array(weight.x)[known] * 220, rtol=1e-3)
         assert np.allclose(np.array(position)[:, seen], np.array(ds.uv)[:, seen], atol=2e-3)
         assert np.allclose(np.array(position)[:, seen], (np.array(unit) * [[20], [11]])[:, seen], atol=2e-3)
