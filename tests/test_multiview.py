@@ -13,6 +13,7 @@ import mis_integrators
 from comparing import Estimate, assert_same, collect_until, differences, smallest_visible
 from foggy import (SIZE, MultiviewBatches, OracleBatches, batch, container, even, grid, lamp, multiview, orbit, pockets, view, views_agree, volpath,
                    world)
+from mis_integrators import cli, output
 from mis_integrators.volume.shifts import SHIFTS
 from mis_integrators.volume.views import Views
 from worlds import bitmap, diffuse, film, grey, path, waves
@@ -283,3 +284,47 @@ def test_scenes_refused(rgb):
     refused(["render_views", "PathIntegrator"], path(), s=view((0, 0, 4)))
     refused(["cropped"], s=batch(orbit(2), crop_width=8, crop_height=8))
     refused(["at least two"], multiview(variance=True), s=view((0, 0, 4)))
+
+
+# --- The command ------------------------------------------------------------------------------------------------
+
+XML = """<scene version="3.0.0">
+  <integrator type="volpath_multiview"><integer name="max_depth" value="2"/></integrator>
+  <emitter type="constant"/>
+  <shape type="sphere"><bsdf type="diffuse"/></shape>
+  <sensor type="batch"><film type="hdrfilm"><integer name="width" value="24"/><integer name="height" value="6"/><rfilter type="box"/></film>
+    <sensor type="perspective"><transform name="to_world"><lookat origin="0,0,5" target="0,0,0" up="0,1,0"/></transform></sensor>
+    <sensor type="perspective"><transform name="to_world"><lookat origin="1,0,5" target="0,0,0" up="0,1,0"/></transform></sensor>
+    <sensor type="perspective"><transform name="to_world"><lookat origin="0,1,5" target="0,0,0" up="0,1,0"/></transform></sensor>
+  </sensor>
+</scene>"""
+
+
+def test_command(rgb, tmp_path, capsys):
+    """Side by side, as a contact sheet, and as frames."""
+    scene = tmp_path / "a.xml"
+    scene.write_text(XML)
+
+    def run(*options):
+        return cli.main([str(scene), "-o", str(tmp_path / "b.exr"), "--spp", "4", "--quiet", *options])
+
+    def same(a, b):                                         # Mitsuba dithers
+        return np.abs(a.astype(int) - b).max() <= 1 and b.std() > 1
+
+    assert run("--frames") == 0
+    assert tuple(mi.Bitmap(str(tmp_path / "b.exr")).size()) == (24, 6)
+    strip = np.array(mi.Bitmap(str(tmp_path / "b.png")))
+    frames = np.concatenate([np.array(mi.Bitmap(str(tmp_path / f"b.00{i}.png"))) for i in range(3)], axis=1)
+    assert same(frames, strip)
+    assert run("--all-views") == 0
+    sheet = np.array(mi.Bitmap(str(tmp_path / "b.png")))
+    assert sheet.shape[:2] == (12, 16) and same(sheet[:6, :8], strip[:, :8]) and same(sheet[6:, :8], strip[:, 16:])
+    assert run("-i", "path", "--all-views") == 1 and "volpath_multiview" in capsys.readouterr().err
+    assert run("-i", "path", "--frames") == 1
+
+
+def test_contact_sheet():
+    images = [np.full((4, 6, 3), i + 1.0) for i in range(4)] + [np.full((2, 3, 3), 5.0)]
+    sheet = output.contact_sheet(images)
+    assert sheet.shape == (12, 12, 3)
+    assert [sheet[y, x, 0] for y, x in ((0, 0), (0, 6), (4, 0), (4, 6), (8, 0), (8, 3), (10, 0))] == [1, 2, 3, 4, 5, 0, 0]

@@ -6,6 +6,7 @@ from functools import partial
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from ..transport.film import colour_channels, colour_matrix
 from ..transport.lights import Lights
@@ -259,6 +260,16 @@ class MultiViewSession(IterativeSession):
         return {name: int(count[0]) for name, count in self._counts.items()}
 
     # ------------------------------------------------------------------ results
+
+    @property
+    def pixels(self):
+        """Pixels of all views together."""
+        return sum(width * height for width, height in self.views.sizes)
+
+    def view_images(self):
+        """The images so far, one a view: float32, (height, width, channels)."""
+        images = [np.array(tensor, dtype=np.float32) for tensor in self.view_tensors()]
+        return [image if image.ndim == 3 else image[:, :, None] for image in images]
 
     def view_tensors(self):
         """The images so far, one tensor a view, as films develop them."""
