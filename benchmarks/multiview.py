@@ -1,7 +1,8 @@
-"""Several views at once: ``volpath_multiview`` against ``volpath`` of each view alone, in equal time; shares of invalid shifts; densities of the shifts.
+"""Several views at once: ``volpath_multiview`` against ``volpath`` of each view alone, in equal time; shares of invalid shifts; densities of the
+shifts.
 
-Variances are those of whole renders under different seeds, so they need no reference; each is divided by the squared mean + 0.01 before it is averaged
-over pixels. With `--charts`, Figure 3 of the paper (shifted densities of null interactions) and the ratios by number of views are drawn.
+Variances are those of whole renders under different seeds, so they need no reference; each is divided by the squared mean + 0.01 before it is
+averaged over pixels. With `--charts`, Figure 3 of the paper is drawn: shifted densities.
 """
 
 from __future__ import annotations

@@ -84,7 +84,8 @@ def numbers(values):
 
 def camera(name, origin, target, fov, inner="", indent="    "):
     lines = [f'<sensor type="perspective" id="{name}">', f'  <float name="fov" value="{fov}"/>',
-             f'  <transform name="to_world"><lookat origin="{numbers(origin)}" target="{numbers(target)}" up="0, 1, 0"/></transform>', inner, "</sensor>"]
+             f'  <transform name="to_world"><lookat origin="{numbers(origin)}" target="{numbers(target)}" up="0, 1, 0"/></transform>',
+             inner, "</sensor>"]
     return "".join(indent + line + "\n" for line in lines if line)
 
 

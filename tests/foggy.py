@@ -20,6 +20,11 @@ def orbit(count, step=0.25, radius=4.5, height=1.2):
     return [view((radius * np.sin(step * i), height, radius * np.cos(step * i))) for i in range(count)]
 
 
+def uneven():
+    """Three views that differ in distance, in field of view, and in how much of the medium lies before what they see."""
+    return [view((0, 1.2, 4.5)), view((1.6, 0.4, 2.2), (0, 0, -0.4), fov=60.0), view((-3.5, 3.2, 4.5), fov=20.0)]
+
+
 def batch(views, size=SIZE, **film_options):
     whole = film(size, **film_options) | {"width": size * len(views)}
     return {"type": "batch", "film": whole, "sampler": {"type": "independent"}, **{f"view{i}": v for i, v in enumerate(views)}}

@@ -11,8 +11,8 @@ import pytest
 
 import mis_integrators
 from comparing import Estimate, assert_same, collect_until, differences, smallest_visible
-from foggy import (SIZE, MultiviewBatches, OracleBatches, batch, container, even, grid, lamp, multiview, orbit, pockets, view, views_agree, volpath,
-                   world)
+from foggy import (SIZE, MultiviewBatches, OracleBatches, batch, container, even, grid, lamp, multiview, orbit, pockets, uneven, view, views_agree,
+                   volpath, world)
 from mis_integrators import cli, output
 from mis_integrators.volume.shifts import SHIFTS
 from mis_integrators.volume.views import Views
@@ -35,7 +35,7 @@ def smoky(sensor, **objects):
 def reference():
     """Three views of the smoky world by `volpath`: computed once."""
     mi.set_variant("llvm_ad_rgb")
-    oracle = OracleBatches(volpath(), smoky(batch(orbit(3))), spp=128)
+    oracle = OracleBatches(volpath(), smoky(batch(uneven())), spp=128)
     oracle.add(24)
     return oracle.estimate()
 
@@ -70,9 +70,9 @@ def test_furnace(rgb, medium):
 
 @pytest.mark.parametrize("shift", SHIFTS)
 def test_shifts(rgb, reference, shift):
-    batches, _ = views_agree(multiview(shift=shift), reference, smoky(batch(orbit(3))))
+    batches, _ = views_agree(multiview(shift=shift), reference, smoky(batch(uneven())))
     shares = {name: batches.statistics[name] / batches.statistics["tried"] for name in ("reached", "lost")}
-    assert shares["reached"] > 0.3
+    assert shares["reached"] > 0.2
     if shift in STRETCHES:
         assert batches.statistics["lost"] == 0
     else:
@@ -82,7 +82,7 @@ def test_shifts(rgb, reference, shift):
 @pytest.mark.parametrize("weights", ["power", "mwis"])
 def test_weights(rgb, reference, weights):
     """MWIS is consistent only: its bias is far below the resolution at the 32 samples a pixel used here."""
-    views_agree(multiview(weights=weights), reference, smoky(batch(orbit(3))))
+    views_agree(multiview(weights=weights), reference, smoky(batch(uneven())))
 
 
 def test_equal_weights(rgb):
@@ -105,7 +105,8 @@ def surfaces(sensor):
                  ball={"type": "sphere", "radius": 0.5, "center": [-0.7, 0, 0], "bsdf": {"type": "plastic", "diffuse_reflectance": grey(0.5)}},
                  glass={"type": "sphere", "radius": 0.4, "center": [0.5, -0.4, 0.6], "bsdf": {"type": "dielectric"}},
                  screen={"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0.3, 0.2, 1.2]).scale(0.5), "bsdf": mask},
-                 pane={"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([-0.6, 0.1, 1.1]).scale(0.5), "bsdf": {"type": "thindielectric"}},
+                 pane={"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([-0.6, 0.1, 1.1]).scale(0.5),
+                       "bsdf": {"type": "thindielectric"}},
                  blend={"type": "sphere", "radius": 0.4, "center": [0.6, 0.5, -0.5],
                         "bsdf": {"type": "blendbsdf", "weight": 0.4, "a": {"type": "conductor"}, "b": diffuse(0.6)}})
 
@@ -116,13 +117,15 @@ def test_surfaces(rgb, hide_emitters):
     lens = {"kind": "thinlens", "aperture_radius": 0.08, "focus_distance": 4.0}
     views = [view((0.3, 1.0, 4.5)), view((1.5, 1.4, 4.0), **lens), view((-0.8, 3.4, 3.6))]
     scene = surfaces(batch(views))
-    views_agree(multiview(hide_emitters=hide_emitters), path(max_depth=8, rr_depth=50, hide_emitters=hide_emitters), scene, whole=0.02, block=0.1, most=200)
+    oracle = path(max_depth=8, rr_depth=50, hide_emitters=hide_emitters)
+    views_agree(multiview(hide_emitters=hide_emitters), oracle, scene, whole=0.02, block=0.1, most=200)
 
 
 def test_views_without_overlap(rgb):
     """Two views back to back: nothing can be shared, and what comes out is plain path tracing, noise included."""
     views = [view((0, 1.0, 3.0), (0, 0.8, 6.0)), view((0, 1.0, -3.0), (0, 0.8, -6.0))]
-    extra = {"near": container(grid(even, scale=1.0), 1.0, (0, 0.5, 6)), "far": container({"type": "homogeneous", "sigma_t": grey(0.7), "albedo": 0.8}, 1.0, (0, 0.5, -6))}
+    extra = {"near": container({"type": "homogeneous", "sigma_t": grey(0.4), "albedo": 0.9}, 1.0, (0, 0.5, 6)),
+             "far": container({"type": "homogeneous", "sigma_t": grey(0.7), "albedo": 0.8}, 1.0, (0, 0.5, -6))}
     together, _ = views_agree(multiview(), volpath(), world(batch(views), None, **extra))
     assert together.statistics["tried"] > 0 and together.statistics["reached"] == 0
     count = len(together.batches)
@@ -158,7 +161,8 @@ def test_hostile_views(rgb):
 def test_thick_media(rgb, shift):
     """Optical depths of hundreds to thousands on lines of sight (exponentials of single precision end at 88)."""
     thick = grid(even, scale=300.0, albedo=0.7)
-    scene = world(batch(orbit(2)), thick, second=container({"type": "homogeneous", "sigma_t": grey(0.8), "scale": 500.0, "albedo": 0.8}, 0.4, (1.5, 0, 0)))
+    homogeneous = {"type": "homogeneous", "sigma_t": grey(0.8), "scale": 500.0, "albedo": 0.8}
+    scene = world(batch(orbit(2)), thick, second=container(homogeneous, 0.4, (1.5, 0, 0)))
     views_agree(multiview(shift=shift, max_depth=4), volpath(max_depth=4), scene)
 
 
@@ -180,8 +184,8 @@ def test_films(rgb, rfilter, options):
         images.append([np.array(t) for t in session.view_tensors()])
         oracle.append([np.array(mi.render(scene, integrator=volpath(max_depth=3), sensor=i, seed=100 + seed, spp=64)) for i in range(2)])
     for mine, theirs in zip(zip(*images), zip(*oracle)):
-        a, b = (Estimate.of([np.concatenate([image.mean(axis=(0, 1))[None], image[[0, -1]].mean(axis=1), image[:, [0, -1]].mean(axis=0)]) for image in side])
-                for side in (mine, theirs))
+        a, b = (Estimate.of([np.concatenate([image.mean(axis=(0, 1))[None], image[[0, -1]].mean(axis=1), image[:, [0, -1]].mean(axis=0)])
+                             for image in side]) for side in (mine, theirs))
         assert not differences(a, b)
         assert smallest_visible(a, b)[0] < 0.05 and np.median(smallest_visible(a, b)) < 0.25          # of the whole, and of a border pixel
 
@@ -208,7 +212,7 @@ def test_variance(rgb):
 
 def test_seeds_and_parts(rgb, monkeypatch):
     """Same seed, same image, also when the paths are traced in parts; another seed, another image of the same mean."""
-    scene = smoky(batch(orbit(3)))
+    scene = smoky(batch(uneven()))
     images = [np.array(mi.render(scene, integrator=multiview(), seed=seed, spp=48)) for seed in (5, 5, 6)]
     module = __import__("sys").modules["mis_integrators.integrators.volpath_multiview"]
     monkeypatch.setattr(module, "PAIRS", 9000)
@@ -261,7 +265,8 @@ def test_cameras_are_mitsubas(rgb):
 # --- Errors -----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("parameters, words", [({"shift": "depth"}, ['"shift"', "majorant_optical_depth"]), ({"weights": "best"}, ['"weights"', "mwis"]),
+@pytest.mark.parametrize("parameters, words", [({"shift": "depth"}, ['"shift"', "majorant_optical_depth"]),
+                                               ({"weights": "best"}, ['"weights"', "mwis"]),
                                                ({"bdd": 1}, ['"bdd"', "camera_paths"]), ({"max_depth": -2}, ['"max_depth"'])])
 def test_wrong_parameters(rgb, parameters, words):
     with pytest.raises(RuntimeError) as error:

@@ -71,7 +71,8 @@ class VolpathMultiview(IterativeIntegrator):
 
     The views are the children of a ``batch`` sensor, side by side on its film, or one sensor, or any list of sensors through
     ``mis_integrators.render_views``. Each view's camera paths are traced to the first vertex that scatters, in a medium or on a surface. Every other
-    view that sees it joins there: the null interactions of the first segment are shifted onto its own line of sight, and all views share the rest of the path.
+    view that sees it joins there: the null interactions of the first segment are shifted onto its own line of sight, and all views share the rest
+    of the path.
 
     With the weights ``mis`` the result is unbiased. Perspective and thin lens sensors are supported; polarised variants, gradients and the film
     ``specfilm`` are refused by name.
@@ -186,8 +187,8 @@ class MultiViewSession(IterativeSession):
 
     def _continue(self, scene, tables, pivot, connections, number, seed):
         integrator = self.integrator
-        return continue_paths(scene, self.lights, self.traits, partial(summand, integrator.weights), pivot, connections, number, seed, self.views.count,
-                              integrator.max_depth, integrator.rr_depth, number < self.views.paths)
+        return continue_paths(scene, self.lights, self.traits, partial(summand, integrator.weights), pivot, connections, number, seed,
+                              self.views.count, integrator.max_depth, integrator.rr_depth, number < self.views.paths)
 
     def _splat(self, scene, tables, pivots, radiance, connections, suffixes, value, numbers, spectral):
         views, weights, matrix = self.views, self.integrator.weights, spectral["matrix"]
@@ -304,9 +305,9 @@ def _gather(record, index):
 def render_views(scene, integrator=None, spp=0, seed=0):
     """Renders all views of `scene` together: the children of its `batch` sensors, and its other sensors, in their order.
 
-    `integrator` is a `volpath_multiview` (default: the scene's own if it is one, else one with its default parameters), `spp` the samples per pixel (0:
-    the most that a sensor's sampler asks for). Returns a list of tensors (height, width, channels), one a view, as each view's film develops
-    it; films may differ in size. Raises `UnsupportedScene` for what cannot be rendered.
+    `integrator` is a `volpath_multiview` (default: the scene's own if it is one, else one with its default parameters), `spp` the samples per
+    pixel (0: the most that a sensor's sampler asks for). Returns a list of tensors (height, width, channels), one a view, as each view's film
+    develops it; films may differ in size. Raises `UnsupportedScene` for what cannot be rendered.
     """
     if integrator is None:
         own = scene.integrator()

@@ -77,8 +77,8 @@ def _invariant_key(emitter):
 class Lights:
     """All emitters of a scene, chosen by power.
 
-    Parameters: `scene`; `guide`, an `EnvironmentGuide` or None (needed for light sub-paths exactly if the scene has infinite emitters); `by_power`: choose
-    emitters by power, or else evenly, as Mitsuba does (without a guide the power of infinite emitters says little).
+    Parameters: `scene`; `guide`, an `EnvironmentGuide` or None (needed for light sub-paths exactly if the scene has infinite emitters);
+    `by_power`: choose emitters by power, or else evenly, as Mitsuba does (without a guide the power of infinite emitters says little).
     """
 
     def __init__(self, scene, plugin="bdpm", guide=None, by_power=True):

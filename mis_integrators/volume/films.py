@@ -1,9 +1,9 @@
 """Pictures of several views: samples splatted into one common image, sums over iterations, and each view's own film at the end.
 
 A sample comes with a weight: one for a path that its own view traces alone, and for paths that views share the share that each view has in them. The
-weights' expected sum at a pixel, W, is known; their actual sum D fluctuates with the number of samples that happen to arrive, and so does the sum Y of the
-weighted values. What both have in common is taken away without bias: the even iterations' m = Y/D is independent of the odd iterations' sums, so
-Y + m (W - D) has the expectation of Y, and the noise of Y - m D. (Or Y/D itself: MWIS.)
+weights' expected sum at a pixel, W, is known; their actual sum D fluctuates with the number of samples that happen to arrive, and so does the sum
+Y of the weighted values. What both have in common is taken away without bias: the even iterations' m = Y/D is independent of the odd iterations'
+sums, so Y + m (W - D) has the expectation of Y, and the noise of Y - m D. (Or Y/D itself: MWIS.)
 """
 
 from __future__ import annotations
@@ -22,15 +22,16 @@ OWN = 5
 
 def splat(views, block, channels, active):
     """Adds samples `[(view, position, list of values)]` to a common image of so many channels; returns it as a tensor (height, width, channels)."""
-    image = mi.ImageBlock(mi.ScalarVector2u(*views.atlas_size), mi.ScalarPoint2i(0), channels, views.rfilter, border=False, normalize=False, coalesce=False)
+    size = mi.ScalarVector2u(*views.atlas_size)
+    image = mi.ImageBlock(size, mi.ScalarPoint2i(0), channels, views.rfilter, border=False, normalize=False, coalesce=False)
     for (view, position, values), mask in zip(block, active):
         image.put(views.place(view, position, mask), values, mask)
     return image.tensor()
 
 
 def own_values(radiance, visible, value, weight, alone, matrix):
-    """The channels of a camera path, `SHARED` and then `OWN`: `radiance` is what it saw on the way to its pivot, `value` what it brings from there, and
-    `weight` its share, one if its view is `alone`."""
+    """The channels of a camera path, `SHARED` and then `OWN`: `radiance` is what it saw on the way to its pivot, `value` what it brings from
+    there, and `weight` its share, one if its view is `alone`."""
     brought = colour_channels(dr.select(alone, radiance + value, value * weight), matrix)
     seen = colour_channels(dr.select(alone, 0, radiance), matrix)
     return [*brought, dr.select(alone, 1, weight), *seen, visible, mi.Float(1)]
@@ -111,8 +112,8 @@ class ViewAccumulator:
                           dr.ones(mi.TensorXf, self.own.shape[:2] + (1,))], axis=2)
 
     def variance(self):
-        """Estimated variance of each pixel's mean (height, width, 3) from the iterations: that of Y - m D over W, or over the mean of D (delta method).
-        The noise of emitters seen directly, if any, is not in it."""
+        """Estimated variance of each pixel's mean (height, width, 3) from the iterations: that of Y - m D over W, or over the mean of D (delta
+        method). The noise of emitters seen directly, if any, is not in it."""
         n, total = self.iterations, self.shared[0] + self.shared[1]
         mean = self._mean(total)
         rest = total[:, :, :3] - mean * total[:, :, 3:]

@@ -17,9 +17,9 @@ BLOCKED, SHIFT_INVALID = 0.0, -1.0
 
 @dr.syntax
 def _walk(scene, traits, ray, medium, slots: int, hide_emitters: bool, active):
-    """Walks `ray` to its `maxt`. Returns `(clear, starts, ends, majorants, media, found, tint, log_passed)`: whether nothing opaque stands in between, the
-    sections as lists of `slots` arrays in order from the ray's origin, how many there were (more than `slots`: the lists lack some), null transmission
-    over passing probability, and the logarithm of the latter."""
+    """Walks `ray` to its `maxt`. Returns `(clear, starts, ends, majorants, media, found, tint, log_passed)`: whether nothing opaque stands in
+    between, the sections as lists of `slots` arrays in order from the ray's origin, how many there were (more than `slots`: the lists lack some),
+    null transmission over passing probability, and the logarithm of the latter."""
     ray = mi.Ray3f(ray)
     medium = mi.MediumPtr(medium)
     active = mi.Bool(active)
@@ -114,8 +114,8 @@ def connect(scene, views, traits, shift, pivot, line, view, number, seed, slots:
 
     Returns `(connection, found)`:
 
-    - `ratio`: p_k(x_k) |dx_k / dx_i| / p_i(x_i), how much likelier the other view makes the shifted path than the path's own view makes the path itself, numbers of samples
-      included; see `BLOCKED` and `SHIFT_INVALID`;
+    - `ratio`: p_k(x_k) |dx_k / dx_i| / p_i(x_i), how much likelier the other view makes the shifted path than the path's own view makes the path
+      itself, numbers of samples included; see `BLOCKED` and `SHIFT_INVALID`;
     - `tint`: spectrum, what the shifted first segment carries over its probability (as `tint` of a pivot);
     - `d`: direction from the pivot to the view; `position`: on the view's film.
     """
@@ -151,7 +151,8 @@ def connect(scene, views, traits, shift, pivot, line, view, number, seed, slots:
             lost |= failed & has_media
             empty |= failed & ~has_media
             evaluated = shifting & shifted.valid
-            null, _, probability = collision(medium, pivot["p"] + d * (distance - shifted.t), majorant, pivot["time"], pivot["wavelengths"], evaluated)
+            place = pivot["p"] + d * (distance - shifted.t)
+            null, _, probability = collision(medium, place, majorant, pivot["time"], pivot["wavelengths"], evaluated)
             empty |= evaluated & (probability <= 0)
             log_ratio[evaluated] = log_ratio + shifted.log_rate + dr.log(dr.maximum(probability, 1e-30))
             tint[evaluated] = tint * null

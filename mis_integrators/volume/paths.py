@@ -20,8 +20,8 @@ def scattering_interaction(medium, p, wi, time, wavelengths):
 
 @dr.syntax
 def direct_light(scene, lights, traits, it, medium, transition, surface, rng, active):
-    """Next-event estimation at interaction `it`, in `medium` or where `transition` between the media of `surface`: `(ds, light, pdf, rng)`, the light's
-    radiance over its density, attenuated on the way, and the advanced generator."""
+    """Next-event estimation at interaction `it`, in `medium` or where `transition` between the media of `surface`: `(ds, light, pdf, rng)`, the
+    light's radiance over its density, attenuated on the way, and the advanced generator."""
     rng = mi.PCG32(rng)
     ds, light, pdf = lights.propose_direct(it, rng, active)
     lit = active & (dr.max(light) > 0)

@@ -44,8 +44,8 @@ def trace_first_segments(scene, views, traits, number, seed, rng, wavelengths, s
     - `kind`, `branch`: see the constants; `p`, `medium` (before the pivot), `wi` (to the camera), `time`, `wavelengths`;
     - `hit`, `ray_o`, `ray_d`: what rebuilds the surface interaction;
     - `view`, `position`, `aperture`, `in_window`: of the camera ray (see `Views.sample`);
-    - `weight`, `tint`: spectra whose product is what the path carries when it scatters, measured value over density; the former belongs to the pivot and is
-      every view's, the latter to the path's own first segment;
+    - `weight`, `tint`: spectra whose product is what the path carries when it scatters, measured value over density; the former belongs to the
+      pivot and is every view's, the latter to the path's own first segment;
     - `log_passed`: logarithm of the probabilities with which it passed null interactions and null surfaces; `nulls`: how many null interactions;
     - `visible`: what the alpha channel shows.
     """

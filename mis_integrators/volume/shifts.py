@@ -42,8 +42,8 @@ class Sections:
 
 @dataclass
 class Shifted:
-    """A shifted interaction: distance `t` on the target, its majorant optical depth `tau` there, `log_rate` = ln dtau'/dtau, `jacobian` = dt'/dt (capped
-    where it exceeds exp(80)), and whether there is such an interaction at all (elsewhere the numbers are finite and mean nothing)."""
+    """A shifted interaction: distance `t` on the target, its majorant optical depth `tau` there, `log_rate` = ln dtau'/dtau, `jacobian` = dt'/dt
+    (capped where it exceeds exp(80)), and whether there is such an interaction at all (elsewhere the numbers are finite and mean nothing)."""
 
     t: Any
     tau: Any
@@ -204,8 +204,8 @@ def majorant_optical_depth(base, target, t):
 def primary_sample(base, target, t):
     """u'(t') = C u(t), C = u'max / umax; dt'/dt = (mu_k / mu'_k') C exp(-tau) / exp(-tau'). Follows the target's majorant density.
 
-    With exp(-tau') = [exp(-tau)(1 - exp(tau - taumax)) + exp(-tau'max)(1 - exp(-tau))] / (1 - exp(-taumax)), whose terms are positive and are summed as
-    logarithms, thick media neither overflow nor cancel; while u' is small, tau' = -ln(1 - u') is the better form.
+    With exp(-tau') = [exp(-tau)(1 - exp(tau - taumax)) + exp(-tau'max)(1 - exp(-tau))] / (1 - exp(-taumax)), whose terms are positive and are
+    summed as logarithms, thick media neither overflow nor cancel; while u' is small, tau' = -ln(1 - u') is the better form.
     """
     end, target_end = total_optical_depth(base), total_optical_depth(target)
     tau = _least(optical_depth(base, t), end)

@@ -29,8 +29,8 @@ def scattering(pivot, surface, d, wo, active):
 def sample_scattering(pivot, surface, d, traits, rng, active):
     """A direction for the path to go on, by the smooth scattering towards `d`, or on a path's `OWN` branch by the delta functions there.
 
-    Returns `(wo, weight, taken)`; `weight` (value over density) is that of the delta functions, and `taken` is false where the sample fell on the other
-    kind. Smooth samples are drawn with all components enabled: only then do Mitsuba's densities fit (3.9.1: `mask` and `blendbsdf` do not
+    Returns `(wo, weight, taken)`; `weight` (value over density) is that of the delta functions, and `taken` is false where the sample fell on the
+    other kind. Smooth samples are drawn with all components enabled: only then do Mitsuba's densities fit (3.9.1: `mask` and `blendbsdf` do not
     heed the component mask in both).
     """
     on_surface = active & (pivot["kind"] == ON_SURFACE)
@@ -56,14 +56,15 @@ def sample_scattering(pivot, surface, d, traits, rng, active):
 
 @dr.syntax
 def continue_paths(scene, lights, traits, summand, pivot, connections, number, seed, views: int, max_depth: int, rr_depth: int, active):
-    """Traces suffixes from pivots. `connections` holds, for each view k and path p at k * paths + p, what `lines.connect` gave (None for a single view).
+    """Traces suffixes from pivots. `connections` holds, for each view k and path p at k * paths + p, what `lines.connect` gave (None for a single
+    view).
 
     A direction is drawn from the mixture of all views' scattering at the pivot, each by its share of the densities, r_k / sum r: the best single
     sample under the balance heuristic, and never a worse one than each view would draw for itself. A second direction goes to a light.
 
-    Returns `(suffix, value)`: `light_d`, `light` and `next_d`, `next`, two directions with what arrives from there over its density, to be multiplied with a
-    view's scattering and its `tint`; `total`, the sum of `summand(r)` over views, and `alone`, whether there is only one; and what the path
-    brings to its own view, before any weight.
+    Returns `(suffix, value)`: `light_d`, `light` and `next_d`, `next`, two directions with what arrives from there over its density, to be
+    multiplied with a view's scattering and its `tint`; `total`, the sum of `summand(r)` over views, and `alone`, whether there is only one; and
+    what the path brings to its own view, before any weight.
     """
     active = active & (pivot["kind"] != NOWHERE)
     if dr.hint(max_depth > 0, mode='scalar'):

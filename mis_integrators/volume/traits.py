@@ -12,8 +12,9 @@ from .media import point_in
 
 class VolumeTraits:
     """Attributes: `has_grids` (media that are not homogeneous), `has_null_media` (media in which collisions may be null: grids, and media whose
-    extinction depends on the channel), `has_infinite_lights`, `has_delta` (specular reflection or refraction), `has_mixed` (smooth and specular parts in
-    one BSDF), `has_null_vertices` (BSDFs that let part of the light pass straight on), `has_masks` (BSDFs that ignore the component mask), `boundary_flags` (what must be known of surfaces that only let light pass)."""
+    extinction depends on the channel), `has_infinite_lights`, `has_delta` (specular reflection or refraction), `has_mixed` (smooth and specular
+    parts in one BSDF), `has_null_vertices` (BSDFs that let part of the light pass straight on), `has_masks` (BSDFs that ignore the component
+    mask), `boundary_flags` (what must be known of surfaces that only let light pass)."""
 
     def __init__(self, scene, sensors):
         flag = mi.BSDFFlags

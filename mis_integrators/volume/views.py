@@ -92,8 +92,9 @@ class Views:
     """N views in one list, paths numbered view by view, pixel by pixel.
 
     They are made of `groups`, sensors of the scene; a `batch` stands for its children, whose films have a share of its own film's width and nothing
-    else that counts. Attributes: `sensors` (of the views), `members` (numbers of views of each group), `count` (N), `sizes` (N pairs, cropped width and height), `paths` (camera paths an iteration), `rfilter`.
-    The views' pictures lie one above the other in an image of `atlas_size`, each with a margin that its reconstruction filter does not leave.
+    else that counts. Attributes: `sensors` (of the views), `members` (numbers of views of each group), `count` (N), `sizes` (N pairs, cropped
+    width and height), `paths` (camera paths an iteration), `rfilter`. The views' pictures lie one above the other in an image of `atlas_size`,
+    each with a margin that its reconstruction filter does not leave.
     """
 
     def __init__(self, groups, camera_paths, plugin):
@@ -181,8 +182,8 @@ class Views:
         height = self.read("height", view, active)
         pixel = (number - self.read("first", view, active)) // self.camera_paths
         row = dr.maximum(width + 2 * border, 1)
-        corner = mi.Vector2f(mi.Float(pixel % row) - border, mi.Float(pixel // row) - border)
-        position = corner + mi.Vector2f(next_2d(rng))
+        pixel = mi.Vector2f(mi.Float(pixel % row) - border, mi.Float(pixel // row) - border)
+        position = pixel + mi.Vector2f(next_2d(rng))
         aperture = next_2d(rng) if self.needs_aperture else mi.Point2f(0.5)
         time = self.read("open", view, active)
         if self.needs_time:
@@ -190,7 +191,8 @@ class Views:
         u, v = position.x / dr.maximum(width, 1), position.y / dr.maximum(height, 1)
         lens = self._lens(view, aperture, active)
         focus, forward = self.read("focus", view, active), self.read_vector("forward", view, active)
-        on_plane = self.read_vector("corner", view, active) + u * self.read_vector("across", view, active) + v * self.read_vector("down", view, active)
+        corner, across, down = (self.read_vector(name, view, active) for name in ("corner", "across", "down"))
+        on_plane = corner + u * across + v * down
         d = dr.normalize(on_plane * focus - lens)
         per_depth = dr.rcp(dr.dot(d, forward))
         near = self.read("near", view, active) * per_depth
@@ -198,7 +200,7 @@ class Views:
         ray.maxt = self.read("far", view, active) * per_depth - near
         in_window = (position.x >= 0) & (position.y >= 0) & (position.x < width) & (position.y < height)
         # A box filter must not lose the rare sample that rounding moves to the next pixel.
-        splat = corner + 0.5 if self.rfilter.is_box_filter() else position
+        splat = pixel + 0.5 if self.rfilter.is_box_filter() else position
         return view, ray, splat, aperture, in_window
 
     def _lens(self, view, aperture, active):
@@ -209,9 +211,9 @@ class Views:
         return disk.x * self.read_vector("lens_x", view, active) + disk.y * self.read_vector("lens_y", view, active)
 
     def connect(self, view, p, aperture, active):
-        """The line from `p` to a view: `(d, distance, density, position)`, the direction to the sensor, the distance to its near plane, the density of
-        the view's camera rays through `p` per area across them [1/m^2], for paths a pixel (zero where the view does not see that way: density = pixels /
-        (A cos^3 r^2), A the area of the film's image at unit depth), and the position on the film in pixels."""
+        """The line from `p` to a view: `(d, distance, density, position)`, the direction to the sensor, the distance to its near plane, the
+        density of the view's camera rays through `p` per area across them [1/m^2], for paths a pixel (zero where the view does not see that way:
+        density = pixels / (A cos^3 r^2), A the area of the film's image at unit depth), and the position on the film in pixels."""
         lens, forward = self._lens(view, aperture, active), self.read_vector("forward", view, active)
         line = mi.Vector3f(p - self.read_vector("origin", view, active)) - lens
         depth = dr.dot(line, forward)
