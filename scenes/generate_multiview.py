@@ -147,26 +147,32 @@ def main():
     lamp = LAMP.format(size=0.8, origin="2.2, 4.5, 1.2", target="0, 0.8, 0", radiance="14, 13, 11")
     sky = SKY.format(radiance="0.35, 0.45, 0.6")
     write("smoke_orbit", ["Smoke over a textured floor, seen from 16 cameras all around it.", "",
-                          "A heterogeneous grid, many null collisions; every view sees the smoke, and all but its shadow of the floor. Claim: sharing",
-                          "paths saves most of the long multiple scattering."], (1024, 64), 64, [batch(orbit()), thick, FLOOR, lamp, sky])
+                          "A heterogeneous grid, many null collisions; every view sees the smoke and most of the floor.",
+                          "Claim: sharing paths saves most of the long multiple scattering."], (1024, 64), 64, [batch(orbit()), thick, FLOOR, lamp, sky])
     write("light_field", ["A light field of 8 x 8 cameras: a glossy knot in homogeneous fog.", "",
-                          "64 close views share almost all of their paths; the knot's lobes differ from view to view, so suffixes must come from the mixture."],
+                          "64 close views share almost all of their paths; the knot's lobes differ from view to view,",
+                          "so suffixes must come from the mixture."],
           (2048, 32), 16, [batch(light_field()),
-                           '  <medium type="homogeneous" id="fog">\n    <float name="sigma_t" value="0.35"/>\n    <float name="albedo" value="0.9"/>\n'
+                           '  <medium type="homogeneous" id="fog">\n    <float name="sigma_t" value="0.35"/>\n'
+                           '    <float name="albedo" value="0.9"/>\n'
                            '    <phase type="hg"><float name="g" value="0.5"/></phase>\n  </medium>\n',
-                           '  <shape type="cube" id="container">\n    <transform name="to_world"><scale x="2.5" y="1.6" z="2"/><translate y="1"/></transform>\n'
+                           '  <shape type="cube" id="container">\n'
+                           '    <transform name="to_world"><scale x="2.5" y="1.6" z="2"/><translate y="1"/></transform>\n'
                            '    <bsdf type="null"/>\n    <ref name="interior" id="fog"/>\n  </shape>\n',
                            '  <shape type="ply" id="knot">\n    <string name="filename" value="../meshes/knot.ply"/>\n'
                            '    <transform name="to_world"><scale value="1.6"/><translate y="0.8"/></transform>\n'
-                           '    <bsdf type="roughconductor"><string name="material" value="Cu"/><float name="alpha" value="0.12"/></bsdf>\n  </shape>\n',
+                           '    <bsdf type="roughconductor"><string name="material" value="Cu"/><float name="alpha" value="0.12"/></bsdf>\n'
+                           '  </shape>\n',
                            FLOOR, lamp, SKY.format(radiance="0.2, 0.25, 0.3")])
     write("fly_through", ["A camera flies into the smoke: eight views with films of their own, the last four within the medium.", "",
-                          "Views that see each other's pivots from very different distances. Render with mis_integrators.render_views or mis-render --all-views."],
+                          "Views that see each other's pivots from very different distances.",
+                          "Render with mis_integrators.render_views or mis-render (option all-views)."],
           (64, 64), 64, [thick, *flight(), FLOOR, lamp, sky])
     write("apart", ["Two views back to back, each with a cloud of its own: no path can be shared.", "",
                     "Must cost little more than two plain renders, and be as noisy."], (128, 64), 16,
           [batch([camera("front", (0, 1.2, 0.5), (0, 0.9, 4), 45), camera("back", (0, 1.2, -0.5), (0, 0.9, -4), 45)]),
-           '  <medium type="homogeneous" id="cloud">\n    <float name="sigma_t" value="0.8"/>\n    <float name="albedo" value="0.95"/>\n  </medium>\n',
+           '  <medium type="homogeneous" id="cloud">\n    <float name="sigma_t" value="0.8"/>\n    <float name="albedo" value="0.95"/>\n'
+           '  </medium>\n',
            *(f'  <shape type="sphere" id="{name}">\n    <point name="center" x="0" y="1" z="{z}"/>\n    <float name="radius" value="0.9"/>\n'
              f'    <bsdf type="null"/>\n    <ref name="interior" id="cloud"/>\n  </shape>\n' for name, z in (("cloud_front", 3), ("cloud_back", -3))),
            FLOOR.replace('"4"', '"6"'), lamp, sky])
