@@ -129,13 +129,12 @@ def light_field(side=8, spacing=0.12):
 def flight(count=8):
     """Cameras of their own, for those within the smoke must say so; each with its own film."""
     found = []
-    film = "".join(line.removeprefix("    ") for line in FILM.splitlines(keepends=True))
     for i, way in enumerate(np.linspace(0, 1, count)):
         origin = np.array([0.5, 1.2, 3.2]) * (1 - way) + np.array([0.1, 0.8, 0.55]) * way
         inside = np.all(np.abs(origin - [0, 1, 0]) < 1)
         medium = '  <ref id="smoke"/>\n' if inside else ""
-        lines = (medium + film).rstrip("\n").replace("\n", "\n  ")
-        found.append(camera(f"view{i}", origin, (-0.1, 0.75, -0.4), 50, lines, "  "))
+        inner = (medium + FILM.replace("\n  ", "\n").removeprefix("  ")).rstrip().replace("\n", "\n  ")
+        found.append(camera(f"view{i}", origin, (-0.1, 0.75, -0.4), 50, inner, "  "))
     return found
 
 
@@ -164,7 +163,7 @@ def main():
                            '    <bsdf type="roughconductor"><string name="material" value="Cu"/><float name="alpha" value="0.12"/></bsdf>\n'
                            '  </shape>\n',
                            FLOOR, lamp, SKY.format(radiance="0.2, 0.25, 0.3")])
-    write("fly_through", ["A camera flies into the smoke: eight views with films of their own, the last four within the medium.", "",
+    write("fly_through", ["A camera flies into the smoke: eight views with films of their own, the last two within the medium.", "",
                           "Views that see each other's pivots from very different distances.",
                           "Render with mis_integrators.render_views or mis-render (option all-views)."],
           (64, 64), 64, [thick, *flight(), FLOOR, lamp, sky])

@@ -25,6 +25,18 @@ def uneven():
     return [view((0, 1.2, 4.5)), view((1.6, 0.4, 2.2), (0, 0, -0.4), fov=60.0), view((-3.5, 3.2, 4.5), fov=20.0)]
 
 
+def around():
+    """Three views from different sides of the origin: what lies near to one lies far from another."""
+    return [view((0, 0.6, 4.0)), view((0.4, 0.2, -3.0), fov=50.0), view((2.2, 1.0, 0.3), fov=60.0)]
+
+
+def sparse(rng, n):
+    """A majorant about five times the density."""
+    values = rng.uniform(0.05, 0.35, (n, n, n))
+    values[0, 0, 0] = 1.0
+    return values
+
+
 def batch(views, size=SIZE, **film_options):
     whole = film(size, **film_options) | {"width": size * len(views)}
     return {"type": "batch", "film": whole, "sampler": {"type": "independent"}, **{f"view{i}": v for i, v in enumerate(views)}}
