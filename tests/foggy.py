@@ -26,8 +26,8 @@ def uneven():
 
 
 def around():
-    """Three views from different sides of the origin: what lies near to one lies far from another."""
-    return [view((0, 0.6, 4.0)), view((0.4, 0.2, -3.0), fov=50.0), view((2.2, 1.0, 0.3), fov=60.0)]
+    """Three views from different sides of the origin: what lies near to one lies far from another, and one sees a part closely."""
+    return [view((0, 0.6, 4.0), fov=15.0), view((0.4, 0.2, -3.0), fov=50.0), view((2.2, 1.0, 0.3), fov=60.0)]
 
 
 def sparse(rng, n):
