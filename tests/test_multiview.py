@@ -14,7 +14,9 @@ from comparing import Estimate, assert_same, collect_until, differences, smalles
 from foggy import (SIZE, MultiviewBatches, OracleBatches, around, batch, container, even, grid, lamp, multiview, orbit, pockets, sparse, uneven,
                    view, views_agree, volpath, world)
 from mis_integrators import cli, output
+from mis_integrators.volume.media import transmittance
 from mis_integrators.volume.shifts import SHIFTS
+from mis_integrators.volume.traits import VolumeTraits
 from mis_integrators.volume.views import Views
 from worlds import bitmap, diffuse, film, grey, path, waves
 
@@ -33,7 +35,7 @@ def smoky(sensor, **objects):
 
 def cloud(size=SIZE):
     """A medium with many null interactions and nothing else, seen from all sides: shifts between very unlike segments."""
-    return mi.load_dict({"type": "scene", "medium": container(grid(sparse, scale=2.5)), "sensor": batch(around(), size), "lamp": lamp(),
+    return mi.load_dict({"type": "scene", "medium": container(grid(sparse, scale=2.5, g=0.6)), "sensor": batch(around(), size), "lamp": lamp(),
                          "sky": {"type": "constant", "radiance": grey(0.1)}})
 
 
@@ -69,6 +71,21 @@ def test_furnace(rgb, medium):
     exact = Estimate.exact(np.ones((1 + 3 * 4, 3)))
     estimates = collect_until(batches, exact, 0.003, 0.01, start=12)
     assert_same(*estimates, 0.003, 0.01, slack=1e-4)
+
+
+@pytest.mark.parametrize("scale", [1.0, 5.0])
+def test_transmittance(rgb, scale):
+    """Ratio tracking through a grid of one value, with its majorant far above it, against the exponential; roulette included."""
+    values = np.full((4, 4, 4, 1), 0.4, np.float32)
+    values[0, 0, 0] = 1.0                                                       # off the ray
+    medium = grid(lambda rng, n: values[..., 0], scale=scale)
+    scene = mi.load_dict({"type": "scene", "medium": container(medium), "sensor": view((0, 0, 4))})
+    n = 400000
+    ray = mi.Ray3f(mi.Point3f(0.9, 0.8, 3), mi.Vector3f(0, 0, -1), mi.Float(0), [])
+    ray.maxt = 5.0
+    value, _ = transmittance(scene, VolumeTraits(scene, scene.sensors()), ray, dr.zeros(mi.MediumPtr, n), mi.PCG32(n), mi.Bool([True] * n))
+    value, exact = np.array(value.x), np.exp(-0.4 * scale * 2)
+    assert abs(value.mean() - exact) < 5 * value.std() / np.sqrt(n) < 0.03 * exact         # 6e-7
 
 
 # --- Several views ---------------------------------------------------------------------------------------------
@@ -113,7 +130,7 @@ def test_variants(variant_name):
     views_agree(multiview(), volpath(), smoky(batch(uneven())), whole=0.02, block=0.1, most=200)
 
 
-def surfaces(sensor):
+def surfaces(sensor, **objects):
     """No media, but everything that surfaces can do at a pivot."""
     mask = {"type": "mask", "opacity": bitmap(0.5 + 0.45 * waves(2, 1)), "bsdf": {"type": "twosided", "bsdf": diffuse(0.7)}}
     return world(sensor, None,
@@ -123,16 +140,17 @@ def surfaces(sensor):
                  pane={"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([-0.6, 0.1, 1.1]).scale(0.5),
                        "bsdf": {"type": "thindielectric"}},
                  blend={"type": "sphere", "radius": 0.4, "center": [0.6, 0.5, -0.5],
-                        "bsdf": {"type": "blendbsdf", "weight": 0.4, "a": {"type": "conductor"}, "b": diffuse(0.6)}})
+                        "bsdf": {"type": "blendbsdf", "weight": 0.4, "a": {"type": "conductor"}, "b": diffuse(0.6)}}, **objects)
 
 
 @pytest.mark.parametrize("hide_emitters", [False, True])
 def test_surfaces(rgb, hide_emitters):
-    """Without media `path` is the oracle; the lamp stands in front of one view's floor, so hiding it shows."""
+    """Without media `path` is the oracle. A lamp stands before the second view, so hiding it shows; `path` itself (3.9.1) misplaces what is behind a hidden
+    lamp, `volpath` does not."""
     lens = {"kind": "thinlens", "aperture_radius": 0.08, "focus_distance": 4.0}
     views = [view((0.3, 1.0, 4.5)), view((1.5, 1.4, 4.0), **lens), view((-0.8, 3.4, 3.6))]
-    scene = surfaces(batch(views))
-    oracle = path(max_depth=8, rr_depth=50, hide_emitters=hide_emitters)
+    scene = surfaces(batch(views), lamp=lamp((0.9, 0.85, 2.4), 0.3, 30.0))
+    oracle = volpath(hide_emitters=True) if hide_emitters else path(max_depth=8, rr_depth=50)
     views_agree(multiview(hide_emitters=hide_emitters), oracle, scene, whole=0.02, block=0.1, most=200)
 
 
