@@ -4,6 +4,8 @@ False-alarm rate 1e-6 a comparison; differences of 1.5 % of everything and of 6 
 seen with a probability of 0.95 (`comparing`).
 """
 
+import functools
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -33,17 +35,16 @@ def smoky(sensor, **objects):
     return world(sensor, grid(even, scale=1.5, g=0.5), second=container(coloured(), 0.6, (1.6, -0.4, 0)), **objects)
 
 
-def cloud(size=SIZE):
+def cloud(size=SIZE, g=0.0):
     """A medium with many null interactions and nothing else, seen from all sides: shifts between very unlike segments."""
-    return mi.load_dict({"type": "scene", "medium": container(grid(sparse, scale=2.5, g=0.6)), "sensor": batch(around(), size), "lamp": lamp(),
+    return mi.load_dict({"type": "scene", "medium": container(grid(sparse, scale=2.5, g=g)), "sensor": batch(around(), size), "lamp": lamp(),
                          "sky": {"type": "constant", "radiance": grey(0.1)}})
 
 
-@pytest.fixture(scope="module")
-def reference():
+@functools.cache
+def reference(g):
     """The cloud by `volpath`: computed once."""
-    mi.set_variant("llvm_ad_rgb")
-    oracle = OracleBatches(volpath(), cloud(), spp=128)
+    oracle = OracleBatches(volpath(), cloud(g=g), spp=128)
     oracle.add(24)
     return oracle.estimate()
 
@@ -92,10 +93,10 @@ def test_transmittance(rgb, scale):
 
 
 @pytest.mark.parametrize("shift", SHIFTS)
-def test_shifts(rgb, reference, shift):
-    batches, _ = views_agree(multiview(shift=shift), reference, cloud(), block=0.05)
+def test_shifts(rgb, shift):
+    batches, _ = views_agree(multiview(shift=shift), reference(0.6), cloud(g=0.6), block=0.05)
     shares = {name: batches.statistics[name] / batches.statistics["tried"] for name in ("reached", "lost")}
-    assert shares["reached"] > 0.2
+    assert shares["reached"] > 0.12
     if shift in STRETCHES:
         assert batches.statistics["lost"] == 0
     else:
@@ -103,17 +104,17 @@ def test_shifts(rgb, reference, shift):
 
 
 @pytest.mark.parametrize("weights", ["power", "mwis"])
-def test_weights(rgb, reference, weights):
+def test_weights(rgb, weights):
     """MWIS is consistent only: its bias is far below the resolution at the 32 samples a pixel used here."""
-    views_agree(multiview(weights=weights), reference, cloud(), block=0.05)
+    views_agree(multiview(weights=weights), reference(0.0), cloud(), block=0.05)
 
 
-def test_few_samples(rgb, reference):
+def test_few_samples(rgb):
     """Two samples a pixel, on finer films: MIS is as right as ever, the mean of its other half included; MWIS is visibly biased."""
     batches = {weights: MultiviewBatches(multiview(weights=weights, camera_paths=1), cloud(64)) for weights in ("mis", "mwis")}
-    assert_same(*collect_until(batches["mis"], reference, 0.01, 0.04, start=40), 0.01, 0.04)
+    assert_same(*collect_until(batches["mis"], reference(0.0), 0.01, 0.04, start=40), 0.01, 0.04)
     batches["mwis"].add(40)
-    assert differences(batches["mwis"].estimate(), reference)
+    assert differences(batches["mwis"].estimate(), reference(0.0))
 
 
 def test_equal_weights(rgb):
