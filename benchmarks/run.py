@@ -14,6 +14,7 @@ mi.set_variant("llvm_ad_rgb")
 import compare  # noqa: E402
 import converge  # noqa: E402
 import freezing  # noqa: E402
+import multiview  # noqa: E402
 import opinions  # noqa: E402
 import overview  # noqa: E402
 import radius  # noqa: E402
@@ -104,6 +105,14 @@ def _parser() -> argparse.ArgumentParser:
     references.add_options(command)
     _sweeps(command, 0.4)
     command.add_argument("--every-value", dest="coarse", action="store_false", help="all values of the sweeps instead of every other")
+
+    command = _measuring(commands, "multiview", multiview)
+    command.set_defaults(scenes=multiview.SCENES)
+    command.add_argument("--weights", nargs="+", default=["mis", "mwis"], help="weights of volpath_multiview (default: mis mwis)")
+    command.add_argument("--time", type=float, default=5, metavar="SECONDS", help="rendering seconds of each (default: 5)")
+    command.add_argument("--seeds", type=int, default=8, help="renders of each, at least two (default: 8)")
+    command.add_argument("--scale", type=float, default=1, help="film size, scene's own = 1 (default: 1)")
+    command.add_argument("--charts", action="store_true", help="draw the shifted densities (needs matplotlib)")
 
     for name, function in (("freeze-scenes", freezing.freeze), ("check-scenes", freezing.check)):
         command = commands.add_parser(name, help=function.__doc__, description=function.__doc__)

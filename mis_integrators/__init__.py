@@ -1,7 +1,7 @@
 """Integrators for Mitsuba 3 built on multiple importance sampling.
 
 Importing this package makes a usable LLVM known to Dr.Jit and registers every plugin for the active Mitsuba
-variant and for each variant set later; it does nothing else.
+variant and for each variant set later; it does nothing else. `render_views` renders several views of a scene together.
 """
 
 from . import llvm
@@ -13,3 +13,10 @@ from . import _plugins  # noqa: E402
 __version__ = "0.1.0"
 
 _plugins.follow_variants()
+
+
+def render_views(scene, integrator=None, spp=0, seed=0):
+    """Renders all views of a scene together; see `mis_integrators.integrators.volpath_multiview.render_views`."""
+    from .integrators import volpath_multiview
+
+    return volpath_multiview.render_views(scene, integrator, spp, seed)

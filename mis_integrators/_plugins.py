@@ -14,7 +14,7 @@ from . import llvm
 _PACKAGE = "mis_integrators.integrators"
 
 # Modules to load anew for a variant, those that others import first.
-MODULES: tuple[str, ...] = ("common", "bdpm", "weighted", "bdpm_balance", "bdpm_opt", "bdpt", "vcm")
+MODULES: tuple[str, ...] = ("common", "bdpm", "weighted", "bdpm_balance", "bdpm_opt", "bdpt", "vcm", "volpath_multiview")
 
 # Plugin name -> (module, class)
 PLUGINS: dict[str, tuple[str, str]] = {
@@ -25,6 +25,7 @@ PLUGINS: dict[str, tuple[str, str]] = {
     "bdpm_opt3": ("bdpm_opt", "BDPMOpt3"),
     "bdpt": ("bdpt", "BDPT"),
     "vcm": ("vcm", "VCM"),
+    "volpath_multiview": ("volpath_multiview", "VolpathMultiview"),
 }
 
 

@@ -151,6 +151,14 @@ def _parse(arguments: list[str] | None) -> argparse.Namespace:
     )
     parser.add_argument("--sensor", type=int, default=0, metavar="N", help="index of the sensor (default: 0)")
     parser.add_argument(
+        "--all-views",
+        action="store_true",
+        help="render all views of the scene together (all sensors, and the children of a batch) into a contact sheet",
+    )
+    parser.add_argument(
+        "--frames", action="store_true", help="also write each view, FILE.000.png and so on: frames of an animation"
+    )
+    parser.add_argument(
         "--variant",
         default="llvm_ad_rgb",
         choices=mi.variants(),
@@ -178,7 +186,7 @@ def _run(options: argparse.Namespace, interrupt: Interrupt) -> int:
         )
         sensor = _sensor(loaded.scene, options.sensor)
         spp = 0 if options.time else options.spp or sensor.sampler().sample_count()
-        session = make_session(loaded.integrator, loaded.scene, sensor, options.seed, spp)
+        session = _session(loaded, sensor, options, spp)
         clock = _render(session, sensor, options, interrupt)
     except loading.SCENE_ERRORS as error:
         raise Failure(EXIT_SCENE, loading.one_line(error)) from error
@@ -195,7 +203,7 @@ def _run(options: argparse.Namespace, interrupt: Interrupt) -> int:
         "renderTime": clock.rendering,
         "compileTime": clock.compiling,
     }
-    written = _write(options.output, session, metadata)
+    written = _write(options, session, metadata)
     report = (
         f"{metadata['spp']} samples per pixel in {clock.rendering:.1f} s (and {clock.compiling:.1f} s of "
         f"compiling): {written}"
@@ -212,7 +220,7 @@ def _render(session: Session, sensor: mi.Sensor, options: argparse.Namespace, in
     """Iterate until the planned samples or the given time are reached, or the user interrupts."""
     clock = Clock()
     width, height = sensor.film().crop_size()
-    paths = width * height * session.samples_per_iteration
+    paths = getattr(session, "pixels", width * height) * session.samples_per_iteration
     if options.time and hasattr(session, "plan_time"):
         session.plan_time(options.time)
     planned = session.iterations_planned
@@ -235,11 +243,29 @@ def _render(session: Session, sensor: mi.Sensor, options: argparse.Namespace, in
                 return clock
 
 
-def _write(path: Path, session: Session, metadata: dict[str, str | int | float]) -> str:
-    image, png = session.image(), path.with_suffix(".png")
+def _session(loaded: loading.LoadedScene, sensor: mi.Sensor, options: argparse.Namespace, spp: int) -> Session:
+    """The session that the options ask for; only some integrators render several views."""
+    if not hasattr(loaded.integrator, "views_session") and (options.all_views or options.frames):
+        option = "--all-views" if options.all_views else "--frames"
+        raise Failure(EXIT_SCENE, f'{option}: "{loaded.plugin}" renders one view at a time; use -i volpath_multiview')
+    if options.all_views:
+        return loaded.integrator.views_session(loaded.scene, seed=options.seed, spp=spp)
+    return make_session(loaded.integrator, loaded.scene, sensor, options.seed, spp)
+
+
+def _write(options: argparse.Namespace, session: Session, metadata: dict[str, str | int | float]) -> str:
+    path = options.output
+    png, channels = path.with_suffix(".png"), session.channels
+    views = session.view_images() if options.all_views or options.frames else []
+    image = output.contact_sheet(views) if options.all_views else session.image()
     try:
-        output.write_exr(path, image, session.channels, metadata)
-        return f"{path} and {png}" if output.write_png(png, image, session.channels) else str(path)
+        output.write_exr(path, image, channels, metadata)
+        written = f"{path} and {png}" if output.write_png(png, image, channels) else str(path)
+        if options.frames:
+            for number, view in enumerate(views):
+                output.write_png(output.frame_path(path, number), view, channels)
+            written += f", {len(views)} frames from {output.frame_path(path, 0)}"
+        return written
     except OSError as error:
         raise Failure(EXIT_OUTPUT, f"cannot write {path}: {error}") from error
 

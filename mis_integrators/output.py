@@ -61,6 +61,23 @@ def write_png(path: Path, image: np.ndarray, channels: Sequence[str]) -> bool:
     return True
 
 
+def contact_sheet(images: Sequence[np.ndarray]) -> np.ndarray:
+    """Images of shape (H, W, C) row by row on one that is about square, black between images that are smaller than the largest."""
+    height, width = (max(image.shape[axis] for image in images) for axis in (0, 1))
+    columns = max(1, round((len(images) * height / width) ** 0.5))
+    rows = -(-len(images) // columns)
+    sheet = np.zeros((rows * height, columns * width, images[0].shape[2]), np.float32)
+    for number, image in enumerate(images):
+        top, left = height * (number // columns), width * (number % columns)
+        sheet[top : top + image.shape[0], left : left + image.shape[1]] = image
+    return sheet
+
+
+def frame_path(path: Path, number: int) -> Path:
+    """Where the PNG of a view goes: ``NAME.000.png`` beside ``NAME.exr``."""
+    return path.with_suffix(f".{number:03d}.png")
+
+
 @contextmanager
 def _replacing(path: Path) -> Iterator[Path]:
     """A temporary path beside ``path`` that replaces it at once when the block ends without an error."""

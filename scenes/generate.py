@@ -1,4 +1,4 @@
-"""Write the meshes (PLY), textures (PNG) and the sky (EXR) of the bundled scenes.
+"""Write the meshes (PLY), textures (PNG) and the sky (EXR) of the bundled scenes, and the scenes with several views.
 
     python scenes/generate.py
 
@@ -8,6 +8,7 @@ Meshes are in metres, y up unless stated. NumPy does the work, Mitsuba's Bitmap 
 
 from pathlib import Path
 
+import generate_multiview
 import mitsuba as mi
 import numpy as np
 
@@ -293,6 +294,7 @@ def main():
     lattice()
     patina()
     sky()
+    generate_multiview.main()
 
 
 if __name__ == "__main__":

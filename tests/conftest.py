@@ -33,7 +33,8 @@ def _activate(variant: str) -> str:
 
 
 def pytest_addoption(parser):
-    parser.addoption("--vectors", metavar="DIR", help="folder with test vectors (optimal_weights.json), used instead of generated worlds")
+    parser.addoption("--vectors", metavar="DIR",
+                     help="folder with test vectors (optimal_weights.json, shifts.json, resampling.json), used instead of generated worlds")
     parser.addoption("--maps", metavar="DIR", default="out/ci", help="where variance maps are left (default: out/ci)")
     parser.addoption("--record-variances", action="store_true", help="take the variances found for those to be kept (variance_guard.json)")
 

@@ -20,13 +20,16 @@ class IterativeIntegrator(mi.AdjointIntegrator):
     A subclass reads its own parameters in `read_parameters` and makes the object that runs iterations in `new_session`.
     """
 
+    CAMERA_PATHS = 1, 1, "at least 1"
+    """Default, least value and range in words of the parameter `camera_paths`."""
+
     def __init__(self, props):
         parameters = Parameters(props)
         self.plugin = parameters.plugin
         self.max_depth = parameters.integer("max_depth", -1, -1, "-1 (unlimited) or at least 0")
         self.rr_depth = parameters.integer("rr_depth", 5, 1, "at least 1")
         self.hide_emitters = parameters.boolean("hide_emitters", False)
-        self.camera_paths = parameters.integer("camera_paths", 1, 1, "at least 1")
+        self.camera_paths = parameters.integer("camera_paths", *self.CAMERA_PATHS)
         self.variance = parameters.boolean("variance", False)
         self.read_parameters(parameters)
         parameters.finish()
@@ -38,6 +41,10 @@ class IterativeIntegrator(mi.AdjointIntegrator):
     def new_session(self, scene, sensor, seed, iterations):
         """The object that runs iterations; see `mis_integrators.session.Session`. Every subclass has its own."""
         raise TypeError(f"{type(self).__name__} does not define new_session")
+
+    def check(self, scene, sensor):
+        """Raises `UnsupportedScene` for a scene that this integrator cannot render."""
+        check_scene(scene, sensor, self.plugin)
 
     def aov_names(self):
         return variance_channels() if self.variance else []
@@ -54,17 +61,21 @@ class IterativeIntegrator(mi.AdjointIntegrator):
     def session(self, scene, sensor=0, seed=0, spp=0):
         """Prepares a rendering of `scene` with `spp` camera paths a pixel, or without a planned end if `spp` is 0."""
         sensor = self._sensor(scene, sensor)
-        check_scene(scene, sensor, self.plugin)
+        self.check(scene, sensor)
+        return self.new_session(scene, sensor, scalar_seed(seed), self.planned_iterations(spp, self.camera_paths))
+
+    def planned_iterations(self, spp, camera_paths):
+        """Iterations of `camera_paths` that make `spp` camera paths a pixel; None (no planned end) if `spp` is 0."""
         if not spp:
-            return self.new_session(scene, sensor, _scalar(seed), None)
-        iterations = math.ceil(spp / self.camera_paths)
-        if iterations * self.camera_paths != spp:
+            return None
+        iterations = math.ceil(spp / camera_paths)
+        if iterations * camera_paths != spp:
             mi.Log(mi.LogLevel.Warn, f"{self.plugin}: {spp} samples per pixel rounded up to {iterations} iterations of "
-                                     f"camera_paths = {self.camera_paths}")
+                                     f"camera_paths = {camera_paths}")
         if self.variance and iterations < 2:
             raise ValueError(f'{self.plugin}: parameter "variance" needs at least two iterations; ask for spp > '
-                             f'{self.camera_paths}')
-        return self.new_session(scene, sensor, _scalar(seed), iterations)
+                             f'{camera_paths}')
+        return iterations
 
     def _sensor(self, scene, sensor):
         check_variant(scene, self.plugin)
@@ -152,5 +163,6 @@ class IterativeSession:
         return [field.name for field in film.bitmap().struct_()]
 
 
-def _scalar(seed):
+def scalar_seed(seed):
+    """A seed as an integer, from one or from an array of width one."""
     return int(seed) if isinstance(seed, int) else int(np.array(seed).ravel()[0])

@@ -77,10 +77,11 @@ def _invariant_key(emitter):
 class Lights:
     """All emitters of a scene, chosen by power.
 
-    Parameters: `scene`; `guide`, an `EnvironmentGuide` or None (needed exactly if the scene has infinite emitters).
+    Parameters: `scene`; `guide`, an `EnvironmentGuide` or None (needed for light sub-paths exactly if the scene has infinite emitters);
+    `by_power`: choose emitters by power, or else evenly, as Mitsuba does (without a guide the power of infinite emitters says little).
     """
 
-    def __init__(self, scene, plugin="bdpm", guide=None):
+    def __init__(self, scene, plugin="bdpm", guide=None, by_power=True):
         self.scene = scene
         # Mitsuba loads a scene's objects in parallel, in no fixed order; random numbers must not depend on it.
         order = sorted(range(len(scene.emitters())), key=lambda i: _invariant_key(scene.emitters()[i]))
@@ -96,7 +97,7 @@ class Lights:
         if not self.emitters:
             return
         uniform = UNIFORM_SHARE * power.sum() / max(np.count_nonzero(power), 1)
-        weights = (1 - UNIFORM_SHARE) * power + uniform * (power > 0)
+        weights = (1 - UNIFORM_SHARE) * power + uniform * (power > 0) if by_power else power > 0
         self.choice = Choice(weights)
         self.numbers = registry_table(self.emitters, mi.EmitterPtr, range(len(self.emitters)), mi.UInt32)
         self.kind_table = mi.UInt32([_KINDS.index(k) for k in self.kinds])
@@ -180,12 +181,11 @@ class Lights:
 
     # ------------------------------------------------------------------ direct light
 
-    def sample_direct(self, ref, rng, active):
-        """Chooses a point on an emitter as seen from interaction `ref`.
+    def propose_direct(self, ref, rng, active):
+        """Chooses a point on an emitter as seen from interaction `ref`, whatever stands between.
 
-        Returns `(ds, weight, pdf)`: a `DirectionSample3f`, radiance over density with visibility included (zero where
-        blocked), and the density per solid angle with the emitter's choice included; `ds.delta` marks emitters that no ray
-        can meet.
+        Returns `(ds, weight, pdf)`: a `DirectionSample3f`, radiance over density (zero where nothing can be sampled), and the density per solid
+        angle with the emitter's choice included; `ds.delta` marks emitters that no ray can meet.
         """
         index, probability = self.choice.sample(rng.next_float32(active) if self.choice.count > 1 else mi.Float(0))
         emitter = self.pointer(index)
@@ -198,14 +198,25 @@ class Lights:
             weight = dr.select(textured, weight_t, weight)
         valid = active & (ds.pdf > 0) & dr.any(weight != 0)
         valid &= dr.isfinite(ds.pdf)
+        return ds, dr.select(valid, weight * dr.rcp(probability), 0), ds.pdf * probability
+
+    @staticmethod
+    def shadow_ray(ref, ds, infinite):
+        """The ray from `ref` to the light of `ds`. Where emitters may be `infinite`, their `ds.p` may lie on too small a sphere (see
+        `scene_bounds`), so their ray does not end."""
         shadow = ref.spawn_ray_to(ds.p)
-        if self.guide is not None:
-            # Infinite emitters place `ds.p` on a sphere that may be too small (see `scene_bounds`).
-            infinite, open_ray = mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite), ref.spawn_ray(ds.d)
-            shadow = mi.Ray3f(dr.select(infinite, open_ray.o, shadow.o), dr.select(infinite, open_ray.d, shadow.d),
-                              dr.select(infinite, open_ray.maxt, shadow.maxt), shadow.time, shadow.wavelengths)
-        visible = valid & ~self.scene.ray_test(shadow, valid)
-        return ds, dr.select(visible, weight * dr.rcp(probability), 0), ds.pdf * probability
+        if infinite:
+            far, open_ray = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite), ref.spawn_ray(ds.d)
+            shadow = mi.Ray3f(dr.select(far, open_ray.o, shadow.o), dr.select(far, open_ray.d, shadow.d),
+                              dr.select(far, open_ray.maxt, shadow.maxt), shadow.time, shadow.wavelengths)
+        return shadow
+
+    def sample_direct(self, ref, rng, active):
+        """`propose_direct` with visibility included in the weight (zero where blocked)."""
+        ds, weight, pdf = self.propose_direct(ref, rng, active)
+        valid = active & dr.any(weight != 0)
+        visible = valid & ~self.scene.ray_test(self.shadow_ray(ref, ds, self.guide is not None), valid)
+        return ds, dr.select(visible, weight, 0), pdf
 
     def unoccluded(self, ref, index, active):
         """Light that emitter `index` would bring to `ref` if nothing stood between, from one fixed point on it: `(ds, irradiance)`, a

@@ -129,12 +129,17 @@ def check_scene(scene, sensor, plugin):
     objects = scene_objects(scene)
     if any(isinstance(o, mi.Medium) for o in objects) or any(s.is_medium_transition() for s in scene.shapes()):
         raise UnsupportedScene(f'{plugin}: participating media are not supported by this surface integrator; use "volpath"')
+    check_emitters(scene, plugin)
+    if mi.has_flag(sensor.film().flags(), mi.FilmFlags.Special):
+        raise UnsupportedScene(f'{plugin}: film "specfilm" is not supported; use "hdrfilm"')
+
+
+def check_emitters(scene, plugin):
+    """Raises `UnsupportedScene` for emitters on which no points can be sampled."""
     for shape in scene.shapes():
         if shape.is_emitter() and shape.class_name() in _UNSAMPLED_SHAPES:
             raise UnsupportedScene(f'{plugin}: Mitsuba cannot sample points on a {shape.class_name()} shape, so it cannot be an '
                                    'emitter here; use a mesh, sphere, rectangle, disk or cylinder')
-    if mi.has_flag(sensor.film().flags(), mi.FilmFlags.Special):
-        raise UnsupportedScene(f'{plugin}: film "specfilm" is not supported; use "hdrfilm"')
 
 
 _UNSAMPLED_SHAPES = frozenset({"BSplineCurve", "LinearCurve", "CatmullRomCurve", "SDFGrid", "Ellipsoids", "EllipsoidsMesh"})

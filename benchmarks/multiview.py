@@ -1,0 +1,209 @@
+"""Several views at once: ``volpath_multiview`` against ``volpath`` of each view alone, in equal time; shares of invalid shifts; densities of the
+shifts.
+
+Variances are those of whole renders under different seeds, so they need no reference; each is divided by the squared mean + 0.01 before it is
+averaged over pixels. With `--charts`, Figure 3 of the paper is drawn: shifted densities.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from errors import RELATIVE_OFFSET
+from mis_integrators import loading
+from mis_integrators.session import PATHS_PER_PASS
+from mis_integrators.volume.shifts import SHIFTS, Sections, majorant_at, optical_depth
+from mis_integrators.volume.views import views_of
+from reports import Row, save, show, tell
+from scene_files import BUNDLED
+
+SCENES = sorted((BUNDLED / "multiview").glob("*.xml"))
+SLICE_SECONDS = 0.3
+
+
+class Together:
+    """All views by one session of `volpath_multiview`."""
+
+    def __init__(self, scene, parameters):
+        self.session = mi.load_dict({"type": "volpath_multiview", **parameters}).views_session(scene)
+
+    def restart(self, seed):
+        self.session.restart(seed)
+
+    def iterate(self):
+        self.session.iterate()
+
+    def images(self):
+        return [np.array(image)[:, :, :3] for image in self.session.view_tensors()]
+
+    @property
+    def samples(self):
+        """Camera paths a pixel so far."""
+        return self.session.iterations * self.session.samples_per_iteration
+
+
+class Apart:
+    """Each view, or each batch of views, by a render of its own, in passes as large as the time allows: what a pass costs besides counts little."""
+
+    def __init__(self, scene, parameters, plugin="volpath"):
+        self.scene, self.integrator = scene, mi.load_dict({"type": plugin, **parameters})
+        self.spp = 1
+        self.restart(0)
+        for _ in range(2):
+            self.iterate()          # compile
+
+    def tune(self, seconds):
+        """Chooses the samples of a pass so that about two passes last `seconds`."""
+        used = []
+        for self.spp in (1, 9):
+            self.iterate()          # compile
+            start = time.perf_counter()
+            self.iterate()
+            used.append(time.perf_counter() - start)
+        per_sample = max((used[1] - used[0]) / 8, 1e-4)
+        width, height = self.scene.sensors()[0].film().crop_size()
+        self.spp = int(np.clip((seconds / 2 - used[0]) / per_sample, 1, PATHS_PER_PASS // (width * height)))
+
+    def restart(self, seed):
+        self.seed, self.passes, self.sum, self.samples = seed, 0, 0.0, 0
+
+    def iterate(self):
+        images = []
+        for number in range(len(self.scene.sensors())):
+            seed = int(np.random.SeedSequence((self.seed, self.passes, number)).generate_state(1)[0])
+            with dr.suspend_grad():
+                images.append(np.array(mi.render(self.scene, sensor=number, integrator=self.integrator, seed=seed, spp=self.spp))[:, :, :3])
+        self.sum = [self.spp * image + before for image, before in zip(images, self.sum or [0.0] * len(images))]
+        self.passes += 1
+        self.samples += self.spp
+
+    def images(self):
+        return [image / self.samples for image in self.sum]
+
+
+def run(options: argparse.Namespace) -> None:
+    """The sub-command ``multiview``."""
+    rows: list[Row] = []
+    for path in options.scenes:
+        rows += compare(path, options)
+        show("Variance x time of volpath_multiview over that of volpath", rows)
+        save(options.out, "multiview", rows, vars(options))
+    shares = [share for path in options.scenes for share in invalid_shifts(path, options)]
+    show("Connections of one iteration", shares)
+    save(options.out, "multiview_shifts", shares, vars(options))
+    if options.charts:
+        draw_densities(options.out / "multiview_densities.png")
+
+
+def load(path: Path, options: argparse.Namespace):
+    """A scene with smaller films, and what its integrator hands on."""
+    loaded = loading.load(path, {}, None, {})
+    if options.scale != 1:
+        sensor = loaded.scene.sensors()[0]
+        views, (width, height) = len(views_of(sensor)), sensor.film().crop_size()
+        size = [views * max(1, round(int(width) // views * options.scale)), max(1, round(int(height) * options.scale))]
+        loaded = loading.load(path, {"resx": str(size[0]), "resy": str(size[1])}, None, {})
+    return loaded.scene, {name: loaded.parameters[name] for name in loading.INHERITED if name in loaded.parameters}
+
+
+def compare(path: Path, options: argparse.Namespace) -> list[Row]:
+    """A row for each choice of weights: the ratio of variance times time to that of `volpath`, over all pixels and for single views."""
+    scene, parameters = load(path, options)
+    apart = Apart(scene, parameters)
+    apart.tune(options.time)
+    methods = {weights: Together(scene, {**parameters, "weights": weights}) for weights in options.weights}
+    contenders = {"volpath": apart, **methods}
+    for contender in methods.values():
+        for _ in range(3):
+            contender.iterate()     # compile and record
+    images, used = {name: [] for name in contenders}, {name: [] for name in contenders}
+    for seed in range(1, options.seeds + 1):
+        seconds = equal_time(contenders, seed, options.time)
+        for name, contender in contenders.items():
+            images[name].append(np.concatenate(contender.images(), axis=1))
+            used[name].append((seconds[name], contender.samples))
+        tell(f"{path.stem}: {seed} of {options.seeds} seeds")
+    mean = np.mean(images["volpath"], axis=0)
+    divisor = mean ** 2 + RELATIVE_OFFSET
+    noise = {name: np.var(stack, axis=0, ddof=1) / divisor for name, stack in images.items()}
+    rows = []
+    for name in methods:
+        views = methods[name].session.views.count
+        ratios = [a.mean() / b.mean() for a, b in zip(*(np.array_split(noise[n].mean(axis=-1), views, axis=1) for n in (name, "volpath")))]
+        times = float(np.mean([s for s, _ in used[name]]) / np.mean([s for s, _ in used["volpath"]]))       # iterations overrun a little
+        rows.append({"scene": path.stem, "views": views, "weights": name, "ratio": times * float(noise[name].mean() / noise["volpath"].mean()),
+                     "best view": times * float(min(ratios)), "worst view": times * float(max(ratios)), "mean ratio": float(np.mean(images[name]) / mean.mean()),
+                     "samples": round(np.mean([n for _, n in used[name]])), "volpath samples": round(np.mean([n for _, n in used["volpath"]])),
+                     "time ratio": times})
+    return rows
+
+
+def equal_time(contenders: dict, seed: int, seconds: float) -> dict[str, float]:
+    """Lets each contender render for so long, in turns; returns what each has used."""
+    used = dict.fromkeys(contenders, 0.0)
+    for contender in contenders.values():
+        contender.restart(seed)
+    while unfinished := [name for name in contenders if used[name] < seconds]:
+        for name in unfinished:
+            end = used[name] + SLICE_SECONDS
+            while used[name] < min(end, seconds):
+                start = time.perf_counter()
+                contenders[name].iterate()
+                used[name] += time.perf_counter() - start
+    return used
+
+
+def invalid_shifts(path: Path, options: argparse.Namespace) -> list[Row]:
+    """What becomes of connections between views, for each shift."""
+    scene, parameters = load(path, options)
+    rows = []
+    for shift in SHIFTS:
+        session = Together(scene, {**parameters, "shift": shift, "max_depth": 2}).session
+        session.iterate()
+        counts = session.statistics
+        seen = max(counts["reached"] + counts["lost"], 1)
+        rows.append({"scene": path.stem, "shift": shift, "seen": (counts["reached"] + counts["lost"]) / max(counts["tried"], 1),
+                     "invalid": counts["lost"] / seen})
+    return rows
+
+
+# --- Figure 3 ---------------------------------------------------------------------------------------------
+
+
+def draw_densities(path: Path) -> None:
+    """Densities of interactions shifted from a segment on [0, 9] to one on [0, 3], next to the target's own: tentative, null and real."""
+    import matplotlib.pyplot as plt
+
+    target = Sections([0.0], [3.0], [2.0])
+
+    def real(t):                                    # extinction on the target
+        return 1.0 + 0.8 * np.sin(2.5 * t)
+
+    grid = np.linspace(1e-4, 3 - 1e-4, 600)
+    own = 2.0 * np.exp(-optical_depth(target, grid))
+    rng = np.random.default_rng(0)
+    figure, axes = plt.subplots(1, 3, figsize=(12, 3.6), sharey=True)
+    for axis, majorant in zip(axes, (0.2, 0.7, 2.0)):
+        base = Sections([0.0, 4.5], [4.5, 9.0], [majorant * 1.5, majorant * 0.5])
+        axis.plot(grid, own, "k", label="tentative")
+        axis.plot(grid, own * (1 - real(grid) / 2), "k--", label="null")
+        axis.plot(grid, own * real(grid) / 2, "k:", label="real")
+        for name in ("raw_depth", "majorant_optical_depth", "primary_sample"):
+            # Density of one interaction at t' if the base places the first one: p(t) / |S'|, p the free flight of the base.
+            t = np.sort(rng.uniform(0, 9, 4000))
+            shifted = SHIFTS[name](base, target, t)
+            density = majorant_at(base, t) * np.exp(-optical_depth(base, t)) / shifted.jacobian
+            axis.plot(shifted.t, density, label=name.replace("_", " "))
+        axis.set(title=f"base majorant {1.5 * majorant:.2g}, then {0.5 * majorant:.2g} [1/m]", xlabel="t' [m]", ylim=(0, 2.6))
+    axes[0].set_ylabel("density [1/m]")
+    axes[-1].legend(fontsize=7)
+    figure.tight_layout()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=130)
+    plt.close(figure)

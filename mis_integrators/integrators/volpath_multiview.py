@@ -1,0 +1,322 @@
+"""Plugin `volpath_multiview`: volumetric path tracing of several views that use each other's paths."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..transport.film import colour_channels, colour_matrix
+from ..transport.lights import Lights
+from ..transport.random import mix, streams
+from ..transport.recording import recorder
+from ..transport.traits import UnsupportedScene, check_variant
+from ..volume.films import OWN, SHARED, ViewAccumulator, own_values, splat, write_film
+from ..volume.lines import connect, own_line
+from ..volume.pivots import ON_SURFACE, OWN as OWN_BRANCH, pivot_surface, trace_first_segments
+from ..volume.shifts import SHIFTS
+from ..volume.suffixes import continue_paths, scattered_to
+from ..volume.traits import VolumeTraits, check_volume_scene
+from ..volume.views import Views
+from ..weights.multiview import HEURISTICS, gain, summand
+from .common import IterativeIntegrator, IterativeSession, scalar_seed
+
+PAIRS = 1 << 21
+"""Connections of paths to views that are made at once at most; more are made in parts (bounds memory)."""
+FEWEST = 1 << 12
+"""Camera paths that a part has at least."""
+LAUNCH = 1 << 16
+"""Camera paths that are worth a launch: of fewer, the longest keep the others waiting."""
+PATHS, WAVELENGTH = range(2)
+"""Purposes of an iteration's random seeds."""
+
+
+class VolpathMultiview(IterativeIntegrator):
+    r"""
+    .. _integrator-volpath_multiview:
+
+    Volumetric path tracing of several views (:monosp:`volpath_multiview`)
+    ----------------------------------------------------------------------
+
+    .. pluginparameters::
+
+     * - shift
+       - |string|
+       - How null interactions are moved from one view's line of sight to another's: ``majorant_optical_depth``, ``raw_depth`` or ``primary_sample``
+         stretch the depth, the same names with ``_copy`` keep it. (Default: ``majorant_optical_depth``)
+     * - weights
+       - |string|
+       - ``mis`` (balance heuristic), ``power`` (power heuristic, exponent 2), ``mwis`` (``mis`` divided by the sum of the weights that arrived
+         at each pixel: consistent, biased at few samples), or ``none`` (the same weight for every view that can make the path: unbiased and
+         noisy, for comparison). (Default: ``mis``)
+     * - camera_paths
+       - |int|
+       - Camera paths per pixel and iteration; 0 stands for as many as keep the processor busy, in eight iterations at least. (Default: 0)
+     * - variance
+       - |bool|
+       - Adds the channels ``var.R``, ``var.G``, ``var.B`` (mono: ``var.Y``): the estimated variance of the pixel mean over the
+         iterations, of which there must be two at least. (Default: no, i.e. |false|)
+     * - max_depth
+       - |int|
+       - Longest path in segments (-1: unlimited). A value of 1 shows only directly visible emitters, 2 adds single scattering, and so
+         on. (Default: -1)
+     * - rr_depth
+       - |int|
+       - Depth from which Russian roulette may end a path. (Default: 5)
+     * - hide_emitters
+       - |bool|
+       - Hide directly visible emitters. (Default: no, i.e. |false|)
+
+    The views are the children of a ``batch`` sensor, side by side on its film, or one sensor, or any list of sensors through
+    ``mis_integrators.render_views``. Each view's camera paths are traced to the first vertex that scatters, in a medium or on a surface. Every other
+    view that sees it joins there: the null interactions of the first segment are shifted onto its own line of sight, and all views share the rest
+    of the path.
+
+    With the weights ``mis`` the result is unbiased. Perspective and thin lens sensors are supported; polarised variants, gradients and the film
+    ``specfilm`` are refused by name.
+
+    .. tabs::
+        .. code-tab:: xml
+
+            <integrator type="volpath_multiview">
+                <string name="shift" value="majorant_optical_depth"/>
+                <integer name="max_depth" value="64"/>
+            </integrator>
+
+        .. code-tab:: python
+
+            'type': 'volpath_multiview',
+            'shift': 'majorant_optical_depth',
+            'max_depth': 64
+    """
+
+    CAMERA_PATHS = 0, 0, "at least 0 (0: automatic)"
+
+    def read_parameters(self, parameters):
+        self.shift = parameters.choice("shift", "majorant_optical_depth", tuple(SHIFTS))
+        self.weights = parameters.choice("weights", "mis", HEURISTICS)
+
+    def settings(self):
+        return {**super().settings(), "shift": self.shift, "weights": self.weights}
+
+    def session(self, scene, sensor=0, seed=0, spp=0):
+        sensor = self._sensor(scene, sensor)
+        return self._session(scene, [sensor], seed, spp)
+
+    def views_session(self, scene, seed=0, spp=0):
+        """Prepares a rendering of all views of a scene; see `render_views`."""
+        check_variant(scene, self.plugin)
+        if not scene.sensors():
+            raise UnsupportedScene(f"{self.plugin}: the scene has no sensor")
+        return self._session(scene, scene.sensors(), seed, spp)
+
+    def _session(self, scene, sensors, seed, spp):
+        check_volume_scene(scene, self.plugin)
+        for sensor in sensors:
+            Views.check_sensor(sensor, self.plugin)
+        camera_paths = self.camera_paths or self._automatic(sensors, spp)
+        iterations = self.planned_iterations(spp, camera_paths)
+        return MultiViewSession(self, scene, sensors, scalar_seed(seed), iterations, camera_paths)
+
+    @staticmethod
+    def _automatic(sensors, spp):
+        """Camera paths a pixel and iteration that make a launch of about `LAUNCH` paths; a divisor of `spp`, and at most an eighth of it."""
+        pixels = sum(int(w) * int(h) for w, h in (sensor.film().crop_size() for sensor in sensors))
+        most = max(1, min(LAUNCH // max(pixels, 1), spp // 8 if spp else 16))
+        return max(n for n in range(1, most + 1) if spp % n == 0)
+
+
+class MultiViewSession(IterativeSession):
+    """Iterations of `volpath_multiview`: first segments, connections, suffixes, splats.
+
+    `sensors` are sensors of the scene, alone or batches; films and images of the session itself are the first one's.
+    """
+
+    def __init__(self, integrator, scene, sensors, seed, iterations, camera_paths):
+        super().__init__(integrator, scene, sensors[0], seed, iterations)
+        self.samples_per_iteration = camera_paths
+        self.views = Views(sensors, camera_paths, integrator.plugin)
+        self.traits = VolumeTraits(scene, sensors)
+        self.lights = Lights(scene, integrator.plugin, by_power=False)
+        self.restart(seed)
+        self.slots = 1
+        self.paths = min(self.views.paths, max(PAIRS // self.views.count, FEWEST))
+        self.recorded = recorder()
+        self._freeze()
+
+    def restart(self, seed):
+        """Forgets what has been rendered, and goes on with another seed."""
+        self.seed = seed
+        self.accumulator = ViewAccumulator(self.views, self.integrator.variance, self.integrator.weights == "mwis")
+        self._counts = {name: mi.UInt64(0) for name in ("tried", "reached", "lost")}
+
+    @property
+    def settings(self):
+        return {**super().settings, "camera_paths": self.samples_per_iteration, "views": self.views.count}
+
+    def _freeze(self):
+        """Records the passes anew."""
+        self._tables = [self.views.table, *([] if self.lights.dark else self.lights.tables())]
+        self._first_pass, self._connection_pass, self._suffix_pass, self._splat_pass = map(
+            self.recorded, (self._trace_first, self._connect, self._continue, self._splat))
+
+    # ------------------------------------------------------------------ passes
+
+    def _trace_first(self, scene, tables, number, seed, spectral):
+        integrator = self.integrator
+        active = number < self.views.paths
+        pivot, radiance, rng = trace_first_segments(scene, self.views, self.traits, number, seed, streams(number, seed), spectral["wavelengths"],
+                                                    spectral["weight"], integrator.hide_emitters, active)
+        line, found = {}, mi.UInt32(0)
+        if self.views.count > 1:
+            shared = active & pivot["in_window"] & (pivot["branch"] != OWN_BRANCH)
+            line, found = own_line(scene, self.views, self.traits, pivot, self.slots, integrator.hide_emitters, shared)
+        return pivot, radiance, line, found
+
+    def _connect(self, scene, tables, pivots, lines, numbers, seed):
+        q = dr.arange(mi.UInt32, self.paths * self.views.count)
+        view, path = q // self.paths, q % self.paths
+        pivot, line = (dr.gather(type(record), record, path) if not isinstance(record, dict) else _gather(record, path) for record in (pivots, lines))
+        number = dr.gather(mi.UInt32, numbers, path)
+        active = (number < self.views.paths) & (view != pivot["view"])
+        connection, found = connect(scene, self.views, self.traits, SHIFTS[self.integrator.shift], pivot, line, view, number, seed, self.slots,
+                                    self.integrator.hide_emitters, active)
+        return connection, found
+
+    def _continue(self, scene, tables, pivot, connections, number, seed):
+        integrator = self.integrator
+        return continue_paths(scene, self.lights, self.traits, partial(summand, integrator.weights), pivot, connections, number, seed,
+                              self.views.count, integrator.max_depth, integrator.rr_depth, number < self.views.paths)
+
+    def _splat(self, scene, tables, pivots, radiance, connections, suffixes, value, numbers, spectral):
+        views, weights, matrix = self.views, self.integrator.weights, spectral["matrix"]
+        active = numbers < views.paths
+        own = own_values(radiance, pivots["visible"], value, gain(weights, mi.Float(1), suffixes["total"]), suffixes["alone"], matrix)
+        image = splat(views, [(pivots["view"], pivots["position"], own)], SHARED + OWN, [active])
+        if views.count == 1:
+            return image[:, :, :SHARED], image[:, :, SHARED:]
+        q = dr.arange(mi.UInt32, self.paths * views.count)
+        view, path = q // self.paths, q % self.paths
+        pivot, suffix = _gather(pivots, path), _gather(suffixes, path)
+        # The path's own view was served above.
+        reached = (connections["ratio"] > 0) & ~suffix["alone"]
+        surface = pivot_surface(pivot, reached & (pivot["kind"] == ON_SURFACE))
+        brought = scattered_to(suffix, pivot, surface, connections["d"], reached) * connections["tint"]
+        weight = gain(weights, connections["ratio"], suffix["total"])
+        colour = colour_channels(brought * weight, matrix)
+        shared = splat(views, [(view, connections["position"], [*colour, weight])], SHARED, [reached])
+        return image[:, :, :SHARED] + shared, image[:, :, SHARED:]
+
+    # ------------------------------------------------------------------ iterations
+
+    def _spectral(self, iteration):
+        """The wavelengths that all paths of an iteration share, and their conversion to colour."""
+        sample = dr.opaque(mi.Float, mix(self.seed, iteration, WAVELENGTH) / 2 ** 32)
+        wavelengths, weight = self.views.sensors[0].sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), sample)
+        spectral = {"wavelengths": wavelengths, "weight": weight, "matrix": colour_matrix(wavelengths)}
+        dr.make_opaque(spectral)
+        return spectral
+
+    def iterate(self):
+        """Runs one iteration to its end."""
+        with dr.suspend_grad():
+            seed, spectral = self._seed(self.iterations, PATHS), self._spectral(self.iterations)
+            layers = [self._part(first, seed, spectral) for first in range(0, self.views.paths, self.paths)]
+            self.accumulator.add(*(sum(layer[1:], layer[0]) for layer in zip(*layers)))
+            dr.eval(self.accumulator.shared, self.accumulator.own)
+            dr.sync_thread()
+
+    def _part(self, first, seed, spectral):
+        """One part of an iteration: its layers."""
+        numbers = dr.arange(mi.UInt32, self.paths) + dr.opaque(mi.UInt32, first)
+        dr.eval(numbers)
+        while True:
+            pivots, radiance, lines, found = self._first_pass(self.scene, self._tables, numbers, seed, spectral)
+            connections, more = None, mi.UInt32(0)
+            if self.views.count > 1:
+                dr.eval(pivots, radiance, lines, found)
+                connections, more = self._connection_pass(self.scene, self._tables, pivots, lines, numbers, seed)
+                dr.eval(connections, more)
+            suffixes, value = self._suffix_pass(self.scene, self._tables, pivots, connections, numbers, seed)
+            dr.eval(suffixes, value)
+            layers = self._splat_pass(self.scene, self._tables, pivots, radiance, connections, suffixes, value, numbers, spectral)
+            dr.eval(layers)
+            needed = int(dr.maximum(dr.max(found), dr.max(more))[0])
+            if needed <= self.slots:
+                break
+            self.slots = needed
+            self._freeze()
+        if connections is not None:
+            for name, kind in (("reached", connections["ratio"] > 0), ("lost", connections["ratio"] < 0)):
+                self._counts[name] += mi.UInt64(dr.sum(dr.select(kind, mi.UInt32(1), mi.UInt32(0))))
+            self._counts["tried"] += self.paths * (self.views.count - 1)
+            dr.schedule(self._counts)
+        return layers
+
+    @property
+    def statistics(self):
+        """Connections `tried` so far, how many `reached` their view, and how many a shift has `lost`."""
+        return {name: int(count[0]) for name, count in self._counts.items()}
+
+    # ------------------------------------------------------------------ results
+
+    @property
+    def pixels(self):
+        """Pixels of all views together."""
+        return sum(width * height for width, height in self.views.sizes)
+
+    def view_images(self):
+        """The images so far, one a view: float32, (height, width, channels)."""
+        images = [np.array(tensor, dtype=np.float32) for tensor in self.view_tensors()]
+        return [image if image.ndim == 3 else image[:, :, None] for image in images]
+
+    def view_tensors(self):
+        """The images so far, one tensor a view, as films develop them."""
+        images, first = [], 0
+        pictures = self.accumulator.pictures()
+        for sensor, members in zip(self.views.groups, self.views.members):
+            image = self._fill(sensor.film(), pictures[first:first + members]).develop()
+            width = self.views.sizes[first][0]
+            images += [image[:, i * width:(i + 1) * width] for i in range(members)]
+            first += members
+        dr.eval(images)
+        return images
+
+    def _fill(self, film, pictures):
+        """Writes pictures side by side into a film."""
+        film.clear()
+        film.prepare(self.integrator.aov_names())
+        write_film(film, pictures[0] if len(pictures) == 1 else dr.concat(pictures, axis=1))
+        return film
+
+    def fill_film(self):
+        """Hands what has been rendered so far to the sensor's film, side by side for a `batch`."""
+        self._fill(self.sensor.film(), self.accumulator.pictures()[:self.views.members[0]])
+
+
+def _gather(record, index):
+    """The entries `index` of every array of a dictionary (and of lists in it)."""
+    return {name: [dr.gather(type(v), v, index) for v in value] if isinstance(value, list) else dr.gather(type(value), value, index)
+            for name, value in record.items()}
+
+
+def render_views(scene, integrator=None, spp=0, seed=0):
+    """Renders all views of `scene` together: the children of its `batch` sensors, and its other sensors, in their order.
+
+    `integrator` is a `volpath_multiview` (default: the scene's own if it is one, else one with its default parameters), `spp` the samples per
+    pixel (0: the most that a sensor's sampler asks for). Returns a list of tensors (height, width, channels), one a view, as each view's film
+    develops it; films may differ in size. Raises `UnsupportedScene` for what cannot be rendered.
+    """
+    if integrator is None:
+        own = scene.integrator()
+        integrator = own if hasattr(own, "views_session") else mi.load_dict({"type": "volpath_multiview"})
+    if not hasattr(integrator, "views_session"):
+        raise UnsupportedScene(f"render_views: the integrator must be a volpath_multiview, not {integrator.class_name()}")
+    with dr.suspend_grad():
+        spp = spp or max((sensor.sampler().sample_count() for sensor in scene.sensors()), default=1)
+        session = integrator.views_session(scene, seed, spp)
+        for _ in range(session.iterations_planned):
+            session.iterate()
+        return session.view_tensors()

@@ -1,0 +1,1 @@
+"""Media along a line of sight: sections, shifts between segments, transmittance, volumetric paths, views."""
