@@ -2,7 +2,7 @@
 
 Sources: Nabata, Iwasaki and Dobashi, Resampling-aware weighting functions for bidirectional path tracing using multiple light sub-paths,
 ACM Transactions on Graphics 39 (2020), doi 10.1145/3338994; the resampling itself: Popov, Ramamoorthi, Durand and Drettakis, Probabilistic
-connections for bidirectional path tracing, Computer Graphics Forum 34 (2015), doi 10.1111/cgf.12673.
+connections for bidirectional path tracing, Computer Graphics Forum 34 (2015), doi 10.1111/cgf.12680.
 
 M light sub-paths Y_{s,i} of every length s = 1 ... S are traced, and an eye sub-path Z connects to N of all S M of them, drawn with
 probabilities proportional to q*(Y Z) / p(Y). Arrays of any shape that broadcasts, NumPy or Dr.Jit, one element a light sub-path:
