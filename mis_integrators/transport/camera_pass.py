@@ -37,6 +37,34 @@ def film_sample_count(sensor):
     return (int(size[0]) + border) * (int(size[1]) + border)
 
 
+def start_camera_paths(sensor, seed, first, stride: int, n_paths: int, camera_paths: int, wavelength_sample):
+    """Camera rays of `n_paths` paths, numbers `first`, `first + stride`, ... of `film_samples`.
+
+    Returns `(path, active, rng, ray, weight, splat, aperture)`: the index of each, whether there is a path of that number, its random numbers, the
+    ray and its weight, the position for splatting, and the sample that chose the point of the lens.
+    """
+    path = dr.arange(mi.UInt32, n_paths)
+    number = path * stride + first
+    active = number < film_sample_count(sensor) * camera_paths
+    rng = streams(number, seed)
+    unit, splat = film_samples(sensor, number, camera_paths, rng)
+    aperture = next_2d(rng) if sensor.needs_aperture_sample() else mi.Point2f(0.5)
+    time = mi.Float(sensor.shutter_open())
+    if sensor.shutter_open_time() > 0:
+        time += rng.next_float32() * sensor.shutter_open_time()
+    ray, weight = sensor.sample_ray(time, wavelength_sample, unit, aperture, active)
+    return path, active, rng, mi.Ray3f(ray), weight, splat, aperture
+
+
+def behind_emitters(scene, integrator, hit, ray, active):
+    """Camera rays that meet an emitter's shape, and their hits, moved on to what is behind it (`hide_emitters`)."""
+    on_light = active & hit.is_valid() & (hit.shape.emitter() != None)  # noqa: E711 (array comparison)
+    behind = hit.compute_surface_interaction(ray, mi.RayFlags.Minimal, on_light).spawn_ray(ray.d)
+    hit[on_light] = integrator.skip_area_emitters(scene, behind, True, on_light)
+    ray.o[on_light] = behind.o
+    return hit, ray
+
+
 def new_vertex_buffer(capacity, weighted=False):
     """Room for `capacity` camera vertices that wait for photons: what rebuilds the surface interaction there, the path's
     throughput up to it, its path's number, and its depth in segments with the top bit set where all photons are wanted (else
@@ -75,20 +103,8 @@ def trace_camera_paths(scene, sensor, integrator, lights, traits, seed, first, s
     light `ds`. The vertex buffer is then one section for each smooth vertex of the path, of `capacity` each (a path's last vertex in the last
     section), and `count` has one entry for each.
     """
-    path = dr.arange(mi.UInt32, n_paths)
-    number = path * stride + first
-    active = number < film_sample_count(sensor) * camera_paths
-    rng = streams(number, seed)
-    unit, splat = film_samples(sensor, number, camera_paths, rng)
-    aperture = mi.Point2f(0.5)
-    if dr.hint(sensor.needs_aperture_sample(), mode='scalar'):
-        aperture = next_2d(rng)
-    time = mi.Float(sensor.shutter_open())
-    if dr.hint(sensor.shutter_open_time() > 0, mode='scalar'):
-        time += rng.next_float32() * sensor.shutter_open_time()
-    ray, sensor_weight = sensor.sample_ray(time, wavelength_sample, unit, aperture, active)
+    path, active, rng, ray, sensor_weight, splat, _ = start_camera_paths(sensor, seed, first, stride, n_paths, camera_paths, wavelength_sample)
 
-    ray = mi.Ray3f(ray)
     throughput = mi.Spectrum(sensor_weight)
     radiance = mi.Spectrum(0)
     vertex = mi.UInt32(0)                            # smooth vertices left behind
@@ -113,11 +129,7 @@ def trace_camera_paths(scene, sensor, integrator, lights, traits, seed, first, s
 
     hit = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
     if dr.hint(hide_emitters, mode='scalar'):
-        on_light = active & hit.is_valid() & (hit.shape.emitter() != None)  # noqa: E711 (array comparison)
-        behind = hit.compute_surface_interaction(ray, mi.RayFlags.Minimal, on_light).spawn_ray(ray.d)
-        skipped = integrator.skip_area_emitters(scene, behind, True, on_light)
-        hit[on_light] = skipped
-        ray.o[on_light] = behind.o
+        hit, ray = behind_emitters(scene, integrator, hit, ray, active)
 
     while dr.hint(active, label="camera paths"):
         si = hit.compute_surface_interaction(ray, mi.RayFlags.All, active=active)

@@ -55,6 +55,28 @@ def sample_perturbed(bsdf, si, bs, delta, weight, rng, active, perturbed):
     return bs, delta, dr.select(perturbed, special, weight)
 
 
+def scatter_light(traits, si, bsdf, rng, active):
+    """Samples where a light sub-path goes on from a surface.
+
+    Returns `(bs, delta, weight, wo, active)`: Mitsuba's BSDF sample, whether a delta function scattered, the flux's factor, the direction in world
+    space, and the paths that go on: those end for which shading and geometric normal disagree about the side. The factor includes the adjoint one
+    of shading normals (Veach 1997, section 5.3).
+    """
+    bs, weight = bsdf.sample(mi.BSDFContext(mi.TransportMode.Importance), si, rng.next_float32(active), next_2d(rng, active), active)
+    delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+    if traits.has_perturbed:
+        perturbed = lookup(traits.perturbed, bsdf, mi.Bool, active)
+        bs, delta, weight = sample_perturbed(bsdf, si, bs, delta, weight, rng, active, perturbed)
+    wo = si.to_world(bs.wo)
+    wi_shading, wo_shading = mi.Frame3f.cos_theta(si.wi), mi.Frame3f.cos_theta(bs.wo)
+    wi_geometric, wo_geometric = dr.dot(si.n, si.to_world(si.wi)), dr.dot(si.n, wo)
+    active = active & (wi_geometric * wi_shading > 0) & (wo_geometric * wo_shading > 0)
+    adjoint = dr.abs(wi_shading * wo_geometric / (wo_shading * wi_geometric))
+    if traits.has_perturbed:
+        adjoint = dr.select(perturbed, dr.abs(wo_geometric / wi_geometric), adjoint)
+    return bs, delta, weight * adjoint, wo, active
+
+
 @dr.syntax
 def trace_light_paths(scene, lights, traits, seed, n_paths: int, capacity: int, wavelengths, shutter_open: float,
                       shutter_time: float, max_depth: int, rr_depth: int, keep_direct: bool = False, notebook=None):
@@ -98,7 +120,6 @@ def trace_light_paths(scene, lights, traits, seed, n_paths: int, capacity: int, 
     depth = dr.zeros(mi.UInt32, lanes)
     eta = dr.ones(mi.Float, lanes)
     active = dr.full(mi.Bool, False, lanes)
-    context = mi.BSDFContext(mi.TransportMode.Importance)
 
     while dr.hint(active | (path < n_paths), label="light sub-paths"):
         # ---- Start the lane's next path where one has ended
@@ -153,21 +174,10 @@ def trace_light_paths(scene, lights, traits, seed, n_paths: int, capacity: int, 
         # ---- Go on: a photon on the next surface needs one more segment, and the camera one after it
         if dr.hint(max_depth > 0, mode='scalar'):
             active &= depth + 2 <= max_depth
-        bs, weight = bsdf.sample(context, si, rng.next_float32(active), next_2d(rng, active), active)
-        delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-        if dr.hint(traits.has_perturbed, mode='scalar'):
-            perturbed = lookup(traits.perturbed, bsdf, mi.Bool, active)
-            bs, delta, weight = sample_perturbed(bsdf, si, bs, delta, weight, rng, active, perturbed)
-        wo = si.to_world(bs.wo)
-        wi_geometric, wo_geometric = dr.dot(si.n, -ray.d), dr.dot(si.n, wo)
-        wi_shading, wo_shading = mi.Frame3f.cos_theta(si.wi), mi.Frame3f.cos_theta(bs.wo)
-        active &= (wi_geometric * wi_shading > 0) & (wo_geometric * wo_shading > 0)
-        adjoint = dr.abs(wi_shading * wo_geometric / (wo_shading * wi_geometric))
-        if dr.hint(traits.has_perturbed, mode='scalar'):
-            adjoint = dr.select(perturbed, dr.abs(wo_geometric / wi_geometric), adjoint)
+        bs, delta, weight, wo, active = scatter_light(traits, si, bsdf, rng, active)
         if dr.hint(notebook is not None, mode='scalar'):
             notes = notebook.scattered(notes, si, bsdf, bs.wo, active & ~delta)
-        flux *= weight * adjoint
+        flux *= weight
         had_delta |= delta
         scattered |= ~delta
         eta *= bs.eta
