@@ -14,7 +14,7 @@ from . import llvm
 _PACKAGE = "mis_integrators.integrators"
 
 # Modules to load anew for a variant, those that others import first.
-MODULES: tuple[str, ...] = ("common", "bdpm", "weighted", "bdpm_balance", "bdpm_opt")
+MODULES: tuple[str, ...] = ("common", "bdpm", "weighted", "bdpm_balance", "bdpm_opt", "bdpt")
 
 # Plugin name -> (module, class)
 PLUGINS: dict[str, tuple[str, str]] = {
@@ -23,6 +23,7 @@ PLUGINS: dict[str, tuple[str, str]] = {
     "bdpm_opt": ("bdpm_opt", "BDPMOpt"),
     "bdpm_opt2": ("bdpm_opt", "BDPMOpt2"),
     "bdpm_opt3": ("bdpm_opt", "BDPMOpt3"),
+    "bdpt": ("bdpt", "BDPT"),
 }
 
 

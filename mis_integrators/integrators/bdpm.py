@@ -7,11 +7,12 @@ import mitsuba as mi
 
 from ..transport.camera_pass import film_sample_count, trace_camera_paths
 from ..transport.coverage import covered_share
-from ..transport.film import colour_matrix, splat_samples
+from ..transport.film import shared_wavelengths, splat_samples
 from ..transport.gather import gather_photons
 from ..transport.guide import EnvironmentGuide, infinite_emitters
 from ..transport.light_pass import trace_light_paths
 from ..transport.lights import Lights
+from ..transport.packing import rounded_up
 from ..transport.photon_map import build_photon_map, smallest_cell
 from ..transport.random import mix
 from ..transport.recording import recorder
@@ -128,7 +129,7 @@ class BDPMSession(IterativeSession):
                                                       (self.traits.has_delta and (depth < 0 or depth >= 3)))
         self.has_indirect = not self.lights.dark and (depth < 0 or depth >= integrator.bdd + 3)
         self.one_vertex = not self.traits.has_mixed and (integrator.bdd == 0 or not self.has_caustics)
-        self.photon_capacity = _rounded_up(3 * self.light_paths)
+        self.photon_capacity = rounded_up(3 * self.light_paths)
         self.vertex_capacity = self._vertex_room(self.chunk)
         self.radii = {kind: integrator.initial_radius for kind in self.kinds()} if integrator.initial_radius else None
         self.corrected = {kind: False for kind in self.kinds()}
@@ -226,11 +227,7 @@ class BDPMSession(IterativeSession):
 
     def _spectral(self, iteration):
         """The wavelengths that all sub-paths of an iteration share, the sample that makes them, and their conversion to colour."""
-        sample = dr.opaque(mi.Float, mix(self.seed, iteration, WAVELENGTH) / 2 ** 32)
-        wavelengths, _ = self.sensor.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), sample)
-        spectral = {"sample": sample, "wavelengths": wavelengths, "matrix": colour_matrix(wavelengths)}
-        dr.make_opaque(spectral)
-        return spectral
+        return shared_wavelengths(self.sensor, mix(self.seed, iteration, WAVELENGTH))
 
     # ------------------------------------------------------------------ iterations
 
@@ -241,7 +238,7 @@ class BDPMSession(IterativeSession):
             photons = self._light_pass(self.scene, self.sensor, self._tables, self._seed(iteration, LIGHT), spectral)
             dr.eval(photons)
             found = int(photons[2][0])
-            room = _rounded_up(found + found // 8 + 1024)
+            room = rounded_up(found + found // 8 + 1024)
             spare = self.photon_capacity - 2 * room
             if found <= self.photon_capacity and (self._sized or spare < SPARE_PHOTONS):
                 return photons
@@ -268,16 +265,10 @@ class BDPMSession(IterativeSession):
                 wanted = 0 if self.one_vertex else int(dr.max(count)[0])
                 if wanted <= self.vertex_capacity or not radii:
                     break
-                self.vertex_capacity = _rounded_up(wanted + wanted // 8)
+                self.vertex_capacity = rounded_up(wanted + wanted // 8)
                 self._freeze()
             total = block if total is None else total + block
         return total
-
-
-def _rounded_up(count):
-    """The next of 4, 5, 6, 7, 8, 10, 12, ...: few different buffer sizes, for they are literals of cached kernels."""
-    step = 1 << max(count.bit_length() - 3, 0)
-    return -(-count // step) * step
 
 
 LIGHT, CAMERA, WAVELENGTH = range(3)

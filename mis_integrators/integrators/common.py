@@ -126,8 +126,8 @@ class IterativeSession:
             dr.eval(self.accumulator.total)
             dr.sync_thread()
 
-    def _seed(self, iteration, purpose):
-        return dr.opaque(mi.UInt32, mix(self.seed, iteration, purpose))
+    def _seed(self, iteration, *purpose):
+        return dr.opaque(mi.UInt32, mix(self.seed, iteration, *purpose))
 
     def fill_film(self):
         """Hands what has been rendered so far to the sensor's film, ready to develop."""

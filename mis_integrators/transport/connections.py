@@ -54,7 +54,7 @@ def join(traits, camera, light, wavelengths, active):
 
 def by_path(vertices, count, lengths, capacity: int):
     """`(start, order)`: the kept vertices of sub-path i, in the order of their `number`, are at the places `order[start[i]]`, `order[start[i] + 1]`, ..."""
-    start = dr.prefix_sum(lengths, exclusive=True)
+    start = dr.prefix_sum(lengths)
     dr.eval(start)
     index = dr.arange(mi.UInt32, capacity)
     active = index < dr.gather(mi.UInt32, count, 0)
@@ -102,7 +102,7 @@ def list_pairs(camera, camera_count, camera_capacity: int, light, start, order, 
 
 def visible(scene, connection, camera, active):
     """Whether nothing stands between the two ends."""
-    return unblocked(scene, camera["p"], camera["n"], connection.d, connection.distance * (1 - 1e-4), active)
+    return unblocked(scene, camera["p"], camera["n"], connection.d, connection.distance, active)
 
 
 @dataclass

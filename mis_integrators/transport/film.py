@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 
 def colour_matrix(wavelengths):
@@ -14,6 +15,16 @@ def colour_matrix(wavelengths):
     count = dr.size_v(mi.Spectrum)
     units = [mi.Spectrum(*[float(i == j) for j in range(count)]) for i in range(count)]
     return [mi.Color3f(mi.spectrum_to_srgb(unit, wavelengths)) for unit in units]
+
+
+def shared_wavelengths(sensor, number):
+    """The wavelengths that all sub-paths of an iteration share, the sample that makes them (from `number`, 32 random bits), and their conversion
+    to colour: a dictionary of opaque arrays `sample`, `wavelengths`, `matrix`."""
+    sample = dr.opaque(mi.Float, number / 2 ** 32)
+    wavelengths, _ = sensor.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), sample)
+    spectral = {"sample": sample, "wavelengths": wavelengths, "matrix": colour_matrix(wavelengths)}
+    dr.make_opaque(spectral)
+    return spectral
 
 
 def colour_channels(radiance, matrix):
@@ -36,6 +47,43 @@ def splat_samples(film, position, radiance, alpha, matrix, active):
         values.append(alpha)
     block.put(position, values + [mi.Float(1)], active)
     return block.tensor()
+
+
+def splat_light(film, position, value, matrix, active):
+    """Sums of filter weight times colour of light that meets the sensor: an image tensor (height, width, 3), border included."""
+    block = mi.ImageBlock(film.crop_size(), film.crop_offset(), 3, film.rfilter(), border=True, coalesce=False)
+    colour = colour_channels(value, matrix)
+    block.put(position, [colour.x, colour.y, colour.z], active)
+    return block.tensor()
+
+
+def expected_weight(film, camera_paths):
+    """Expected sum of filter weights that `camera_paths` samples a pixel leave in each pixel of a block, border included: a tensor (height, width, 1).
+
+    What light sub-paths bring to the sensor is divided by this, not by the weights that the camera's samples happen to have."""
+    rfilter = film.rfilter()
+    radius, border = float(rfilter.radius()), rfilter.border_size()
+    steps = 4096
+    x = (np.arange(steps) + 0.5) * (2 * radius / steps) - radius
+    cumulative = np.concatenate([[0], np.cumsum(np.array(rfilter.eval(mi.Float(x)), dtype=np.float64)) * (2 * radius / steps)])
+    spread = border if film.sample_border() else 0
+
+    def along(size):
+        middle = np.arange(-border, size + border) + 0.5
+        low, high = (np.clip(edge - middle, -radius, radius) for edge in (-spread, size + spread))
+        return np.interp(high, np.linspace(-radius, radius, steps + 1), cumulative) - \
+            np.interp(low, np.linspace(-radius, radius, steps + 1), cumulative)
+
+    width, height = film.crop_size()
+    return mi.TensorXf((camera_paths * np.outer(along(height), along(width)))[:, :, None].astype(np.float32))
+
+
+def with_light(block, light, expected):
+    """A block of camera samples (`splat_samples`) plus light that meets the sensor (`splat_light`), which gets the block's own weights
+    over the `expected_weight`: then both are divided by the same, and the mean over iterations stays unbiased."""
+    scale = dr.select(expected > 1e-6, block[:, :, -1:] / dr.maximum(expected, 1e-6), 0)
+    colour = block[:, :, :3] + light * scale
+    return dr.concat([colour, block[:, :, 3:]], axis=2)
 
 
 class Accumulator:

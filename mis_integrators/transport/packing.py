@@ -1,5 +1,5 @@
 """Unit vectors and small integers in 32 bits, so that a photon's position and what its distance test needs next to it
-share one 16-byte record."""
+share one 16-byte record; and the sizes and targets of buffers."""
 
 import drjit as dr
 import mitsuba as mi
@@ -80,6 +80,12 @@ def unpack_depth(word):
 def unpack_caustic(word):
     """The kind stored by `pack_surface`: true for caustic photons."""
     return (word >> 31) != 0
+
+
+def rounded_up(count):
+    """The next of 4, 5, 6, 7, 8, 10, 12, ...: few different buffer sizes, for they are literals of cached kernels."""
+    step = 1 << max(count.bit_length() - 3, 0)
+    return -(-count // step) * step
 
 
 class Store:

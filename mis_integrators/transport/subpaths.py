@@ -63,6 +63,11 @@ def _keep(store, junction, si, hit, towards, throughput, path, depth, number, pa
     return slot
 
 
+def _either(mask, yes, no):
+    """Element by element, of two states."""
+    return [dr.select(mask, a, b) for a, b in zip(yes, no)]
+
+
 def read_vertices(vertices, index, active, only=None):
     """The vertices at places `index` (all their fields, or those of the list `only`); zero on inactive lanes."""
     return {name: dr.gather(type(values), values, index, active) for name, values in vertices.items() if only is None or name in only}
@@ -137,8 +142,8 @@ def trace_light_subpaths(scene, lights, traits, weights, seed, n_paths: int, cap
 
         # ---- Arrive
         first = active & begin
-        state = [dr.select(first, a, b) for a, b in zip(weights.lit(si, source, ~unreachable, first),
-                 weights.arrived(state, density * dr.abs(dr.dot(si.n, towards)) * dr.rcp(dr.maximum(dr.squared_norm(si.p - origin), 1e-20))))]
+        arrival = density * dr.abs(dr.dot(si.n, towards)) * dr.rcp(dr.maximum(dr.squared_norm(si.p - origin), 1e-20))
+        state = _either(first, weights.lit(si, source, ~unreachable, first), weights.arrived(state, arrival))
         smooth = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
         junction = Junction.at(traits, si, bsdf, smooth)
         slot = _keep(store, junction, si, hit, towards, flux, path, depth, number, parent, state, weights.states, capacity, smooth)
@@ -151,7 +156,7 @@ def trace_light_subpaths(scene, lights, traits, weights, seed, n_paths: int, cap
             active &= depth + 2 <= max_depth
         bs, delta, weight, wo, active = scatter_light(traits, si, bsdf, rng, active)
         unused, p_back, p_forward = junction.between(wo, towards, active & ~delta)
-        state = [dr.select(active, a, b) for a, b in zip(weights.left(state, p_forward, p_back, delta), state)]
+        state = _either(active, weights.left(state, p_forward, p_back, delta), state)
         density = dr.select(delta, 0, p_forward * dr.abs(dr.dot(si.n, wo)))
         origin = mi.Point3f(si.p)
         flux *= weight
@@ -235,8 +240,8 @@ def trace_camera_subpaths(scene, sensor, integrator, lights, traits, weights, se
         of_rays = mi.Float(0)
         if dr.hint(lens.connects, mode='scalar'):
             of_rays = cosine * lens.density(si.p, si.time, aperture, begin & inside)
-        state = [dr.select(begin, a, b) for a, b in zip(weights.seen(of_rays, begin),
-                 weights.arrived(state, density * cosine * dr.rcp(dr.maximum(dr.squared_norm(si.p - origin.p), 1e-20))))]
+        arrival = density * cosine * dr.rcp(dr.maximum(dr.squared_norm(si.p - origin.p), 1e-20))
+        state = _either(begin, weights.seen(of_rays, begin), weights.arrived(state, arrival))
         junction = Junction.at(traits, si, bsdf, smooth)
 
         # ---- Direct light
@@ -266,7 +271,7 @@ def trace_camera_subpaths(scene, sensor, integrator, lights, traits, weights, se
         visible |= active & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
         wo = si.to_world(bs.wo)
         unused, p_forward, p_back = junction.between(towards, wo, active & ~delta)
-        state = [dr.select(active, a, b) for a, b in zip(weights.left(state, p_forward, p_back, delta), state)]
+        state = _either(active, weights.left(state, p_forward, p_back, delta), state)
         density = dr.select(delta, 0, p_forward * dr.abs(dr.dot(si.n, wo)))
         origin = mi.Interaction3f(si)
         throughput *= weight

@@ -1,0 +1,170 @@
+"""Plugin `bdpt`: bidirectional path tracing."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from ..transport.camera_pass import film_sample_count
+from ..transport.connections import by_path, join, join_sensor, list_pairs, visible
+from ..transport.film import expected_weight, shared_wavelengths, splat_light, splat_samples, with_light
+from ..transport.guide import EnvironmentGuide, infinite_emitters
+from ..transport.lenses import Lens
+from ..transport.lights import Lights
+from ..transport.packing import rounded_up
+from ..transport.random import mix, next_2d, streams
+from ..transport.recording import recorder
+from ..transport.subpaths import read_vertices, trace_camera_subpaths, trace_light_subpaths
+from ..transport.traits import SceneTraits
+from .common import IterativeIntegrator, IterativeSession
+from .connection_weights import ConnectionWeights
+
+CHUNK = 1 << 19
+"""Camera paths, and as many light sub-paths, traced at once at most; larger films are traced in parts (bounds memory)."""
+
+
+class BDPT(IterativeIntegrator):
+    """(docs below)"""
+
+    def read_parameters(self, parameters):
+        self.beta = parameters.number("beta", 1.0, lambda beta: 1 <= beta <= 8, "from 1 (balance) to 8; 2 is the power heuristic")
+
+    def settings(self):
+        return {**super().settings(), "beta": self.beta}
+
+    def new_session(self, scene, sensor, seed, iterations):
+        return BDPTSession(self, scene, sensor, seed, iterations)
+
+
+class BDPTSession(IterativeSession):
+    """Iterations of `bdpt`: light sub-paths, camera sub-paths, connections, the light that meets the sensor."""
+
+    def __init__(self, integrator, scene, sensor, seed, iterations):
+        super().__init__(integrator, scene, sensor, seed, iterations)
+        self.traits = SceneTraits(scene)
+        guide = EnvironmentGuide(scene, sensor) if infinite_emitters(scene) else None
+        self.lights = Lights(scene, integrator.plugin, guide)
+        self.path_count = film_sample_count(sensor) * integrator.camera_paths
+        self.chunks = -(-self.path_count // CHUNK)
+        self.chunk = -(-self.path_count // self.chunks)
+        self.light_paths = self.chunks * self.chunk
+        width, height = sensor.film().crop_size()
+        self.pixel_paths = width * height * integrator.camera_paths
+        self.capacity = {"light": rounded_up(3 * self.chunk), "camera": rounded_up(3 * self.chunk), "pairs": rounded_up(4 * self.chunk)}
+        self.lens = Lens(sensor).connects
+        depth = integrator.max_depth
+        self.bidirectional = not self.lights.dark and (depth < 0 or depth >= 2)
+        self.expected_weight = expected_weight(sensor.film(), integrator.camera_paths)
+        self.recorded = recorder()
+        self._freeze()
+
+    def _freeze(self):
+        """Records the passes anew; from the second iteration on, their kernels run without their Python."""
+        self._tables = [self.traits.lambertian, self.traits.perturbed, *self.lights.tables()]
+        self._light_pass = self.recorded(self._trace_light)
+        self._camera_pass = self.recorded(self._trace_camera)
+        self._pair_pass = self.recorded(self._list_pairs)
+        self._connection_pass = self.recorded(self._connect)
+        self._sensor_pass = self.recorded(self._join_sensor)
+
+    def weights(self):
+        """The weights of this session."""
+        integrator = self.integrator
+        beta = int(integrator.beta) if integrator.beta == int(integrator.beta) else integrator.beta
+        return ConnectionWeights(self.lights, beta, self.light_paths / self.pixel_paths)
+
+    # ------------------------------------------------------------------ passes
+
+    def _trace_light(self, scene, sensor, tables, seed, spectral):
+        return trace_light_subpaths(scene, self.lights, self.traits, self.weights(), seed, self.chunk, self.capacity["light"],
+                                    spectral["wavelengths"], sensor.shutter_open(), sensor.shutter_open_time(),
+                                    self.integrator.max_depth, self.integrator.rr_depth)
+
+    def _trace_camera(self, scene, sensor, tables, seed, first, spectral):
+        integrator = self.integrator
+        return trace_camera_subpaths(scene, sensor, integrator, self.lights, self.traits, self.weights(), seed, first, self.chunk,
+                                     integrator.camera_paths, spectral["sample"], integrator.max_depth, integrator.rr_depth,
+                                     integrator.hide_emitters, self.capacity["camera"])
+
+    def _list_pairs(self, light, camera, camera_count):
+        vertices, count, lengths = light
+        start, order = by_path(vertices, count, lengths, self.capacity["light"])
+        return list_pairs(camera, camera_count, self.capacity["camera"], vertices, start, order, lengths, self.integrator.max_depth,
+                          self.capacity["pairs"])
+
+    def _connect(self, scene, tables, radiance, camera, light, pairs, spectral):
+        """Radiance of camera paths with that of connections added."""
+        camera_place, light_place, count = pairs
+        index = dr.arange(mi.UInt32, self.capacity["pairs"])
+        active = index < dr.gather(mi.UInt32, count, 0)
+        z = read_vertices(camera, dr.gather(mi.UInt32, camera_place, index, active), active)
+        y = read_vertices(light, dr.gather(mi.UInt32, light_place, index, active), active)
+        pair = join(self.traits, z, y, spectral["wavelengths"], active)
+        seen = visible(scene, pair, z, active & (dr.max(pair.value) > 0))
+        value = pair.value * self.weights().connected(pair, z, y)
+        total = mi.Spectrum(radiance)
+        dr.scatter_reduce(dr.ReduceOp.Add, total, value, z["path"], seen)
+        return total
+
+    def _join_sensor(self, scene, sensor, tables, light, seed, spectral):
+        """Block of the light that meets the sensor."""
+        vertices, count, _ = light
+        index = dr.arange(mi.UInt32, self.capacity["light"])
+        active = index < dr.gather(mi.UInt32, count, 0)
+        aperture = next_2d(streams(index, seed)) if sensor.needs_aperture_sample() else mi.Point2f(0.5)
+        y = read_vertices(vertices, index, active)
+        joined = join_sensor(scene, self.integrator, self.traits, Lens(sensor), y, aperture, mi.Float(sensor.shutter_open()),
+                             spectral["wavelengths"], self.integrator.hide_emitters, active)
+        value = joined.value * self.weights().seen_by_sensor(joined, y) * (self.pixel_paths / self.light_paths)
+        return splat_light(sensor.film(), joined.film, value, spectral["matrix"], joined.active)
+
+    def _splat(self, sensor, radiance, alpha, position, first, spectral):
+        if self.integrator.hide_emitters:
+            radiance = dr.select(alpha > 0, radiance, 0)       # as `path` does: what is behind nothing but null surfaces is hidden
+        active = dr.arange(mi.UInt32, self.chunk) + first < self.path_count
+        return splat_samples(sensor.film(), position, radiance, alpha, spectral["matrix"], active)
+
+    # ------------------------------------------------------------------ iterations
+
+    def _grown(self, name, count):
+        """Whether the `count` (an array of width one) found more than there is room for; then there will be more room."""
+        found = int(count[0])
+        if found <= self.capacity[name]:
+            return False
+        self.capacity[name] = rounded_up(found + found // 8)
+        self._freeze()
+        return True
+
+    def _chunk(self, iteration, chunk, spectral):
+        """Blocks of camera and light of one part of the paths; the latter None if there is none. Passes whose buffers overflow run again."""
+        first = dr.opaque(mi.UInt32, chunk * self.chunk)
+        light = None
+        while self.bidirectional:
+            light = self._light_pass(self.scene, self.sensor, self._tables, self._seed(iteration, LIGHT, chunk), spectral)
+            if not self._grown("light", light[1]):
+                break
+        while True:
+            radiance, alpha, position, camera, count = self._camera_pass(self.scene, self.sensor, self._tables, self._seed(iteration, CAMERA),
+                                                                         first, spectral)
+            if not self.bidirectional or not self._grown("camera", count):
+                break
+        lit = None
+        if self.bidirectional:
+            while True:
+                pairs = self._pair_pass(light, camera, count)
+                if not self._grown("pairs", pairs[2]):
+                    break
+            radiance = self._connection_pass(self.scene, self._tables, radiance, camera, light[0], pairs, spectral)
+            if self.lens:
+                lit = self._sensor_pass(self.scene, self.sensor, self._tables, light, self._seed(iteration, APERTURE, chunk), spectral)
+        return self._splat(self.sensor, radiance, alpha, position, first, spectral), lit
+
+    def _iteration(self, iteration):
+        spectral = shared_wavelengths(self.sensor, mix(self.seed, iteration, WAVELENGTH))
+        parts = [self._chunk(iteration, chunk, spectral) for chunk in range(self.chunks)]
+        block, light = (sum(blocks[1:], blocks[0]) if blocks[0] is not None else None for blocks in zip(*parts))
+        return block if light is None else with_light(block, light, self.expected_weight)
+
+
+LIGHT, CAMERA, WAVELENGTH, APERTURE = range(4)
+"""Purposes of an iteration's random seeds."""
