@@ -334,6 +334,14 @@ class Lights:
             density = dr.select(chosen, value, density)
         return density
 
+    def can_be_met(self, emitter, active):
+        """Whether a ray can meet the emitter and see light there."""
+        return active & self._of_kind(lookup(self.numbers, emitter, mi.UInt32, active), "area", "environment", active=active)
+
+    def untold(self, emitter, active):
+        """Emitters whose light rays Mitsuba samples without telling their density; `forward_density` is made up."""
+        return active & self._of_kind(lookup(self.numbers, emitter, mi.UInt32, active), "ray", active=active)
+
     def _of_kind(self, index, *names, active=True):
         kind = dr.gather(mi.UInt32, self.kind_table, index, active)
         result = mi.Bool(False)
