@@ -7,7 +7,8 @@ import mitsuba as mi
 
 from ..transport.camera_pass import film_sample_count
 from ..transport.connections import by_path, join, join_sensor, list_pairs, visible
-from ..transport.film import expected_weight, shared_wavelengths, splat_light, splat_samples, with_light
+from ..transport.film import (as_camera_weights, colour_channels, expected_weight, shared_wavelengths, splat_channels, splat_samples,
+                              with_colour)
 from ..transport.guide import EnvironmentGuide, infinite_emitters
 from ..transport.lenses import Lens
 from ..transport.lights import Lights
@@ -18,9 +19,12 @@ from ..transport.subpaths import read_vertices, trace_camera_subpaths, trace_lig
 from ..transport.traits import SceneTraits
 from .common import IterativeIntegrator, IterativeSession
 from .connection_weights import ConnectionWeights
+from .pyramid import Ledger, camera_images, sensor_images, technique_channels, with_rest
 
 CHUNK = 1 << 19
 """Camera paths, and as many light sub-paths, traced at once at most; larger films are traced in parts (bounds memory)."""
+
+THINNING = 0.1
 
 
 class BDPT(IterativeIntegrator):
@@ -29,8 +33,14 @@ class BDPT(IterativeIntegrator):
     def read_parameters(self, parameters):
         self.beta = parameters.number("beta", 1.0, lambda beta: 1 <= beta <= 8, "from 1 (balance) to 8; 2 is the power heuristic")
 
+        self.techniques = parameters.integer("techniques", 0, 0, "from 0 (none) to 10", high=10)
+        self.technique_weights = parameters.boolean("technique_weights", True)
+
+    def aov_names(self):
+        return super().aov_names() + (technique_channels(self.techniques, self.technique_weights) if self.techniques else [])
+
     def settings(self):
-        return {**super().settings(), "beta": self.beta}
+        return {**super().settings(), "beta": self.beta, "techniques": self.techniques, "technique_weights": self.technique_weights}
 
     def new_session(self, scene, sensor, seed, iterations):
         return BDPTSession(self, scene, sensor, seed, iterations)
@@ -55,6 +65,7 @@ class BDPTSession(IterativeSession):
         depth = integrator.max_depth
         self.bidirectional = not self.lights.dark and (depth < 0 or depth >= 2)
         self.expected_weight = expected_weight(sensor.film(), integrator.camera_paths)
+        self.pyramid = None
         self.recorded = recorder()
         self._freeze()
 
@@ -82,29 +93,39 @@ class BDPTSession(IterativeSession):
 
     def _trace_camera(self, scene, sensor, tables, seed, first, spectral):
         integrator = self.integrator
-        return trace_camera_subpaths(scene, sensor, integrator, self.lights, self.traits, self.weights(), seed, first, self.chunk,
-                                     integrator.camera_paths, spectral["sample"], integrator.max_depth, integrator.rr_depth,
-                                     integrator.hide_emitters, self.capacity["camera"])
+        ledger = self._ledger() if integrator.techniques else None
+        radiance, alpha, position, vertices, count = trace_camera_subpaths(
+            scene, sensor, integrator, self.lights, self.traits, self.weights(), seed, first, self.chunk, integrator.camera_paths,
+            spectral["sample"], integrator.max_depth, integrator.rr_depth, integrator.hide_emitters, self.capacity["camera"], ledger)
+        return radiance, alpha, position, vertices, count, ledger.entries if ledger else None
 
-    def _list_pairs(self, light, camera, camera_count):
+    def _ledger(self, entries=None):
+        return Ledger(self.chunk, self.integrator.techniques, self.integrator.technique_weights, entries)
+
+    def _list_pairs(self, tables, light, radiance, camera, camera_count, seed):
         vertices, count, lengths = light
         start, order = by_path(vertices, count, lengths, self.capacity["light"])
-        return list_pairs(camera, camera_count, self.capacity["camera"], vertices, start, order, lengths, self.integrator.max_depth,
-                          self.capacity["pairs"])
+        level = dr.zeros(mi.Float, self.chunk) + dr.mean(dr.mean(radiance)) * THINNING
+        dr.eval(level, start, order)
+        return list_pairs(self.traits, self.weights(), camera, camera_count, self.capacity["camera"], vertices, start, order, lengths,
+                          self.integrator.max_depth, self.capacity["pairs"], level, seed)
 
-    def _connect(self, scene, tables, radiance, camera, light, pairs, spectral):
+    def _connect(self, scene, tables, radiance, camera, light, pairs, spectral, entries):
         """Radiance of camera paths with that of connections added."""
-        camera_place, light_place, count = pairs
+        camera_place, light_place, factor, count = pairs
         index = dr.arange(mi.UInt32, self.capacity["pairs"])
         active = index < dr.gather(mi.UInt32, count, 0)
         z = read_vertices(camera, dr.gather(mi.UInt32, camera_place, index, active), active)
         y = read_vertices(light, dr.gather(mi.UInt32, light_place, index, active), active)
         pair = join(self.traits, z, y, spectral["wavelengths"], active)
         seen = visible(scene, pair, z, active & (dr.max(pair.value) > 0))
-        value = pair.value * self.weights().connected(pair, z, y)
+        share = self.weights().connected(pair, z, y) * dr.gather(mi.Float, factor, index, active)
         total = mi.Spectrum(radiance)
-        dr.scatter_reduce(dr.ReduceOp.Add, total, value, z["path"], seen)
-        return total
+        dr.scatter_reduce(dr.ReduceOp.Add, total, pair.value * share, z["path"], seen)
+        if entries:
+            ledger = self._ledger(dict(entries))
+            ledger.joined(z["path"], z["depth"], y["depth"], pair.value, share, seen)
+        return total, entries
 
     def _join_sensor(self, scene, sensor, tables, light, seed, spectral):
         """Block of the light that meets the sensor."""
@@ -115,14 +136,23 @@ class BDPTSession(IterativeSession):
         y = read_vertices(vertices, index, active)
         joined = join_sensor(scene, self.integrator, self.traits, Lens(sensor), y, aperture, mi.Float(sensor.shutter_open()),
                              spectral["wavelengths"], self.integrator.hide_emitters, active)
-        value = joined.value * self.weights().seen_by_sensor(joined, y) * (self.pixel_paths / self.light_paths)
-        return splat_light(sensor.film(), joined.film, value, spectral["matrix"], joined.active)
+        value = joined.value * (self.pixel_paths / self.light_paths)
+        share = self.weights().seen_by_sensor(joined, y)
+        channels = list(colour_channels(value * share, spectral["matrix"]))
+        if self.integrator.techniques:
+            value = value * share if self.integrator.technique_weights else value
+            channels += sensor_images(self.integrator.techniques, y["depth"], value, spectral["matrix"])
+        return splat_channels(sensor.film(), joined.film, channels, joined.active)
 
-    def _splat(self, sensor, radiance, alpha, position, first, spectral):
-        if self.integrator.hide_emitters:
-            radiance = dr.select(alpha > 0, radiance, 0)       # as `path` does: what is behind nothing but null surfaces is hidden
+    def _splat(self, radiance, alpha, position, first, spectral, entries):
+        """Block of the camera paths, and that of their techniques (or None)."""
         active = dr.arange(mi.UInt32, self.chunk) + first < self.path_count
-        return splat_samples(sensor.film(), position, radiance, alpha, spectral["matrix"], active)
+        film, techniques = self.sensor.film(), None
+        shown = alpha > 0 if self.integrator.hide_emitters else mi.Bool(True)   # as `path`: what is behind nothing but null surfaces is hidden
+        if entries:
+            channels = camera_images(self._ledger(entries), spectral["matrix"])
+            techniques = splat_channels(film, position, [dr.select(shown, channel, 0) for channel in channels], active)
+        return splat_samples(film, position, dr.select(shown, radiance, 0), alpha, spectral["matrix"], active), techniques
 
     # ------------------------------------------------------------------ iterations
 
@@ -136,35 +166,48 @@ class BDPTSession(IterativeSession):
         return True
 
     def _chunk(self, iteration, chunk, spectral):
-        """Blocks of camera and light of one part of the paths; the latter None if there is none. Passes whose buffers overflow run again."""
+        """Blocks of one part of the paths: of camera paths, of their techniques, of light that met the sensor (None where there is none)."""
         first = dr.opaque(mi.UInt32, chunk * self.chunk)
-        light = None
+        light = lit = None
         while self.bidirectional:
             light = self._light_pass(self.scene, self.sensor, self._tables, self._seed(iteration, LIGHT, chunk), spectral)
             if not self._grown("light", light[1]):
                 break
         while True:
-            radiance, alpha, position, camera, count = self._camera_pass(self.scene, self.sensor, self._tables, self._seed(iteration, CAMERA),
-                                                                         first, spectral)
+            radiance, alpha, position, camera, count, entries = self._camera_pass(
+                self.scene, self.sensor, self._tables, self._seed(iteration, CAMERA), first, spectral)
             if not self.bidirectional or not self._grown("camera", count):
                 break
-        lit = None
         if self.bidirectional:
             while True:
-                pairs = self._pair_pass(light, camera, count)
-                if not self._grown("pairs", pairs[2]):
+                pairs = self._pair_pass(self._tables, light, radiance, camera, count, self._seed(iteration, THIN, chunk))
+                if not self._grown("pairs", pairs[-1]):
                     break
-            radiance = self._connection_pass(self.scene, self._tables, radiance, camera, light[0], pairs, spectral)
+            radiance, entries = self._connection_pass(self.scene, self._tables, radiance, camera, light[0], pairs, spectral, entries)
             if self.lens:
                 lit = self._sensor_pass(self.scene, self.sensor, self._tables, light, self._seed(iteration, APERTURE, chunk), spectral)
-        return self._splat(self.sensor, radiance, alpha, position, first, spectral), lit
+        return *self._splat(radiance, alpha, position, first, spectral, entries), lit
 
     def _iteration(self, iteration):
         spectral = shared_wavelengths(self.sensor, mix(self.seed, iteration, WAVELENGTH))
         parts = [self._chunk(iteration, chunk, spectral) for chunk in range(self.chunks)]
-        block, light = (sum(blocks[1:], blocks[0]) if blocks[0] is not None else None for blocks in zip(*parts))
-        return block if light is None else with_light(block, light, self.expected_weight)
+        block, techniques, light = (None if blocks[0] is None else sum(blocks[1:], blocks[0]) for blocks in zip(*parts))
+        if light is not None:
+            light = as_camera_weights(light, block, self.expected_weight)
+            block = with_colour(block, light[:, :, :3])
+            techniques = None if techniques is None else techniques + light[:, :, 3:]
+        if techniques is not None:
+            techniques = with_rest(techniques, block) if self.integrator.technique_weights else techniques
+            self.pyramid = techniques if self.pyramid is None else self.pyramid + techniques
+            dr.eval(self.pyramid)
+        return block
+
+    def fill_film(self):
+        film = self.sensor.film()
+        film.clear()
+        film.prepare(self.integrator.aov_names())
+        self.accumulator.put(film, self.pyramid)
 
 
-LIGHT, CAMERA, WAVELENGTH, APERTURE = range(4)
+LIGHT, CAMERA, WAVELENGTH, APERTURE, THIN = range(5)
 """Purposes of an iteration's random seeds."""

@@ -13,7 +13,8 @@ import mitsuba as mi
 from .junctions import SMALLEST_COSINE
 from .lenses import unblocked, unblocked_by_visible
 from .packing import Store
-from .subpaths import junction_of, read_vertices
+from .random import streams
+from .subpaths import STATES, junction_of, read_vertices
 
 
 @dataclass
@@ -59,45 +60,54 @@ def by_path(vertices, count, lengths, capacity: int):
     index = dr.arange(mi.UInt32, capacity)
     active = index < dr.gather(mi.UInt32, count, 0)
     order = dr.zeros(mi.UInt32, capacity)
-    place = dr.gather(mi.UInt32, start, dr.gather(mi.UInt32, vertices["path"], index, active), active)
-    dr.scatter(order, index, place + dr.gather(mi.UInt32, vertices["number"], index, active), active)
+    vertex = read_vertices(vertices, index, active, ("path", "number"))
+    dr.scatter(order, index, dr.gather(mi.UInt32, start, vertex["path"], active) + vertex["number"], active)
     return start, order
 
 
+LAMBERTIAN = ("p", "path", "throughput", "density", "ns", "depth", "towards", "value", "n", *STATES)
+"""Fields of a vertex that a connection of Lambertian vertices needs."""
+
+
 @dr.syntax
-def list_pairs(camera, camera_count, camera_capacity: int, light, start, order, lengths, max_depth: int, capacity: int):
+def list_pairs(traits, weights, camera, camera_count, camera_capacity: int, light, start, order, lengths, max_depth: int, capacity: int, level, seed):
     """Every camera vertex with every vertex of the light sub-path of its own number, as far as `max_depth` lets them.
 
-    Left out are pairs of Lambertian vertices that turn their backs on each other. Returns `(camera places, light places, count)`.
+    Pairs of Lambertian vertices are thinned out by what they would bring if nothing stood between (Russian roulette): those worth less than `level`
+    [radiance, channel mean; an array with one number a camera path] stay with a probability in proportion. Returns `(camera places, light
+    places, one over that probability, count)`.
     """
-    store = Store(camera=dr.empty(mi.UInt32, capacity), light=dr.empty(mi.UInt32, capacity), count=dr.zeros(mi.UInt32, 1))
+    store = Store(camera=dr.empty(mi.UInt32, capacity), light=dr.empty(mi.UInt32, capacity), factor=dr.empty(mi.Float, capacity),
+                  count=dr.zeros(mi.UInt32, 1))
     index = dr.arange(mi.UInt32, camera_capacity)
     active = index < dr.gather(mi.UInt32, camera_count, 0)
-    path = dr.gather(mi.UInt32, camera["path"], index, active)
-    depth = dr.gather(mi.UInt32, camera["depth"], index, active)
-    p, n = dr.gather(mi.Point3f, camera["p"], index, active), dr.gather(mi.Vector3f, camera["ns"], index, active)
-    n = dr.mulsign(n, dr.dot(n, dr.gather(mi.Vector3f, camera["towards"], index, active)))
-    simple = dr.gather(mi.Float, camera["density"], index, active) >= 0
-    place = dr.gather(mi.UInt32, start, path, active)
-    left = dr.gather(mi.UInt32, lengths, path, active)
+    rng = streams(index, seed)
+    z = read_vertices(camera, index, active, LAMBERTIAN)
+    level = dr.gather(mi.Float, level, z["path"], active)
+    place = dr.gather(mi.UInt32, start, z["path"], active)
+    left = dr.gather(mi.UInt32, lengths, z["path"], active)
 
     while dr.hint(left > 0, label="pairs"):
         vertex = dr.gather(mi.UInt32, order, place)
+        y = read_vertices(light, vertex, True, LAMBERTIAN)
         keep = mi.Bool(True)
         if dr.hint(max_depth > 0, mode='scalar'):
-            keep &= dr.gather(mi.UInt32, light["depth"], vertex) + depth + 1 <= max_depth
-        offset = dr.gather(mi.Point3f, light["p"], vertex, keep) - p
-        keep &= ~simple | (dr.dot(offset, n) > 0)
-        normal = dr.gather(mi.Vector3f, light["ns"], vertex, keep)
-        normal = dr.mulsign(normal, dr.dot(normal, dr.gather(mi.Vector3f, light["towards"], vertex, keep)))
-        keep &= (dr.gather(mi.Float, light["density"], vertex, keep) < 0) | (dr.dot(offset, normal) < 0)
+            keep &= y["depth"] + z["depth"] + 1 <= max_depth
+        chance = mi.Float(1)
+        if dr.hint(traits.has_lambertian, mode='scalar'):
+            pair = join(traits, z, y, [], keep)
+            worth = dr.mean(pair.value) * weights.connected(pair, z, y)
+            simple = (y["density"] >= 0) & (z["density"] >= 0)
+            chance = dr.select(simple, dr.minimum(worth * dr.rcp(dr.maximum(level, 1e-30)), 1), 1)
+            keep &= rng.next_float32() < chance
         slot = dr.scatter_inc(store.count, mi.UInt32(0), keep)
         keep &= slot < capacity
         dr.scatter(store.camera, index, slot, keep)
         dr.scatter(store.light, vertex, slot, keep)
+        dr.scatter(store.factor, dr.rcp(chance), slot, keep)
         place += 1
         left -= 1
-    return store.camera, store.light, store.count
+    return store.camera, store.light, store.factor, store.count
 
 
 def visible(scene, connection, camera, active):

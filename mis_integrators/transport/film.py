@@ -39,21 +39,16 @@ def colour_channels(radiance, matrix):
 def splat_samples(film, position, radiance, alpha, matrix, active):
     """Reconstructs one pass: an image tensor (height, width, channels), border included, that holds sums of filter weight
     times (R, G, B, [alpha,] 1); `matrix` as for `colour_channels`."""
-    channels = 5 if mi.has_flag(film.flags(), mi.FilmFlags.Alpha) else 4
-    block = mi.ImageBlock(film.crop_size(), film.crop_offset(), channels, film.rfilter(), border=True, coalesce=False)
-    colour = colour_channels(radiance, matrix)
-    values = [colour.x, colour.y, colour.z]
+    values = list(colour_channels(radiance, matrix))
     if mi.has_flag(film.flags(), mi.FilmFlags.Alpha):
         values.append(alpha)
-    block.put(position, values + [mi.Float(1)], active)
-    return block.tensor()
+    return splat_channels(film, position, values + [mi.Float(1)], active)
 
 
-def splat_light(film, position, value, matrix, active):
-    """Sums of filter weight times colour of light that meets the sensor: an image tensor (height, width, 3), border included."""
-    block = mi.ImageBlock(film.crop_size(), film.crop_offset(), 3, film.rfilter(), border=True, coalesce=False)
-    colour = colour_channels(value, matrix)
-    block.put(position, [colour.x, colour.y, colour.z], active)
+def splat_channels(film, position, channels, active):
+    """Image tensor (height, width, channels), border included, of sums of filter weight times the values `channels`."""
+    block = mi.ImageBlock(film.crop_size(), film.crop_offset(), len(channels), film.rfilter(), border=True, coalesce=False)
+    block.put(position, channels, active)
     return block.tensor()
 
 
@@ -78,12 +73,15 @@ def expected_weight(film, camera_paths):
     return mi.TensorXf((camera_paths * np.outer(along(height), along(width)))[:, :, None].astype(np.float32))
 
 
-def with_light(block, light, expected):
-    """A block of camera samples (`splat_samples`) plus light that meets the sensor (`splat_light`), which gets the block's own weights
+def as_camera_weights(light, block, expected):
+    """Sums of filter weight times light that meets the sensor (`splat_channels`), times the camera samples' own weights in `block` (`splat_samples`)
     over the `expected_weight`: then both are divided by the same, and the mean over iterations stays unbiased."""
-    scale = dr.select(expected > 1e-6, block[:, :, -1:] / dr.maximum(expected, 1e-6), 0)
-    colour = block[:, :, :3] + light * scale
-    return dr.concat([colour, block[:, :, 3:]], axis=2)
+    return light * dr.select(expected > 1e-6, block[:, :, -1:] / dr.maximum(expected, 1e-6), 0)
+
+
+def with_colour(block, colour):
+    """A block of camera samples with `colour` (height, width, 3) added to its own."""
+    return dr.concat([block[:, :, :3] + colour, block[:, :, 3:]], axis=2)
 
 
 class Accumulator:
@@ -125,8 +123,9 @@ class Accumulator:
         spread = self.square - 2 * mean * self.cross + mean * mean * self.weight_square
         return dr.maximum(spread, 0) * (n / ((n - 1) * safe * safe))
 
-    def put(self, film):
-        """Writes the accumulated image, with variance channels where kept, into a film prepared with matching AOVs."""
+    def put(self, film, extra=None):
+        """Writes the accumulated image, with variance channels where kept, into a film prepared with matching AOVs. `extra`: a tensor of more
+        channels, summed with the same weights."""
         tensor = self.total
         if self.with_variance:
             weight = tensor[:, :, -1:]
@@ -134,6 +133,8 @@ class Accumulator:
             if mi.is_monochromatic:
                 variance = variance[:, :, :1]
             tensor = dr.concat([tensor, variance], axis=2)
+        if extra is not None:
+            tensor = dr.concat([tensor, extra], axis=2)
         film.put_block(mi.ImageBlock(tensor, film.crop_offset(), film.rfilter(), border=True))
 
 

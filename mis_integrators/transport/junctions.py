@@ -55,7 +55,7 @@ class Junction:
         value = dr.select(one_side, self.value * dr.abs(shading_light), 0)
         p_camera = dr.select(one_side, self.density * dr.abs(shading_light), 0)
         p_light = dr.select(one_side, self.density * dr.abs(shading_camera), 0)
-        if traits.has_rough:
+        if self.si is not None and traits.has_rough:
             rough = active & (self.density < 0)
             seen, lit = mi.SurfaceInteraction3f(self.si), mi.SurfaceInteraction3f(self.si)
             seen.wi, lit.wi = self.si.to_local(to_camera), self.si.to_local(to_light)

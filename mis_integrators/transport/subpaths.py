@@ -31,21 +31,26 @@ from .lenses import Lens
 from .light_pass import PATHS_PER_LANE, scatter_light
 from .packing import Store
 from .random import next_2d, streams
+from .records import Layout
 
 NO_PARENT = 0xffffffff
 STATES = ("near", "far")
 """What the buffers call the numbers of a state."""
 
 
+def vertex_layout(states=STATES):
+    """Fields of a kept vertex: position `p`, number of the sub-path `path`, `throughput` (light: flux; camera: importance) that arrives, `value` and
+    `density` as of `Junction`, the state of the weights, geometric normal `n`, direction `towards` the vertex before, `depth` in segments,
+    shading normal `ns`, `number` among the sub-path's kept vertices, `parent` (the place of the one before, or `NO_PARENT`)."""
+    return Layout({"p": mi.Point3f, "path": mi.UInt32, "throughput": mi.Spectrum, "density": mi.Float, "ns": mi.Vector3f, "depth": mi.UInt32,
+                   "towards": mi.Vector3f, "number": mi.UInt32, "value": mi.Spectrum, "parent": mi.UInt32, "n": mi.Vector3f,
+                   **{name: mi.Float for name in states}})
+
+
 def new_vertices(traits, capacity, states=STATES):
-    """Room for `capacity` vertices (a dictionary of arrays): position `p`, normals `n` (geometric) and `ns` (shading), direction `towards` the vertex
-    before, `throughput` (light: flux; camera: importance) that arrives, `value` and `density` as of `Junction`, number of the sub-path,
-    `depth` in segments, `number` among the sub-path's kept vertices, `parent`, the state of the weights; `hit` where surfaces are not
-    all Lambertian. Nothing is cleared: only the places below the count are valid."""
-    buffer = {name: dr.empty(mi.Float, capacity) for name in ("density", *states)}
-    buffer |= {name: dr.empty(mi.UInt32, capacity) for name in ("path", "depth", "number", "parent")}
-    buffer |= {name: dr.empty(mi.Spectrum, capacity) for name in ("throughput", "value")}
-    buffer |= {name: dr.empty(mi.Vector3f, capacity) for name in ("n", "ns", "towards")} | {"p": dr.empty(mi.Point3f, capacity)}
+    """Room for `capacity` vertices, a dictionary: `words` (records of `vertex_layout`), and where surfaces are not all Lambertian `hit`, from which
+    the surface interaction is made again. Only the places below the count are valid."""
+    buffer = {"words": vertex_layout(states).room(capacity)}
     if traits.has_rough:
         buffer["hit"] = dr.empty(mi.PreliminaryIntersection3f, capacity)
     return buffer
@@ -57,11 +62,18 @@ def keep_vertex(store, junction, si, hit, towards, throughput, path, depth, numb
     keep = keep & (slot < capacity)
     values = {"p": si.p, "n": junction.n, "ns": junction.ns, "towards": towards, "throughput": throughput, "value": junction.value,
               "density": junction.density, "path": path, "depth": depth, "number": number, "parent": parent, **dict(zip(states, state))}
+    vertex_layout(states).write(store.vertices["words"], values, slot, keep)
     if "hit" in store.vertices:
-        values["hit"] = hit
-    for name, value in values.items():
-        dr.scatter(store.vertices[name], value, slot, keep)
+        dr.scatter(store.vertices["hit"], hit, slot, keep)
     return slot
+
+
+def read_vertices(vertices, index, active, only=None, states=STATES):
+    """The vertices at places `index`, a dictionary of all their fields (or those named in `only`); zero on inactive lanes."""
+    record = vertex_layout(states).read(vertices["words"], index, active, only)
+    if "hit" in vertices and (only is None or "hit" in only):
+        record["hit"] = dr.gather(mi.PreliminaryIntersection3f, vertices["hit"], index, active)
+    return record
 
 
 def _either(mask, yes, no):
@@ -69,15 +81,10 @@ def _either(mask, yes, no):
     return [dr.select(mask, a, b) for a, b in zip(yes, no)]
 
 
-def read_vertices(vertices, index, active, only=None):
-    """The vertices at places `index` (all their fields, or those of the list `only`); zero on inactive lanes."""
-    return {name: dr.gather(type(values), values, index, active) for name, values in vertices.items() if only is None or name in only}
-
-
 def junction_of(traits, record, wavelengths, active):
-    """The `Junction` of kept vertices, as read by `read_vertices`."""
+    """The `Junction` of kept vertices, as read by `read_vertices`; without `hit` only where they are Lambertian."""
     si = bsdf = None
-    if traits.has_rough:
+    if "hit" in record:
         hit, d = record["hit"], -record["towards"]
         hit.shape = dr.select(active, hit.shape, dr.zeros(mi.ShapePtr))
         rough = active & (record["density"] < 0)
@@ -183,8 +190,8 @@ def trace_camera_subpaths(scene, sensor, integrator, lights, traits, weights, se
     finds at each smooth vertex, weighted.
 
     Returns `(radiance, alpha, splat position, vertices, count)`: the kept vertices are those that a light sub-path may be joined with; `count` as in
-    `trace_light_subpaths`. `ledger`, if given, learns every contribution: `met(path, depth, value, mask)` and `direct(path, depth, value, mask)` with
-    the path's number in segments.
+    `trace_light_subpaths`. `ledger`, if given, learns every contribution: `met(path, depth, value, share, mask)` and `direct(...)`, with the length
+    of the joint path in segments, and the weight apart.
     """
     path, active, rng, ray, sensor_weight, splat, aperture = start_camera_paths(sensor, seed, first, 1, n_paths, camera_paths, wavelength_sample)
     lens = Lens(sensor)
@@ -225,10 +232,11 @@ def trace_camera_subpaths(scene, sensor, integrator, lights, traits, weights, se
                 shown &= (depth > 1) | si.is_valid()
             later = shown & (depth > 1)
             share = weights.met(state, lights.pdf_direct(origin, ds, later), lights.emission_ratio(origin, ds, later), density)
-            light = throughput * dr.select(later, share, 1) * ds.emitter.eval(si, shown)
-            radiance[shown] += light
+            share = dr.select(later, share, 1)
+            light = throughput * ds.emitter.eval(si, shown)
+            radiance[shown] += light * share
             if dr.hint(ledger is not None, mode='scalar'):
-                ledger.met(path, depth, light, shown)
+                ledger.met(path, depth, light, share, shown)
 
         active &= si.is_valid()
         if dr.hint(max_depth > 0, mode='scalar'):
@@ -255,10 +263,10 @@ def trace_camera_subpaths(scene, sensor, integrator, lights, traits, weights, se
             response, p_camera, p_light = junction.between(towards, direction, reached)
             facing = dr.abs(dr.dot(si.n, direction))
             share = weights.direct(state, light_pdf, facing * lights.emission_ratio(si, ds, reached), p_camera * facing, p_light, ds.delta)
-            light = dr.select(reached, throughput * share * response * light, 0)
-            radiance[reached] += light
+            light = throughput * response * light
+            radiance[reached] += light * share
             if dr.hint(ledger is not None, mode='scalar'):
-                ledger.direct(path, depth + 1, light, reached)
+                ledger.direct(path, depth + 1, light, share, reached)
 
         # ---- Keep the vertex: a light sub-path needs two more segments
         wanted = smooth & (dr.max(throughput) > 0)

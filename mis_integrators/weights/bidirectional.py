@@ -56,7 +56,7 @@ def reciprocal(density):
 def nearer(near, far, p_back, beta, eta=0.0):
     """A_i = near_i + P' far_i + eta (the brackets of equations 40 and 41): all techniques nearer to the sub-path's start than the one that
     joins x_i with the other side, over p<(x_i). `p_back`: P', the other side's density at x_i for the direction to x_{i-1}."""
-    return norm(norm(near, p_back * far, beta), eta, beta)
+    return norm(norm(near, at_most(p_back * far, LARGEST), beta), eta, beta)
 
 
 def near_of(p_forward, geometry):
@@ -102,7 +102,7 @@ def met(direct_over_sampled, emission_density, far, beta):
     `direct_over_sampled`: density of next-event estimation for this point over the density with which the path was sampled there, zero where
     it cannot work from the vertex before; `emission_density`: density of next-event estimation per solid angle there times `emission` of
     `light_start` over the cosine at the vertex before; `far`: of the emitter's point."""
-    return 1 / (1 + bounded_power(norm(direct_over_sampled, emission_density * far, beta), beta))
+    return 1 / (1 + bounded_power(norm(at_most(direct_over_sampled, LARGEST), at_most(emission_density * far, LARGEST), beta), beta))
 
 
 def merging(a_light, a_camera, eta, beta):
