@@ -7,7 +7,7 @@ import pytest
 
 from comparing import assert_frequencies
 from mis_integrators.transport.cache_points import NORMAL_COST, CacheGrid
-from mis_integrators.transport.proposals import UNIFORM_SHARE, Proposals
+from mis_integrators.transport.proposals import UNIFORM_SHARE, Proposals, cumulative_sums
 from mis_integrators.transport.random import streams
 
 
@@ -49,6 +49,11 @@ def test_neighbours_are_the_nearest(rgb, count, neighbors, stretch):
     assert np.allclose(np.array(grid.spread)[rows], spread, rtol=1e-3, atol=1e-8)
 
 
+def new_proposals(grid, r, count, width):
+    count = dr.opaque(mi.UInt32, count)
+    return Proposals(grid, cumulative_sums(r, count, width), count, width)
+
+
 @pytest.mark.parametrize("width", [24, 37])
 def test_draws_have_their_probability(rgb, width):
     """Frequencies of drawn light vertices against the mixture of pmfs computed apart, and against `probability`; rows without light are uniform."""
@@ -62,7 +67,7 @@ def test_draws_have_their_probability(rgb, width):
     r[table[dark]] = 0
     r[table[dominated, 0], :count] = 1e-12
     r[table[dominated, 0], 4] = 1e12
-    proposals = Proposals(grid, mi.Float(r.ravel()), dr.opaque(mi.UInt32, count), width)
+    proposals = new_proposals(grid, mi.Float(r.ravel()), count, width)
     pmf = np.zeros_like(r)
     pmf[:, :count] = np.where(r.sum(axis=1, keepdims=True) > 0, r[:, :count] / np.maximum(r.sum(axis=1, keepdims=True), 1e-30), 1 / count)
     for row in (dark, dominated, grid.rows - 1):
@@ -76,7 +81,7 @@ def test_draws_have_their_probability(rgb, width):
 def test_no_light_vertices(rgb):
     """All light sub-paths missed the scene: draws are harmless."""
     p, n = box_points(5)
-    proposals = Proposals(CacheGrid(mi.Point3f(p), mi.Normal3f(n), 3), dr.zeros(mi.Float, 5 * 8), dr.opaque(mi.UInt32, 0), 8)
+    proposals = new_proposals(CacheGrid(mi.Point3f(p), mi.Normal3f(n), 3), dr.zeros(mi.Float, 5 * 8), 0, 8)
     drawn = proposals.draw(dr.zeros(mi.UInt32, 100), streams(dr.arange(mi.UInt32, 100), mi.UInt32(0)))
     assert np.all(np.array(drawn) == 0)
     assert np.all(np.isfinite(np.array(proposals.probability(dr.zeros(mi.UInt32, 100), drawn))))

@@ -18,6 +18,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..transport.light_ends import END
 from ..transport.proposals import UNIFORM_SHARE
 from ..weights import bidirectional as theory
 from ..weights import resampling
@@ -31,7 +32,7 @@ class ResampledWeights:
     the weights know of the resampling (else every technique has the density of its path alone); `ratio`: N_t, light sub-paths that are joined to
     the sensor over camera paths, of all the film."""
 
-    states = ("near", "far", "strength")
+    states = END
 
     def __init__(self, lights, grid, records, shares, M, N, aware, ratio):
         self.lights, self.grid, self.records, self.shares = lights, grid, records, shares

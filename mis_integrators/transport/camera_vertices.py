@@ -13,7 +13,8 @@ from .junctions import Junction, scattered_mean
 from .lenses import Lens
 from .packing import Store
 from .random import next_2d
-from .subpaths import NO_PARENT, keep_vertex, new_vertices
+from .records import Layout
+from .subpaths import NO_PARENT, keep_vertex, new_vertices, vertex_layout
 
 STEP = ("near", "geometry", "forward", "back", "scattered", "row")
 """What vertices and hits remember of the step from their parent: one over the area density with which it was made [m^2] (over that per solid angle [sr] for
@@ -24,11 +25,12 @@ HIT = ("light_mean", "start", "across")
 """What a hit knows besides: `Lights.start_density` and `forward_density` of the emitter's point, and its light, channel mean, over the former."""
 
 
-def new_hits(capacity):
-    """Room for `capacity` hits of emitters beyond the first vertex (a dictionary of arrays): `value` (spectrum, throughput included), number of the
-    path, `depth` in segments, `parent`, and the fields of `STEP` and `HIT`."""
-    return {name: dr.empty(mi.Float, capacity) for name in (*STEP, *HIT)} | {"value": dr.empty(mi.Spectrum, capacity)} | \
-        {name: dr.empty(mi.UInt32, capacity) for name in ("path", "depth", "parent")}
+
+def hit_layout():
+    """Fields of a hit of an emitter beyond the first vertex: `value` (throughput included), number of the path, `depth` in segments, `parent`, and the
+    fields of `STEP` and `HIT`."""
+    return Layout({"value": mi.Spectrum, "path": mi.UInt32, **{name: mi.Float for name in STEP}, "depth": mi.UInt32, "parent": mi.UInt32,
+                   **{name: mi.Float for name in HIT}})
 
 
 @dr.syntax
@@ -37,7 +39,7 @@ def trace_camera_vertices(scene, sensor, integrator, lights, traits, soften, see
     """Traces `n_paths` camera paths, numbers `first`, `first + 1`, ... of `film_samples`.
 
     Returns `(radiance, alpha, splat position, vertices, count, hits, hit count)`: the light that the camera's rays meet at once; vertices as of
-    `subpaths.new_vertices` with the fields of `STEP`; `new_hits`. Counts have width one; if they exceed the capacities the surplus is missing. The
+    `subpaths.new_vertices` with the fields of `STEP`; records of `hit_layout`. Counts have width one; if they exceed the capacities the surplus is missing. The
     first vertex has one over the density of camera rays there, over the whole crop window, times `ratio`, as its `near`, and no parent.
 
     `soften.row(p, n)` numbers places, with the normal on the side of the light; `soften.softened(row, geometry, squared)` may change the geometric
@@ -61,7 +63,7 @@ def trace_camera_vertices(scene, sensor, integrator, lights, traits, soften, see
     cosine_there = mi.Float(0)                       # at the parent
     origin = dr.zeros(mi.Interaction3f)              # the last vertex, of whichever kind
     context = mi.BSDFContext()
-    store = Store(vertices=new_vertices(traits, capacity, STEP), count=dr.zeros(mi.UInt32, 1), hits=new_hits(hit_capacity),
+    store = Store(vertices=new_vertices(traits, capacity, STEP), count=dr.zeros(mi.UInt32, 1), hits=hit_layout().room(hit_capacity),
                   hit_count=dr.zeros(mi.UInt32, 1))
     visible = mi.Bool((scene.environment() is not None) and not hide_emitters)
     if dr.hint(max_depth == 0, mode='scalar'):
@@ -94,8 +96,7 @@ def trace_camera_vertices(scene, sensor, integrator, lights, traits, soften, see
             values = dict(zip(STEP, step)) | {
                 "value": throughput * light, "path": path, "depth": depth, "parent": parent, "start": start,
                 "light_mean": dr.mean(light) * dr.rcp(dr.maximum(start, 1e-20)), "across": lights.forward_density(origin, ds, met)}
-            for name in dr.hint(list(values), mode='scalar'):
-                dr.scatter(store.hits[name], values[name], slot, met)
+            hit_layout().write(store.hits, values, slot, met)
 
         active &= si.is_valid()
         if dr.hint(max_depth > 0, mode='scalar'):
@@ -156,6 +157,7 @@ def sum_before(vertices, step, parent, p_made, strength, scattered, back, segmen
     to the parent; `segments`: of the joint path. `gain(r, row, s, active)`: what resampling makes of the technique that joins a light sub-path of s
     vertices, which sends r = q*/p, to a vertex of that row. Joining to the sensor (the last step, without a parent) has the gain one.
     """
+    layout = vertex_layout(STEP)
     near, geometry, forward, back_there, scattered_there, row = (mi.Float(step[name]) for name in STEP)
     parent = mi.UInt32(parent)
     ratio = mi.Float(p_made)
@@ -165,18 +167,14 @@ def sum_before(vertices, step, parent, p_made, strength, scattered, back, segmen
     total = mi.Float(0)
     while dr.hint(active, label="techniques"):
         joined = parent != NO_PARENT
-        depth = dr.gather(mi.UInt32, vertices["depth"], parent, active & joined)
+        depth = layout.read(vertices["words"], parent, active & joined, ("depth",))["depth"]
         better = gain(strength * scattered * geometry, mi.UInt32(row), segments - depth, active & joined)
         total = dr.select(active, total + ratio * near * dr.select(joined, better, 1), total)
         ratio = dr.minimum(ratio * (back * dr.rcp(dr.maximum(forward, 1e-20))), 1e15)
         strength = dr.minimum(strength * (scattered * dr.rcp(dr.maximum(back, 1e-20))), 1e15)
         back, scattered = mi.Float(back_there), mi.Float(scattered_there)
         active &= joined & (ratio > 0)
-        near = dr.gather(mi.Float, vertices["near"], parent, active)
-        geometry = dr.gather(mi.Float, vertices["geometry"], parent, active)
-        forward = dr.gather(mi.Float, vertices["forward"], parent, active)
-        back_there = dr.gather(mi.Float, vertices["back"], parent, active)
-        scattered_there = dr.gather(mi.Float, vertices["scattered"], parent, active)
-        row = dr.gather(mi.Float, vertices["row"], parent, active)
-        parent = dr.gather(mi.UInt32, vertices["parent"], parent, active)
+        record = layout.read(vertices["words"], parent, active, (*STEP, "parent"))
+        near, geometry, forward = record["near"], record["geometry"], record["forward"]
+        back_there, scattered_there, row, parent = record["back"], record["scattered"], record["row"], record["parent"]
     return total

@@ -8,9 +8,13 @@ import drjit as dr
 import mitsuba as mi
 
 from .junctions import SMALLEST_COSINE, scattered_mean
+from .lenses import unblocked
 from .light_starts import read_starts
 from .subpaths import junction_of, read_vertices
-from .lenses import unblocked
+
+
+END = ("near", "far", "strength")
+"""Fields that the ends' states have."""
 
 
 @dataclass
@@ -35,7 +39,7 @@ class Sent:
 
 class LightEnds:
     """Ends of M light sub-paths. The first M are starts (`light_starts`), the others the vertices at the places `list` of a buffer of `subpaths`, whose
-    states are those of `ResampledWeights`: near, far, strength.
+    states have the fields `END`.
 
     `count`: how many ends there are (uint32 of width one).
     """
@@ -48,13 +52,13 @@ class LightEnds:
         """How many vertices the sub-paths `index` have."""
         surface = active & (index >= self.paths)
         place = dr.gather(mi.UInt32, self.places, index - self.paths, surface)
-        return dr.select(surface, dr.gather(mi.UInt32, self.vertices["depth"], place, surface) + 1, 1)
+        return dr.select(surface, read_vertices(self.vertices, place, surface, ("depth",), END)["depth"] + 1, 1)
 
     def send(self, p, index, time, wavelengths, active):
         """What the ends `index` send to points `p`: a `Sent`."""
         surface = active & (index >= self.paths)
         place = dr.gather(mi.UInt32, self.places, index - self.paths, surface)
-        y = read_vertices(self.vertices, place, surface)
+        y = read_vertices(self.vertices, place, surface, states=END)
         offset = y["p"] - p
         squared = dr.maximum(dr.squared_norm(offset), 1e-20)
         distance = dr.sqrt(squared)
@@ -91,7 +95,7 @@ def list_ends(vertices, count, first, paths: int, capacity: int, room: int):
     missing)."""
     index = dr.arange(mi.UInt32, capacity)
     active = index < dr.gather(mi.UInt32, count, 0)
-    path = dr.gather(mi.UInt32, vertices["path"], index, active)
+    path = read_vertices(vertices, index, active, ("path",), END)["path"]
     active &= (path >= first) & (path < first + paths)
     found, places = dr.zeros(mi.UInt32, 1), dr.zeros(mi.UInt32, room)
     slot = dr.scatter_inc(found, mi.UInt32(0), active)

@@ -92,7 +92,7 @@ class Lights:
         power = np.array([_mean_power(e) for e in self.emitters])
         if guide is not None:
             power = guide.useful_power(power[np.argsort(order)])[order]
-        self.total_power = power.sum()
+        self.total_power = float(power.sum())
         if not self.emitters:
             return
         uniform = UNIFORM_SHARE * power.sum() / max(np.count_nonzero(power), 1)

@@ -9,29 +9,28 @@ UNIFORM_SHARE = 0.1
 """Share of draws that ignore the cache: what no near cache point sees is still drawn."""
 
 
-class Proposals:
-    """The pmfs of C cache points over up to `width` light vertices, as cumulative sums, and a mixture of them for every row of a `CacheGrid`.
+def cumulative_sums(r, count, width):
+    """Cumulative sums, up to one in each row, of the pmfs of C cache points over up to `width` light vertices.
 
-    Parameters: `grid`; `r` (float, C x width, one row a cache point: q*/p of each light vertex, zero in unused places); `count` (uint32 of
-    width one: light vertices in use, the first ones); `width`. A row without any light is uniform.
+    `r` (float, C x width, one row a cache point): q*/p of each light vertex, zero in unused places; `count` (uint32 of width one): light vertices in
+    use, the first ones. A row without any light is uniform.
+    """
+    place = dr.arange(mi.UInt32, dr.width(r))
+    sums = dr.block_prefix_sum(r, width, exclusive=False)
+    total = dr.gather(mi.Float, sums, (place // width) * width + (width - 1))
+    column = mi.Float(dr.minimum(place % width + 1, count))
+    some = total > 0
+    return dr.select(some, dr.minimum(sums * dr.rcp(dr.select(some, total, 1)), 1), column / mi.Float(dr.maximum(count, 1)))
+
+
+class Proposals:
+    """For every row of a `CacheGrid` a mixture of the pmfs of its cache points: `cumulative` as of `cumulative_sums`, `count` and `width` as there.
 
     The probability of a light vertex is what the cumulative sums give it: they are what is drawn from, rounding included.
     """
 
-    def __init__(self, grid, r, count, width):
-        self.grid, self.count, self.width = grid, count, width
-        place = dr.arange(mi.UInt32, dr.width(r))
-        last = (place // width) * width + (width - 1)
-        sums = dr.block_prefix_sum(r, width, exclusive=False)
-        total = dr.gather(mi.Float, sums, last)
-        column = mi.Float(dr.minimum(place % width + 1, count))
-        some = total > 0
-        self.cumulative = dr.select(some, dr.minimum(sums * dr.rcp(dr.select(some, total, 1)), 1), column / mi.Float(dr.maximum(count, 1)))
-        dr.eval(self.cumulative)
-
-    def tables(self):
-        """Every evaluated array that `draw` and `probability` read, for `dr.freeze` to track."""
-        return [self.cumulative, self.count, *self.grid.tables()]
+    def __init__(self, grid, cumulative, count, width):
+        self.grid, self.cumulative, self.count, self.width = grid, cumulative, count, width
 
     def draw(self, row, rng, active=True):
         """Light vertex for each row: one of the row's cache points at random, then a light vertex from its pmf, or any at the uniform share."""
