@@ -7,7 +7,7 @@ import pytest
 
 from comparing import assert_frequencies
 from mis_integrators.transport.cache_points import NORMAL_COST, CacheGrid
-from mis_integrators.transport.proposals import UNIFORM_SHARE, Proposals, cumulative_sums
+from mis_integrators.transport.proposals import BLIND_SHARE, UNIFORM_SHARE, Proposals, cumulative_sums
 from mis_integrators.transport.random import streams
 
 
@@ -49,9 +49,9 @@ def test_neighbours_are_the_nearest(rgb, count, neighbors, stretch):
     assert np.allclose(np.array(grid.spread)[rows], spread, rtol=1e-3, atol=1e-8)
 
 
-def new_proposals(grid, r, count, width):
+def new_proposals(grid, r, seen, count, width):
     count = dr.opaque(mi.UInt32, count)
-    return Proposals(grid, cumulative_sums(r, count, width), count, width)
+    return Proposals(grid, cumulative_sums(r, seen, count, width), count, width)
 
 
 @pytest.mark.parametrize("width", [24, 37])
@@ -67,9 +67,13 @@ def test_draws_have_their_probability(rgb, width):
     r[table[dark]] = 0
     r[table[dominated, 0], :count] = 1e-12
     r[table[dominated, 0], 4] = 1e12
-    proposals = new_proposals(grid, mi.Float(r.ravel()), count, width)
-    pmf = np.zeros_like(r)
-    pmf[:, :count] = np.where(r.sum(axis=1, keepdims=True) > 0, r[:, :count] / np.maximum(r.sum(axis=1, keepdims=True), 1e-30), 1 / count)
+    seen = rng.random(r.shape) < 0.3
+    seen[table[dominated, 1]] = False
+    proposals = new_proposals(grid, mi.Float(r.ravel()), mi.Bool(seen.ravel()), count, width)
+    every, some = r.sum(axis=1, keepdims=True), (r * seen).sum(axis=1, keepdims=True)
+    blind, open_ = r / np.maximum(every, 1e-30), r * seen / np.maximum(some, 1e-30)
+    pmf = np.where(some > 0, (1 - BLIND_SHARE) * open_ + BLIND_SHARE * blind, blind)[:, :count]
+    pmf = np.where(every > 0, pmf, 1 / count)
     for row in (dark, dominated, grid.rows - 1):
         expected = (1 - UNIFORM_SHARE) * pmf[table[row]].mean(axis=0)[:count] + UNIFORM_SHARE / count
         said = np.array(proposals.probability(mi.UInt32(row), dr.arange(mi.UInt32, count)))
@@ -81,7 +85,7 @@ def test_draws_have_their_probability(rgb, width):
 def test_no_light_vertices(rgb):
     """All light sub-paths missed the scene: draws are harmless."""
     p, n = box_points(5)
-    proposals = new_proposals(CacheGrid(mi.Point3f(p), mi.Normal3f(n), 3), dr.zeros(mi.Float, 5 * 8), 0, 8)
+    proposals = new_proposals(CacheGrid(mi.Point3f(p), mi.Normal3f(n), 3), dr.zeros(mi.Float, 5 * 8), dr.full(mi.Bool, True, 5 * 8), 0, 8)
     drawn = proposals.draw(dr.zeros(mi.UInt32, 100), streams(dr.arange(mi.UInt32, 100), mi.UInt32(0)))
     assert np.all(np.array(drawn) == 0)
     assert np.all(np.isfinite(np.array(proposals.probability(dr.zeros(mi.UInt32, 100), drawn))))

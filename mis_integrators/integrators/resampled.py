@@ -24,12 +24,13 @@ from ..transport.recording import recorder
 from ..transport.subpaths import junction_of, read_vertices, trace_light_subpaths
 from ..transport.traits import SceneTraits
 from .common import IterativeIntegrator, IterativeSession
-from .resampled_weights import LENGTHS, ResampledWeights, tabulate
+from .resampled_weights import LENGTHS, ResampledWeights, doubt, tabulate
 
 CHUNK = 1 << 18
 """Camera paths, and as many light sub-paths, traced at once at most; larger films are traced in parts (bounds memory)."""
-CACHE_SHARE = 1 / 100
-FEWEST_CACHE_POINTS = 64
+BLIND_COSINE = 0.0
+CACHE_SHARE = 1 / 300
+FEWEST_CACHE_POINTS = 256
 """Cache points: this share of a part's camera vertices, but at least so many."""
 MOST_PAIRS = 1 << 24
 """Pairs of a cache point and a light vertex at most, four bytes each (and some more while they are made); beyond that there are fewer cache points."""
@@ -124,7 +125,8 @@ class ResampledSession(IterativeSession):
         return LightEnds(self.traits, self.lights, starts, M, light, places, dr.minimum(found, self.capacity["ends"]) + M, self.reach)
 
     def _targets(self, scene, sensor, tables, seed, light, count, first, cache, spectral, target):
-        """q*/p of every light vertex of M sub-paths (from the number `first` on) at every cache point, row by row, and what makes their `LightEnds`."""
+        """q*/p of every light vertex of M sub-paths (from the number `first` on) at every cache point if nothing stood between, row by row; whether nothing
+        does; and what makes their `LightEnds`."""
         room, M = self.capacity["ends"], self.integrator.light_paths
         places, found = list_ends(light, count, first, M, self.capacity["light"], room)
         starts = self._starts(sensor, seed, spectral)
@@ -141,21 +143,22 @@ class ResampledSession(IterativeSession):
         if target == "f_y_rho_g_v":
             n = dr.mulsign(z["n"], dr.dot(z["n"], z["towards"]))
             cosine = dr.dot(n, sent.d)
-            r = dr.mean(sent.light) * dr.select(z["through"], dr.abs(cosine), dr.maximum(cosine, 0))
+            cosine = dr.select(z["through"], dr.abs(cosine), dr.maximum(cosine, BLIND_COSINE))
+            r = dr.mean(sent.light) * cosine
         else:
             r = dr.mean(sent.light * junction_of(self.traits, z, spectral["wavelengths"], active).between(z["towards"], sent.d, active)[0])
         active &= (r > 0) & dr.isfinite(r)
-        active = ends.unblocked(scene, z["p"], z["n"], sent, active)
-        return dr.select(active, r, 0), starts, places, found, sent.vertices
+        seen = ends.unblocked(scene, z["p"], z["n"], sent, active)
+        return dr.select(active, r, 0), seen, starts, places, found, sent.vertices
 
     def _own_targets(self, scene, sensor, tables, seed, light, count, cache, spectral):
         """The same of the first M sub-paths for the target at hand (the last array is not needed)."""
-        return self._targets(scene, sensor, tables, seed, light, count, 0, cache, spectral, self.integrator.target)[:4]
+        return self._targets(scene, sensor, tables, seed, light, count, 0, cache, spectral, self.integrator.target)[:5]
 
-    def _pmfs(self, r, found):
+    def _pmfs(self, r, seen, found):
         """Cumulative sums of the cache points' pmfs."""
         M, room = self.integrator.light_paths, self.capacity["ends"]
-        cumulative = cumulative_sums(r, dr.minimum(found, room) + M, M + room)
+        cumulative = cumulative_sums(r, seen, dr.minimum(found, room) + M, M + room)
         dr.eval(cumulative)                                        # a recording cannot make it
         return cumulative
 
@@ -230,7 +233,7 @@ class ResampledSession(IterativeSession):
         wanted = min(max(FEWEST_CACHE_POINTS, int(vertices * CACHE_SHARE)), max(vertices, 1))
         self.cache = self._cache_points(traced[3], vertices, min(wanted, FEWEST_CACHE_POINTS))
         self._ends_fit(lambda: self._targets(self.scene, self.sensor, self._tables, self._seed(PILOT, START), *light, 0, self.cache, spectral,
-                                             "f_y_rho_g_v")[:4])
+                                             "f_y_rho_g_v"))
         self.cache = self._cache_points(traced[3], vertices, max(min(wanted, MOST_PAIRS // (M + self.capacity["ends"])), 1))
         normals = dr.mulsign(self.cache["n"], dr.dot(self.cache["n"], self.cache["towards"]))
         self.grid = CacheGrid(self.cache["p"], normals, self.integrator.cache_neighbors)
@@ -252,21 +255,22 @@ class ResampledSession(IterativeSession):
         return cache
 
     def _integrals(self, light, spectral):
-        """Q (C), Q_s (C x LENGTHS) at the cache points, and light vertices a sub-path, of all lengths and of each."""
-        M, points = self.integrator.light_paths, dr.width(self.cache["depth"])
+        """`Q_s`, `Q_blind`, `doubts` and `ends_s` as `tabulate` takes them."""
+        M, points, cache = self.integrator.light_paths, dr.width(self.cache["depth"]), self.cache
         sets = max(min(PILOT_SETS, self.light_chunk // M), 1)
-        Q_s, ends = np.zeros((points, LENGTHS)), np.zeros(LENGTHS)
+        place = np.array(cache["p"]).T, np.array(dr.mulsign(cache["n"], dr.dot(cache["n"], cache["towards"]))).T
+        Q_s, Q_blind, doubts, ends_s = np.zeros((points, LENGTHS)), np.zeros(points), np.zeros(points), np.zeros(LENGTHS)
         for k in range(sets):
-            r, _, _, found, vertices = self._ends_fit(lambda: self._targets(
-                self.scene, self.sensor, self._tables, self._seed(PILOT, START, k), *light, dr.opaque(mi.UInt32, k * M), self.cache, spectral, "f_y_rho_g_v"))
-            width = M + self.capacity["ends"]
-            r = np.array(r, dtype=np.float64).reshape(points, width)
-            length = np.minimum(np.array(vertices)[:width], LENGTHS) - 1
-            for s in range(LENGTHS):
-                Q_s[:, s] += r[:, length == s].sum(axis=1)
-            ends += np.bincount(length[:M + int(found[0])], minlength=LENGTHS)
-        Q_s, ends = Q_s / (sets * M), ends / (sets * M)
-        return Q_s.sum(axis=1), Q_s, ends.sum(), ends
+            r, seen, _, _, found, vertices = self._ends_fit(lambda: self._targets(
+                self.scene, self.sensor, self._tables, self._seed(PILOT, START, k), *light, dr.opaque(mi.UInt32, k * M), cache, spectral, "f_y_rho_g_v"))
+            used = M + int(found[0])
+            r, seen = (np.array(x).reshape(points, M + self.capacity["ends"])[:, :used] for x in (r, seen))
+            length = np.minimum(np.array(vertices)[:used], LENGTHS) - 1
+            Q_s += np.where(seen, r, 0) @ np.eye(LENGTHS)[length]
+            Q_blind += r.sum(axis=1)
+            doubts += doubt(*place, r, seen, self.integrator.cache_neighbors, self.grid.normal_cost)
+            ends_s += np.bincount(length, minlength=LENGTHS)
+        return Q_s / (sets * M), Q_blind / (sets * M), doubts / sets, ends_s / (sets * M)
 
     # ------------------------------------------------------------------ iterations
 
@@ -294,11 +298,11 @@ class ResampledSession(IterativeSession):
                 return traced
 
     def _ends_fit(self, compute):
-        """Result of `compute()`, repeated with more room for ends if there were more (its fourth array counts them)."""
+        """Result of `compute()`, repeated with more room for ends if there were more (its fifth entry counts them)."""
         while True:
             result = compute()
             dr.eval(result)
-            if not self._grown("ends", result[3]):
+            if not self._grown("ends", result[4]):
                 return result
 
     def _chunk(self, iteration, chunk, spectral):
@@ -308,9 +312,9 @@ class ResampledSession(IterativeSession):
         block = None
         if self.lit:
             light = self._light(iteration, chunk, spectral)
-            r, starts, places, found = self._ends_fit(lambda: self._target_pass(
+            r, seen, starts, places, found = self._ends_fit(lambda: self._target_pass(
                 self.scene, self.sensor, self._tables, self._seed(iteration, START, chunk), *light, self.cache, spectral))
-            radiance = self._connection_pass(self.scene, self.sensor, self._tables, radiance, camera, count, light[0], starts, places, found, self._pmfs(r, found),
+            radiance = self._connection_pass(self.scene, self.sensor, self._tables, radiance, camera, count, light[0], starts, places, found, self._pmfs(r, seen, found),
                                              self._seed(iteration, DRAW, chunk), spectral)
             radiance = self._hit_pass(self._tables, radiance, camera, hits, hit_count)
             if self.lens:

@@ -3,12 +3,13 @@
 Hooks of `transport.subpaths` and `transport.camera_vertices`, and what resampling makes of each technique of a joint path. All techniques of a path
 evaluate one function: a technique that joins a light sub-path Y to the camera vertex z is taken to draw it with
 
-    q/p = a(z) r(Y, z) + b(z),    r = f_y rho G softened,    G softened = G d^2 / (d^2 + h(z)^2)
+    q/p = (a + c) r + b  if a cache point of z sees what z sees, else  c r + b,    r = f_y rho G softened,    G softened = G d^2 / (d^2 + h^2)
 
-a, b, h and the lengths' shares Q_s/Q are looked up by the place of z and the side from which the light comes (`CacheGrid.row`); they are averages over
-the N_c cache points there, made once before the first iteration. So the weights depend neither on an iteration's light sub-paths nor on its cache of
-pmfs, and the sum of the techniques stays unbiased. h^2 is the mean squared distance of the cache points: the cached pmf, made for their places, does not know
-that G has a pole at z. Left out are visibility (the ends of a joint path see each other), the camera's BSDF of `f_y_f_yz`, and delta functions' weights;
+where the parts are the cached pmfs' visible, blind and uniform ones (`proposals`), and the second case has a probability e. The five numbers of z and the
+lengths' shares Q_s/Q are looked up by place and by the side from which the light comes (`CacheGrid.row`); they are averages over the N_c cache points
+there, made once before the first iteration. So the weights depend neither on an iteration's light sub-paths nor on its pmfs, and the sum of
+the techniques stays unbiased. h^2 is the mean squared distance of the cache points: the cached pmf, made for their places, does not know that G has
+a pole at z. Left out are visibility (the ends of a joint path see each other), the camera's BSDF of `f_y_f_yz`, and delta functions' weights;
 colours enter by channel means.
 """
 
@@ -19,16 +20,20 @@ import mitsuba as mi
 import numpy as np
 
 from ..transport.light_ends import END
-from ..transport.proposals import UNIFORM_SHARE
+from ..transport.proposals import BLIND_SHARE, UNIFORM_SHARE
 from ..weights import bidirectional as theory
 from ..weights import resampling
 
 LENGTHS = 16
 """Lengths of light sub-paths whose shares are told apart; longer ones count with the last."""
+UNEXPECTED = 0.1
+"""A cache point's light is unexpected if the points around it have less than this share of its own pmf for it."""
+LEAST_DOUBT = 0.05
+"""Some of the light may always be unexpected."""
 
 
 class ResampledWeights:
-    """`lights`, `grid` (a `CacheGrid`), `records` (float, four a row: a, b, h^2, 0), `shares` (float, `LENGTHS` a row), M light sub-paths, N draws; `aware`: whether
+    """`lights`, `grid` (a `CacheGrid`), `records` (float, four a row: a, b, c, e), `shares` (float, `LENGTHS` a row), M light sub-paths, N draws; `aware`: whether
     the weights know of the resampling (else every technique has the density of its path alone); `ratio`: N_t, light sub-paths that are joined to
     the sensor over camera paths, of all the film."""
 
@@ -48,7 +53,7 @@ class ResampledWeights:
         """The geometric term without its pole; unchanged for lights infinitely far away."""
         if not self.aware:
             return geometry
-        spread = dr.gather(mi.Float, self.records, 4 * row + 2)
+        spread = dr.gather(mi.Float, self.grid.spread, row)
         return geometry * dr.rcp(1 + spread * dr.rcp(squared))
 
     def gain(self, r, row, s, active=True):
@@ -57,7 +62,8 @@ class ResampledWeights:
             return mi.Float(1)
         record = dr.gather(mi.Vector4f, self.records, row, active)
         share = dr.gather(mi.Float, self.shares, row * LENGTHS + dr.minimum(dr.maximum(s, 1), LENGTHS) - 1, active)
-        return resampling.gain(record.x * r + record.y, share, self.M, self.N)
+        spare = record.z * r + record.y
+        return resampling.gain(resampling.doubtful_ratio(record.x * r + spare, spare, record.w), share, self.M, self.N)
 
     # ------------------------------------------------------------------ hooks of the light sub-paths
 
@@ -99,18 +105,42 @@ class ResampledWeights:
         return theory.connection(connection.density * (1 / self.ratio), a_light, 0, 0, 1)
 
 
-def tabulate(grid, Q, Q_s, proposals, proposals_s):
+def doubt(p, n, r, seen, neighbors, normal_cost):
+    """How much of a cache point's light comes from light vertices that the cache points around it do not expect: a number each (C).
+
+    NumPy arrays `p`, `n` (C x 3), `r`, `seen` (C x light vertices, as for `cumulative_sums`); `normal_cost` as of `CacheGrid` [length^2]."""
+    if len(p) < 2:
+        return np.ones(len(p))
+    cost = np.sum(p ** 2, axis=1)[:, None] + np.sum(p ** 2, axis=1) - 2 * p @ p.T + normal_cost * (1 - n @ n.T)
+    np.fill_diagonal(cost, np.inf)
+    around = np.argsort(cost, axis=1)[:, :min(neighbors, len(p) - 1)]
+    pmf = np.where(seen, r, 0)
+    pmf = pmf / np.maximum(pmf.sum(axis=1, keepdims=True), 1e-30)
+    expected = sum(pmf[column] for column in around.T) / around.shape[1]
+    return np.sum(pmf * (expected < UNEXPECTED * pmf), axis=1)
+
+
+def tabulate(grid, Q_s, Q_blind, doubts, ends_s):
     """`(records, shares)` of the rows, as `ResampledWeights` takes them.
 
-    `Q` (C), `Q_s` (C x LENGTHS): integrals at the C cache points; `proposals`: light vertices that a light sub-path has on average, `proposals_s`:
-    of each length. NumPy arrays. Cache points that no light reaches have the uniform pmf.
+    NumPy arrays: `Q_s` (C x LENGTHS), integrals at the C cache points, visibility included; `Q_blind` (C), of all lengths, visibility not; `doubts`
+    (C); `ends_s` (LENGTHS): light vertices that a light sub-path has of each length on average.
     """
     near = np.array(grid.table).reshape(-1, grid.neighbors)
-    dark = ~(Q > 0)
-    inverse = np.where(dark, 0, 1 / np.where(dark, 1, Q))
-    uniform = UNIFORM_SHARE + (1 - UNIFORM_SHARE) * dark[near].mean(axis=1)
-    a = (1 - UNIFORM_SHARE) * inverse[near].mean(axis=1)
-    b = uniform / max(proposals, 1e-9)
-    shares = (1 - UNIFORM_SHARE) * (Q_s * inverse[:, None])[near].mean(axis=1) + uniform[:, None] * (proposals_s / max(proposals, 1e-9))
-    records = np.stack([a, b, np.array(grid.spread), np.zeros_like(a)], axis=1)
+    cached = 1 - UNIFORM_SHARE
+
+    def inverse(Q):
+        return np.where(Q > 0, 1 / np.where(Q > 0, Q, 1), 0)
+
+    Q = Q_s.sum(axis=1)
+    blind = np.where(Q > 0, BLIND_SHARE, 1)
+    ends = max(ends_s.sum(), 1e-9)
+    nothing = (~(Q_blind > 0))[near].mean(axis=1)
+    uniform = UNIFORM_SHARE + cached * nothing
+    # What a darker neighbour has least of is what matters here: 1/Q of the mean, not the mean of 1/Q.
+    a = cached * (1 - blind)[near].mean(axis=1) * inverse(Q[near].mean(axis=1))
+    c = cached * blind[near].mean(axis=1) * inverse(Q_blind[near].mean(axis=1))
+    e = np.clip(doubts[near].mean(axis=1), LEAST_DOUBT, 1)
+    shares = (Q_s * inverse(Q)[:, None])[near].mean(axis=1) + (~(Q > 0))[near].mean(axis=1)[:, None] * (ends_s / ends)
+    records = np.stack([a, uniform / ends, c, e], axis=1)
     return mi.Float(records.ravel().astype(np.float32)), mi.Float(shares.ravel().astype(np.float32))

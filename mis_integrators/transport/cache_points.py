@@ -27,7 +27,8 @@ class CacheGrid:
     `neighbors` (N_c; if C is smaller, neighbours repeat).
 
     Attributes: `table` (uint32, indices of cache points: entry `rows()` times N_c and on, nearest first), `spread` (float, one a row: mean squared
-    distance of the row's neighbours from the cell's centre [length^2]), `rows` (number of rows), `spacing` (of the cache points [length]).
+    distance of the row's neighbours from the cell's centre [length^2]), `rows` (number of rows), `spacing` (of the cache points [length]), `normal_cost` (what a right angle
+    between normals costs [length^2]).
     """
 
     def __init__(self, points, normals, neighbors):
@@ -38,6 +39,7 @@ class CacheGrid:
         # Surfaces: C points cover about the box's faces, each an equal share.
         area = 2 * (size[0] * size[1] + size[1] * size[2] + size[2] * size[0])
         self.spacing = float(np.sqrt(area / len(p)))
+        self.normal_cost = 0.5 * NORMAL_COST * self.spacing ** 2
         edge = FINENESS * self.spacing
         while np.prod(np.maximum(np.ceil(size / edge), 1)) > CELLS:
             edge *= 1.05
@@ -83,7 +85,7 @@ def _nearest(grid, points, normals, count: int, edge: float):
     sign = dr.select(direction % 2 == 1, mi.Float(-1), mi.Float(1))
     axis = mi.Vector3f(dr.select(direction // 2 == 0, sign, 0), dr.select(direction // 2 == 1, sign, 0),
                        dr.select(direction // 2 == 2, sign, 0))
-    cost_unit = mi.Float(0.5 * NORMAL_COST * grid.spacing ** 2)
+    cost_unit = mi.Float(grid.normal_cost)
     best = [mi.Float(dr.inf) for _ in range(grid.neighbors)]
     found = [mi.UInt32(0) for _ in range(grid.neighbors)]
     index = mi.UInt32(0)

@@ -6,21 +6,26 @@ import drjit as dr
 import mitsuba as mi
 
 UNIFORM_SHARE = 0.1
-"""Share of draws that ignore the cache: what no near cache point sees is still drawn."""
+"""Share of draws that ignore the cache: what no near cache point is sent is still drawn."""
+BLIND_SHARE = 0.15
+"""Share of the cached pmfs that ignores what stands between: a cache point in the shadow knows little of a place near it in the light."""
 
 
-def cumulative_sums(r, count, width):
+def cumulative_sums(r, seen, count, width):
     """Cumulative sums, up to one in each row, of the pmfs of C cache points over up to `width` light vertices.
 
-    `r` (float, C x width, one row a cache point): q*/p of each light vertex, zero in unused places; `count` (uint32 of width one): light vertices in
-    use, the first ones. A row without any light is uniform.
+    `r` (float, C x width, one row a cache point): q*/p of each light vertex if nothing stood between, zero in unused places; `seen` (bool, alike):
+    whether nothing does; `count` (uint32 of width one): light vertices in use, the first ones. The pmf is that of what is seen, with
+    `BLIND_SHARE` of what is not told apart; one of the two alone if the other is nothing, uniform if both are.
     """
     place = dr.arange(mi.UInt32, dr.width(r))
-    sums = dr.block_prefix_sum(r, width, exclusive=False)
-    total = dr.gather(mi.Float, sums, (place // width) * width + (width - 1))
-    column = mi.Float(dr.minimum(place % width + 1, count))
-    some = total > 0
-    return dr.select(some, dr.minimum(sums * dr.rcp(dr.select(some, total, 1)), 1), column / mi.Float(dr.maximum(count, 1)))
+    last = (place // width) * width + (width - 1)
+    all_sums, seen_sums = (dr.block_prefix_sum(x, width, exclusive=False) for x in (r, dr.select(seen, r, 0)))
+    every, some = (dr.gather(mi.Float, x, last) for x in (all_sums, seen_sums))
+    uniform = mi.Float(dr.minimum(place % width + 1, count)) / mi.Float(dr.maximum(count, 1))
+    blind = dr.select(every > 0, dr.minimum(all_sums / dr.select(every > 0, every, 1), 1), uniform)
+    share = dr.select(some > 0, mi.Float(BLIND_SHARE), 1)
+    return dr.fma(share, blind, (1 - share) * dr.minimum(seen_sums / dr.select(some > 0, some, 1), 1))
 
 
 class Proposals:

@@ -85,6 +85,13 @@ def technique_weights(densities, counts):
     return [part / total for part in parts]
 
 
+def doubtful_ratio(whole, spare, doubt):
+    """q/p to put into `gain` where the pmf is a cached one, made for a place near by: 1 / E[p/q], for 1/q is what the variance is linear in.
+
+    `whole`: q/p if the cache sees what can be seen here; `spare`: what is left of it if it does not, which happens with the probability `doubt`."""
+    return 1 / ((1 - doubt) / at_least(whole, SMALLEST) + doubt / at_least(spare, SMALLEST))
+
+
 # ---------------------------------------------------------------- the noise
 
 def sample_variance(g, p, integrate):
