@@ -14,7 +14,7 @@ from . import llvm
 _PACKAGE = "mis_integrators.integrators"
 
 # Modules to load anew for a variant, those that others import first.
-MODULES: tuple[str, ...] = ("common", "bdpm", "weighted", "bdpm_balance", "bdpm_opt", "bdpt", "resampled", "bdpt_ris")
+MODULES: tuple[str, ...] = ("common", "bdpm", "weighted", "bdpm_balance", "bdpm_opt", "bdpt", "vcm", "resampled", "bdpt_ris")
 
 # Plugin name -> (module, class)
 PLUGINS: dict[str, tuple[str, str]] = {
@@ -26,6 +26,7 @@ PLUGINS: dict[str, tuple[str, str]] = {
     "bdpt": ("bdpt", "BDPT"),
     "bdpt_ris": ("bdpt_ris", "BDPTRIS"),
     "pcbpt": ("bdpt_ris", "PCBPT"),
+    "vcm": ("vcm", "VCM"),
 }
 
 

@@ -81,6 +81,8 @@ class MitsubaSession:
             )
         # The film has all channels; the tensor that render() could return lacks some under `aov`.
         self._sum += np.array(self._sensor.film().bitmap()).reshape(self._sum.shape)
+        # Else the sampler's unused final state waits, and the next recorded pass would trace these paths again to evaluate it.
+        self._sensor.sampler().seed(0, 1)
         self.iterations += 1
 
     def image(self) -> np.ndarray:

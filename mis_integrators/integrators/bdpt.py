@@ -13,7 +13,7 @@ from ..transport.guide import EnvironmentGuide, infinite_emitters
 from ..transport.lenses import Lens
 from ..transport.lights import Lights
 from ..transport.packing import rounded_up
-from ..transport.random import mix, next_2d, streams
+from ..transport.random import mix, next_2d, vertex_streams
 from ..transport.recording import recorder
 from ..transport.subpaths import read_vertices, trace_camera_subpaths, trace_light_subpaths
 from ..transport.traits import SceneTraits
@@ -23,18 +23,79 @@ from .pyramid import Ledger, camera_images, sensor_images, technique_channels, w
 
 CHUNK = 1 << 19
 """Camera paths, and as many light sub-paths, traced at once at most; larger films are traced in parts (bounds memory)."""
-
-THINNING = 0.1
+THINNING = 0.05
+"""Joined pairs that would bring less than this share of the mean radiance are left out by Russian roulette."""
 
 
 class BDPT(IterativeIntegrator):
-    """(docs below)"""
+    r"""
+    .. _integrator-bdpt:
+
+    Bidirectional path tracing (:monosp:`bdpt`)
+    -------------------------------------------
+
+    .. pluginparameters::
+
+     * - beta
+       - |float|
+       - Exponent of the heuristic, from 1 to 8: 1 is Veach's balance heuristic, 2 his power heuristic. (Default: 1)
+     * - techniques
+       - |int|
+       - Adds an image of its own for each technique (s, t), s vertices from the light and t from the camera, of paths of up to that many
+         segments: channels ``technique.s2.t1.R`` and so on (mono: ``.Y``), and ``technique.rest.*`` for all longer paths. From 0 (none) to 10.
+         (Default: 0)
+     * - technique_weights
+       - |bool|
+       - Those images show each technique's share, and their sum is the image; |false| shows each as if it were the only technique.
+         (Default: |true|)
+     * - camera_paths
+       - |int|
+       - Camera paths per pixel and iteration, each with a light sub-path of its own. (Default: 1)
+     * - variance
+       - |bool|
+       - Adds the channels ``var.R``, ``var.G``, ``var.B`` (mono: ``var.Y``): the estimated variance of the pixel mean over the
+         iterations, of which there must be two at least. (Default: no, i.e. |false|)
+     * - max_depth
+       - |int|
+       - Longest path in segments, both halves together (-1: unlimited). A value of 1 shows only directly visible emitters, 2 adds
+         direct light, and so on. (Default: -1)
+     * - rr_depth
+       - |int|
+       - Depth from which Russian roulette may end a sub-path, in each half. (Default: 5)
+     * - hide_emitters
+       - |bool|
+       - Hide directly visible emitters. (Default: no, i.e. |false|)
+
+    Each camera path is traced with a light sub-path. Light comes from emitters that the camera path meets, from next-event estimation,
+    from joining each of its vertices with each of the light sub-path's (few of those that would bring little), and from joining the latter's with
+    the sensor, on perspective, thin-lens and orthographic sensors. All techniques that could have made a path share it by Veach's
+    heuristic (1997, chapter 10).
+
+    Unbiased, without any parameter to choose. Participating media, polarised variants, gradients and the film ``specfilm`` are refused by name.
+
+    .. tabs::
+        .. code-tab:: xml
+
+            <integrator type="bdpt">
+                <integer name="max_depth" value="10"/>
+            </integrator>
+
+        .. code-tab:: python
+
+            'type': 'bdpt',
+            'max_depth': 10
+    """
+
+    techniques, technique_weights = 0, True
 
     def read_parameters(self, parameters):
-        self.beta = parameters.number("beta", 1.0, lambda beta: 1 <= beta <= 8, "from 1 (balance) to 8; 2 is the power heuristic")
-
+        self.read_heuristic(parameters)
         self.techniques = parameters.integer("techniques", 0, 0, "from 0 (none) to 10", high=10)
         self.technique_weights = parameters.boolean("technique_weights", True)
+
+    def read_heuristic(self, parameters):
+        """Reads the exponent."""
+        self.beta = parameters.number("beta", 1.0, lambda beta: 1 <= beta <= 8, "from 1 (balance) to 8; 2 is the power heuristic")
 
     def aov_names(self):
         return super().aov_names() + (technique_channels(self.techniques, self.technique_weights) if self.techniques else [])
@@ -49,6 +110,9 @@ class BDPT(IterativeIntegrator):
 class BDPTSession(IterativeSession):
     """Iterations of `bdpt`: light sub-paths, camera sub-paths, connections, the light that meets the sensor."""
 
+    shortest = 2
+    """Segments that a light sub-path adds at least to a camera path with which it is joined."""
+
     def __init__(self, integrator, scene, sensor, seed, iterations):
         super().__init__(integrator, scene, sensor, seed, iterations)
         self.traits = SceneTraits(scene)
@@ -57,10 +121,11 @@ class BDPTSession(IterativeSession):
         self.path_count = film_sample_count(sensor) * integrator.camera_paths
         self.chunks = -(-self.path_count // CHUNK)
         self.chunk = -(-self.path_count // self.chunks)
-        self.light_paths = self.chunks * self.chunk
+        self.light_chunk = self.light_count()
+        self.light_paths = self.chunks * self.light_chunk
         width, height = sensor.film().crop_size()
         self.pixel_paths = width * height * integrator.camera_paths
-        self.capacity = {"light": rounded_up(3 * self.chunk), "camera": rounded_up(3 * self.chunk), "pairs": rounded_up(4 * self.chunk)}
+        self.capacity = {"light": rounded_up(3 * self.light_chunk), "camera": rounded_up(3 * self.chunk), "pairs": rounded_up(4 * self.chunk)}
         self.lens = Lens(sensor).connects
         depth = integrator.max_depth
         self.bidirectional = not self.lights.dark and (depth < 0 or depth >= 2)
@@ -78,8 +143,12 @@ class BDPTSession(IterativeSession):
         self._connection_pass = self.recorded(self._connect)
         self._sensor_pass = self.recorded(self._join_sensor)
 
-    def weights(self):
-        """The weights of this session."""
+    def light_count(self):
+        """Light sub-paths with each part of the camera paths."""
+        return self.chunk
+
+    def weights(self, spectral):
+        """The weights of an iteration."""
         integrator = self.integrator
         beta = int(integrator.beta) if integrator.beta == int(integrator.beta) else integrator.beta
         return ConnectionWeights(self.lights, beta, self.light_paths / self.pixel_paths)
@@ -87,7 +156,7 @@ class BDPTSession(IterativeSession):
     # ------------------------------------------------------------------ passes
 
     def _trace_light(self, scene, sensor, tables, seed, spectral):
-        return trace_light_subpaths(scene, self.lights, self.traits, self.weights(), seed, self.chunk, self.capacity["light"],
+        return trace_light_subpaths(scene, self.lights, self.traits, self.weights(spectral), seed, self.light_chunk, self.capacity["light"],
                                     spectral["wavelengths"], sensor.shutter_open(), sensor.shutter_open_time(),
                                     self.integrator.max_depth, self.integrator.rr_depth)
 
@@ -95,19 +164,21 @@ class BDPTSession(IterativeSession):
         integrator = self.integrator
         ledger = self._ledger() if integrator.techniques else None
         radiance, alpha, position, vertices, count = trace_camera_subpaths(
-            scene, sensor, integrator, self.lights, self.traits, self.weights(), seed, first, self.chunk, integrator.camera_paths,
-            spectral["sample"], integrator.max_depth, integrator.rr_depth, integrator.hide_emitters, self.capacity["camera"], ledger)
+            scene, sensor, integrator, self.lights, self.traits, self.weights(spectral), seed, first, self.chunk, integrator.camera_paths,
+            spectral["sample"], integrator.max_depth, integrator.rr_depth, integrator.hide_emitters, self.capacity["camera"], ledger,
+            self.shortest)
         return radiance, alpha, position, vertices, count, ledger.entries if ledger else None
 
     def _ledger(self, entries=None):
         return Ledger(self.chunk, self.integrator.techniques, self.integrator.technique_weights, entries)
 
-    def _list_pairs(self, tables, light, radiance, camera, camera_count, seed):
+    def _list_pairs(self, tables, light, radiance, camera, camera_count, seed, spectral):
         vertices, count, lengths = light
         start, order = by_path(vertices, count, lengths, self.capacity["light"])
-        level = dr.zeros(mi.Float, self.chunk) + dr.mean(dr.mean(radiance)) * THINNING
+        thinning = THINNING if self.integrator.technique_weights else 0
+        level = dr.zeros(mi.Float, self.chunk) + dr.mean(dr.mean(radiance)) * thinning
         dr.eval(level, start, order)
-        return list_pairs(self.traits, self.weights(), camera, camera_count, self.capacity["camera"], vertices, start, order, lengths,
+        return list_pairs(self.traits, self.weights(spectral), camera, camera_count, self.capacity["camera"], vertices, start, order, lengths,
                           self.integrator.max_depth, self.capacity["pairs"], level, seed)
 
     def _connect(self, scene, tables, radiance, camera, light, pairs, spectral, entries):
@@ -119,7 +190,7 @@ class BDPTSession(IterativeSession):
         y = read_vertices(light, dr.gather(mi.UInt32, light_place, index, active), active)
         pair = join(self.traits, z, y, spectral["wavelengths"], active)
         seen = visible(scene, pair, z, active & (dr.max(pair.value) > 0))
-        share = self.weights().connected(pair, z, y) * dr.gather(mi.Float, factor, index, active)
+        share = self.weights(spectral).connected(pair, z, y) * dr.gather(mi.Float, factor, index, active)
         total = mi.Spectrum(radiance)
         dr.scatter_reduce(dr.ReduceOp.Add, total, pair.value * share, z["path"], seen)
         if entries:
@@ -132,12 +203,13 @@ class BDPTSession(IterativeSession):
         vertices, count, _ = light
         index = dr.arange(mi.UInt32, self.capacity["light"])
         active = index < dr.gather(mi.UInt32, count, 0)
-        aperture = next_2d(streams(index, seed)) if sensor.needs_aperture_sample() else mi.Point2f(0.5)
         y = read_vertices(vertices, index, active)
+        rng = vertex_streams(y["path"], y["number"], seed)
+        aperture = next_2d(rng) if sensor.needs_aperture_sample() else mi.Point2f(0.5)
         joined = join_sensor(scene, self.integrator, self.traits, Lens(sensor), y, aperture, mi.Float(sensor.shutter_open()),
                              spectral["wavelengths"], self.integrator.hide_emitters, active)
         value = joined.value * (self.pixel_paths / self.light_paths)
-        share = self.weights().seen_by_sensor(joined, y)
+        share = self.weights(spectral).seen_by_sensor(joined, y)
         channels = list(colour_channels(value * share, spectral["matrix"]))
         if self.integrator.techniques:
             value = value * share if self.integrator.technique_weights else value
@@ -148,11 +220,10 @@ class BDPTSession(IterativeSession):
         """Block of the camera paths, and that of their techniques (or None)."""
         active = dr.arange(mi.UInt32, self.chunk) + first < self.path_count
         film, techniques = self.sensor.film(), None
-        shown = alpha > 0 if self.integrator.hide_emitters else mi.Bool(True)   # as `path`: what is behind nothing but null surfaces is hidden
         if entries:
             channels = camera_images(self._ledger(entries), spectral["matrix"])
-            techniques = splat_channels(film, position, [dr.select(shown, channel, 0) for channel in channels], active)
-        return splat_samples(film, position, dr.select(shown, radiance, 0), alpha, spectral["matrix"], active), techniques
+            techniques = splat_channels(film, position, channels, active)
+        return splat_samples(film, position, radiance, alpha, spectral["matrix"], active), techniques
 
     # ------------------------------------------------------------------ iterations
 
@@ -180,16 +251,25 @@ class BDPTSession(IterativeSession):
                 break
         if self.bidirectional:
             while True:
-                pairs = self._pair_pass(self._tables, light, radiance, camera, count, self._seed(iteration, THIN, chunk))
+                pairs = self._pair_pass(self._tables, light, radiance, camera, count, self._seed(iteration, THIN, chunk), spectral)
                 if not self._grown("pairs", pairs[-1]):
                     break
             radiance, entries = self._connection_pass(self.scene, self._tables, radiance, camera, light[0], pairs, spectral, entries)
+            radiance = self._merge(radiance, camera, count, light, spectral)
             if self.lens:
                 lit = self._sensor_pass(self.scene, self.sensor, self._tables, light, self._seed(iteration, APERTURE, chunk), spectral)
         return *self._splat(radiance, alpha, position, first, spectral, entries), lit
 
+    def _spectral(self, iteration):
+        """What all sub-paths of an iteration share."""
+        return shared_wavelengths(self.sensor, mix(self.seed, iteration, WAVELENGTH))
+
+    def _merge(self, radiance, camera, count, light, spectral):
+        """Radiance of camera paths with that of merges added (none here)."""
+        return radiance
+
     def _iteration(self, iteration):
-        spectral = shared_wavelengths(self.sensor, mix(self.seed, iteration, WAVELENGTH))
+        spectral = self._spectral(iteration)
         parts = [self._chunk(iteration, chunk, spectral) for chunk in range(self.chunks)]
         block, techniques, light = (None if blocks[0] is None else sum(blocks[1:], blocks[0]) for blocks in zip(*parts))
         if light is not None:

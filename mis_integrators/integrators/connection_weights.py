@@ -31,7 +31,7 @@ class ConnectionWeights:
 
     # ------------------------------------------------------------------ hooks of the sub-paths
 
-    def lit(self, si, source, reachable, active, flux):
+    def lit(self, si, source, reachable, active, flux=None):
         ds = dr.copy(source)
         ds.d = ds.p - si.p
         ds.dist = dr.norm(ds.d)
@@ -46,11 +46,11 @@ class ConnectionWeights:
     def seen(self, density, active):
         return [dr.select(active & (density > 0), theory.camera_start(density, self.ratio), 0), mi.Float(0)]
 
-    def left(self, state, p_forward, p_back, delta, scattered):
+    def left(self, state, p_forward, p_back, delta, scattered=None):
         near, far = state
         return [near, dr.select(delta, far, theory.far_of(self._nearer(state, p_back), p_forward))]
 
-    def arrived(self, state, density, si, squared, depth):
+    def arrived(self, state, density, si=None, squared=None, depth=None):
         return [dr.select(density > 0, theory.reciprocal(density), 0), state[1]]
 
     def met(self, state, direct, emission, sampled):
@@ -71,6 +71,12 @@ class ConnectionWeights:
         a_light = self._nearer([light[name] for name in self.states], connection.back_at_light)
         a_camera = self._nearer([camera[name] for name in self.states], connection.back_at_camera)
         return theory.connection(connection.density_at_light, a_light, connection.density_at_camera, a_camera, self.beta)
+
+    def merged(self, camera, state, back_at_light, back_at_camera):
+        """Weight of merging a camera vertex with a light vertex of that `state` (arguments as of `weigh` of `transport.merging.merge`)."""
+        a_light = theory.nearer(*state, back_at_light, self.beta)
+        a_camera = theory.nearer(camera["near"], camera["far"], back_at_camera, self.beta)
+        return theory.merging(a_light, a_camera, self.eta, self.beta)
 
     def seen_by_sensor(self, connection, light):
         """Weight of a `LensConnection` of a light vertex."""

@@ -19,7 +19,7 @@ from ..transport.light_starts import sample_light_starts
 from ..transport.lights import Lights
 from ..transport.packing import rounded_up
 from ..transport.proposals import Proposals, cumulative_sums
-from ..transport.random import mix, next_2d, streams
+from ..transport.random import mix, next_2d, vertex_streams
 from ..transport.recording import recorder
 from ..transport.subpaths import junction_of, read_vertices, trace_light_subpaths
 from ..transport.traits import SceneTraits
@@ -106,10 +106,9 @@ class ResampledSession(IterativeSession):
     # ------------------------------------------------------------------ passes
 
     def _trace_light(self, scene, sensor, tables, seed, spectral):
-        vertices, count, _ = trace_light_subpaths(scene, self.lights, self.traits, self.weights(), seed, self.light_chunk, self.capacity["light"],
-                                                  spectral["wavelengths"], sensor.shutter_open(), sensor.shutter_open_time(),
-                                                  self.integrator.max_depth, self.integrator.rr_depth)
-        return vertices, count
+        return trace_light_subpaths(scene, self.lights, self.traits, self.weights(), seed, self.light_chunk, self.capacity["light"],
+                                    spectral["wavelengths"], sensor.shutter_open(), sensor.shutter_open_time(), self.integrator.max_depth,
+                                    self.integrator.rr_depth)
 
     def _trace_camera(self, scene, sensor, tables, seed, first, spectral):
         integrator = self.integrator
@@ -124,11 +123,11 @@ class ResampledSession(IterativeSession):
         M = self.integrator.light_paths
         return LightEnds(self.traits, self.lights, starts, M, light, places, dr.minimum(found, self.capacity["ends"]) + M, self.reach)
 
-    def _targets(self, scene, sensor, tables, seed, light, count, first, cache, spectral, target):
+    def _targets(self, scene, sensor, tables, seed, light, count, lengths, first, cache, spectral, target):
         """q*/p of every light vertex of M sub-paths (from the number `first` on) at every cache point if nothing stood between, row by row; whether nothing
         does; and what makes their `LightEnds`."""
         room, M = self.capacity["ends"], self.integrator.light_paths
-        places, found = list_ends(light, count, first, M, self.capacity["light"], room)
+        places, found = list_ends(light, count, lengths, first, M, self.capacity["light"], room)
         starts = self._starts(sensor, seed, spectral)
         ends = self._ends(starts, light, places, found)
         width = M + room
@@ -151,9 +150,9 @@ class ResampledSession(IterativeSession):
         seen = ends.unblocked(scene, z["p"], z["n"], sent, active)
         return dr.select(active, r, 0), seen, starts, places, found, sent.vertices
 
-    def _own_targets(self, scene, sensor, tables, seed, light, count, cache, spectral):
+    def _own_targets(self, scene, sensor, tables, seed, light, count, lengths, cache, spectral):
         """The same of the first M sub-paths for the target at hand (the last array is not needed)."""
-        return self._targets(scene, sensor, tables, seed, light, count, 0, cache, spectral, self.integrator.target)[:5]
+        return self._targets(scene, sensor, tables, seed, light, count, lengths, mi.UInt32(0), cache, spectral, self.integrator.target)[:5]
 
     def _pmfs(self, r, seen, found):
         """Cumulative sums of the cache points' pmfs."""
@@ -171,7 +170,7 @@ class ResampledSession(IterativeSession):
         vertex = index // integrator.resamples
         active = vertex < dr.gather(mi.UInt32, count, 0)
         z = read_vertices(camera, vertex, active, states=STEP)
-        rng = streams(index, seed)
+        rng = vertex_streams(z["path"] * integrator.resamples + index % integrator.resamples, z["number"], seed)
         row = self.grid.row(z["p"], dr.mulsign(z["n"], dr.dot(z["n"], z["towards"])))
         drawn = proposals.draw(row, rng, active)
         active &= drawn < dr.gather(mi.UInt32, ends.count, 0)
@@ -215,8 +214,8 @@ class ResampledSession(IterativeSession):
         """Block of the light that meets the sensor."""
         index = dr.arange(mi.UInt32, self.capacity["light"])
         active = index < dr.gather(mi.UInt32, count, 0)
-        aperture = next_2d(streams(index, seed)) if sensor.needs_aperture_sample() else mi.Point2f(0.5)
         y = read_vertices(light, index, active, states=END)
+        aperture = next_2d(vertex_streams(y["path"], y["number"], seed)) if sensor.needs_aperture_sample() else mi.Point2f(0.5)
         joined = join_sensor(scene, self.integrator, self.traits, Lens(sensor), y, aperture, mi.Float(sensor.shutter_open()),
                              spectral["wavelengths"], self.integrator.hide_emitters, active)
         value = joined.value * (self.weights().seen_by_sensor(joined, y) / self.ratio)
@@ -232,7 +231,7 @@ class ResampledSession(IterativeSession):
         vertices, M = min(int(traced[4][0]), self.capacity["camera"]), self.integrator.light_paths
         wanted = min(max(FEWEST_CACHE_POINTS, int(vertices * CACHE_SHARE)), max(vertices, 1))
         self.cache = self._cache_points(traced[3], vertices, min(wanted, FEWEST_CACHE_POINTS))
-        self._ends_fit(lambda: self._targets(self.scene, self.sensor, self._tables, self._seed(PILOT, START), *light, 0, self.cache, spectral,
+        self._ends_fit(lambda: self._targets(self.scene, self.sensor, self._tables, self._seed(PILOT, START), *light, mi.UInt32(0), self.cache, spectral,
                                              "f_y_rho_g_v"))
         self.cache = self._cache_points(traced[3], vertices, max(min(wanted, MOST_PAIRS // (M + self.capacity["ends"])), 1))
         normals = dr.mulsign(self.cache["n"], dr.dot(self.cache["n"], self.cache["towards"]))
@@ -243,9 +242,11 @@ class ResampledSession(IterativeSession):
 
     def _cache_points(self, camera, vertices, count):
         """`count` of the camera's vertices, at random (a single one in nothingness if there is none)."""
-        chosen = np.random.default_rng(mix(self.seed, PILOT, CAMERA)).choice(max(vertices, 1), count, replace=False)
         active = mi.Bool(vertices > 0)
-        cache = read_vertices(camera, mi.UInt32(np.sort(chosen)), active, states=STEP)
+        order = read_vertices(camera, dr.arange(mi.UInt32, max(vertices, 1)), active, ("path", "number"), STEP)
+        order = np.lexsort((np.array(order["number"]), np.array(order["path"])))        # places in the buffer are accidental
+        chosen = np.random.default_rng(mix(self.seed, PILOT, CAMERA)).choice(order, count, replace=False)
+        cache = read_vertices(camera, mi.UInt32(chosen.astype(np.uint32)), active, states=STEP)
         cache = {name: cache[name] for name in ("p", "n", "ns", "towards", "value", "density", "depth", "hit") if name in cache}
         cache["through"] = dr.full(mi.Bool, False, count)
         if "hit" in cache:
@@ -284,7 +285,7 @@ class ResampledSession(IterativeSession):
         return True
 
     def _light(self, iteration, chunk, spectral):
-        """`(vertices, count)` of light sub-paths."""
+        """What `trace_light_subpaths` returns."""
         while True:
             light = self._light_pass(self.scene, self.sensor, self._tables, self._seed(iteration, LIGHT, chunk), spectral)
             if not self._grown("light", light[1]):
@@ -318,7 +319,7 @@ class ResampledSession(IterativeSession):
                                              self._seed(iteration, DRAW, chunk), spectral)
             radiance = self._hit_pass(self._tables, radiance, camera, hits, hit_count)
             if self.lens:
-                block = self._sensor_pass(self.scene, self.sensor, self._tables, *light, self._seed(iteration, APERTURE, chunk), spectral)
+                block = self._sensor_pass(self.scene, self.sensor, self._tables, *light[:2], self._seed(iteration, APERTURE, chunk), spectral)
         active = dr.arange(mi.UInt32, self.chunk) + first < self.path_count
         if self.integrator.hide_emitters:
             radiance = dr.select(alpha > 0, radiance, 0)       # as `path` does: what is behind nothing but null surfaces is hidden

@@ -84,7 +84,7 @@ def trace_camera_vertices(scene, sensor, integrator, lights, traits, soften, see
             ds = mi.DirectionSample3f(scene, si, origin)
             shown = active & (ds.emitter != None)  # noqa: E711 (array comparison)
             if dr.hint(hide_emitters, mode='scalar'):
-                shown &= (depth > 1) | si.is_valid()
+                shown &= visible                     # what is behind nothing but null surfaces is hidden, too
             light = ds.emitter.eval(si, shown)
             radiance[shown & (depth == 1)] += throughput * light
             met = shown & (depth > 1) & (dr.max(light * throughput) > 0)
@@ -99,9 +99,10 @@ def trace_camera_vertices(scene, sensor, integrator, lights, traits, soften, see
             hit_layout().write(store.hits, values, slot, met)
 
         active &= si.is_valid()
-        if dr.hint(max_depth > 0, mode='scalar'):
-            active &= depth < max_depth
         bsdf = si.bsdf(ray)
+        if dr.hint(max_depth > 0, mode='scalar'):
+            visible |= active & (depth >= max_depth) & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+            active &= depth < max_depth
         smooth = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
 
         # ---- Keep the vertex
@@ -174,7 +175,8 @@ def sum_before(vertices, step, parent, p_made, strength, scattered, back, segmen
         strength = dr.minimum(strength * (scattered * dr.rcp(dr.maximum(back, 1e-20))), 1e15)
         back, scattered = mi.Float(back_there), mi.Float(scattered_there)
         active &= joined & (ratio > 0)
-        record = layout.read(vertices["words"], parent, active, (*STEP, "parent"))
+        record = layout.read(vertices["words"], parent, active, STEP)
         near, geometry, forward = record["near"], record["geometry"], record["forward"]
-        back_there, scattered_there, row, parent = record["back"], record["scattered"], record["row"], record["parent"]
+        back_there, scattered_there, row = record["back"], record["scattered"], record["row"]
+        parent = dr.gather(mi.UInt32, vertices["parent"], parent, active)
     return total

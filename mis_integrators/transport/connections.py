@@ -13,7 +13,7 @@ import mitsuba as mi
 from .junctions import SMALLEST_COSINE
 from .lenses import unblocked, unblocked_by_visible
 from .packing import Store
-from .random import streams
+from .random import vertex_streams
 from .subpaths import STATES, junction_of, read_vertices
 
 
@@ -65,13 +65,13 @@ def by_path(vertices, count, lengths, capacity: int):
     return start, order
 
 
-LAMBERTIAN = ("p", "path", "throughput", "density", "ns", "depth", "towards", "value", "n", *STATES)
+LAMBERTIAN = ("p", "path", "throughput", "density", "ns", "depth", "towards", "number", "value", "n", *STATES)
 """Fields of a vertex that a connection of Lambertian vertices needs."""
 
 
 @dr.syntax
 def list_pairs(traits, weights, camera, camera_count, camera_capacity: int, light, start, order, lengths, max_depth: int, capacity: int, level, seed):
-    """Every camera vertex with every vertex of the light sub-path of its own number, as far as `max_depth` lets them.
+    """Every camera vertex with every vertex of the light sub-path of its own number (modulo theirs), as far as `max_depth` lets them.
 
     Pairs of Lambertian vertices are thinned out by what they would bring if nothing stood between (Russian roulette): those worth less than `level`
     [radiance, channel mean; an array with one number a camera path] stay with a probability in proportion. Returns `(camera places, light
@@ -81,11 +81,12 @@ def list_pairs(traits, weights, camera, camera_count, camera_capacity: int, ligh
                   count=dr.zeros(mi.UInt32, 1))
     index = dr.arange(mi.UInt32, camera_capacity)
     active = index < dr.gather(mi.UInt32, camera_count, 0)
-    rng = streams(index, seed)
     z = read_vertices(camera, index, active, LAMBERTIAN)
+    rng = vertex_streams(z["path"], z["number"], seed)
     level = dr.gather(mi.Float, level, z["path"], active)
-    place = dr.gather(mi.UInt32, start, z["path"], active)
-    left = dr.gather(mi.UInt32, lengths, z["path"], active)
+    partner = z["path"] % dr.width(lengths)
+    place = dr.gather(mi.UInt32, start, partner, active)
+    left = dr.gather(mi.UInt32, lengths, partner, active)
 
     while dr.hint(left > 0, label="pairs"):
         vertex = dr.gather(mi.UInt32, order, place)

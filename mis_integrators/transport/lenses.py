@@ -10,6 +10,9 @@ import mitsuba as mi
 
 CONNECTED = ("PerspectiveCamera", "ThinLensCamera", "OrthographicCamera")
 
+SAME_POINT = 1e-4
+"""Relative difference of distances up to which a ray has met the point towards which it was sent."""
+
 
 class Lens:
     """What joins surface points to a sensor. Attribute `connects`: whether that is possible; other sensors are only met by camera rays."""
@@ -66,11 +69,13 @@ def unblocked(scene, p, n, d, distance, active):
 
 
 def unblocked_by_visible(scene, integrator, p, d, distance, active):
-    """The same towards a sensor that does not see emitters' shapes (`hide_emitters`): looks from there to the point."""
+    """The same towards a sensor that does not see emitters' shapes (`hide_emitters`): whether a look from there through all of them ends at the
+    point. It does not where the point lies on such a shape itself."""
     ray = mi.Ray3f(p + d * distance, -d)
     hit = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
     on_light = active & hit.is_valid() & (hit.shape.emitter() != None)  # noqa: E711 (array comparison)
     behind = hit.compute_surface_interaction(ray, mi.RayFlags.Minimal, on_light).spawn_ray(ray.d)
     hit[on_light] = integrator.skip_area_emitters(scene, behind, True, on_light)
     start = dr.select(on_light, behind.o, ray.o)
-    return active & (~hit.is_valid() | (hit.t > dr.norm(p - start) * (1 - 1e-3)))
+    expected = dr.norm(p - start)
+    return active & hit.is_valid() & (dr.abs(hit.t - expected) < SAME_POINT * distance)

@@ -90,14 +90,17 @@ class LightEnds:
         return unblocked(scene, p, n, sent.d, dr.minimum(sent.distance, self.reach), active)
 
 
-def list_ends(vertices, count, first, paths: int, capacity: int, room: int):
-    """Places of the vertices of the light sub-paths `first`, `first + 1`, ..., `paths` of them, and their number (width one; above `room`: the surplus is
-    missing)."""
+def list_ends(vertices, count, lengths, first, paths: int, capacity: int, room: int):
+    """Places of the vertices of the light sub-paths `first`, `first + 1`, ..., `paths` of them, in the order of paths and of each one's vertices, and their
+    number (width one; above `room`: the surplus is missing). `lengths`: how many vertices each sub-path has."""
+    start = dr.prefix_sum(lengths, exclusive=False)
+    dr.eval(start)
+    before = dr.gather(mi.UInt32, start, first - 1, first > 0)
     index = dr.arange(mi.UInt32, capacity)
     active = index < dr.gather(mi.UInt32, count, 0)
-    path = read_vertices(vertices, index, active, ("path",), END)["path"]
-    active &= (path >= first) & (path < first + paths)
-    found, places = dr.zeros(mi.UInt32, 1), dr.zeros(mi.UInt32, room)
-    slot = dr.scatter_inc(found, mi.UInt32(0), active)
-    dr.scatter(places, index, slot, active & (slot < room))
-    return places, found
+    vertex = read_vertices(vertices, index, active, ("path", "number"), END)
+    active &= (vertex["path"] >= first) & (vertex["path"] < first + paths)
+    rank = dr.gather(mi.UInt32, start, vertex["path"] - 1, active & (vertex["path"] > 0)) + vertex["number"] - before
+    places = dr.zeros(mi.UInt32, room)
+    dr.scatter(places, index, rank, active & (rank < room))
+    return places, dr.gather(mi.UInt32, start, first + (paths - 1)) - before

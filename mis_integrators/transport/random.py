@@ -21,6 +21,11 @@ def streams(index, seed):
     return mi.PCG32(initstate=mi.UInt64(low) | (mi.UInt64(high) << 32), initseq=mi.UInt64(index))
 
 
+def vertex_streams(path, number, seed):
+    """A generator for every kept vertex `number` of sub-path `path`: not for its place in a buffer, which chance decides."""
+    return streams(path, seed + number * mi.UInt32(0x9e3779b9))
+
+
 def next_2d(rng, active=True):
     """Two uniform numbers in [0, 1) as a point; advances `rng`."""
     return mi.Point2f(rng.next_float32(active), rng.next_float32(active))

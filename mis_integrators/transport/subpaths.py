@@ -41,16 +41,16 @@ STATES = ("near", "far")
 def vertex_layout(states=STATES):
     """Fields of a kept vertex: position `p`, number of the sub-path `path`, `throughput` (light: flux; camera: importance) that arrives, `value` and
     `density` as of `Junction`, the state of the weights, geometric normal `n`, direction `towards` the vertex before, `depth` in segments,
-    shading normal `ns`, `number` among the sub-path's kept vertices, `parent` (the place of the one before, or `NO_PARENT`)."""
+    shading normal `ns`, `number` among the sub-path's kept vertices."""
     return Layout({"p": mi.Point3f, "path": mi.UInt32, "throughput": mi.Spectrum, "density": mi.Float, "ns": mi.Vector3f, "depth": mi.UInt32,
-                   "towards": mi.Vector3f, "number": mi.UInt32, "value": mi.Spectrum, "parent": mi.UInt32, "n": mi.Vector3f,
+                   "towards": mi.Vector3f, "number": mi.UInt32, "value": mi.Spectrum, "n": mi.Vector3f,
                    **{name: mi.Float for name in states}})
 
 
 def new_vertices(traits, capacity, states=STATES):
-    """Room for `capacity` vertices, a dictionary: `words` (records of `vertex_layout`), and where surfaces are not all Lambertian `hit`, from which
-    the surface interaction is made again. Only the places below the count are valid."""
-    buffer = {"words": vertex_layout(states).room(capacity)}
+    """Room for `capacity` vertices, a dictionary: `words` (records of `vertex_layout`), `parent` (the place of the vertex before, or `NO_PARENT`), and
+    where surfaces are not all Lambertian `hit`, from which the surface interaction is made again. Only the places below the count are valid."""
+    buffer = {"words": vertex_layout(states).room(capacity), "parent": dr.empty(mi.UInt32, capacity)}
     if traits.has_rough:
         buffer["hit"] = dr.empty(mi.PreliminaryIntersection3f, capacity)
     return buffer
@@ -61,8 +61,9 @@ def keep_vertex(store, junction, si, hit, towards, throughput, path, depth, numb
     slot = dr.scatter_inc(store.count, mi.UInt32(0), keep)
     keep = keep & (slot < capacity)
     values = {"p": si.p, "n": junction.n, "ns": junction.ns, "towards": towards, "throughput": throughput, "value": junction.value,
-              "density": junction.density, "path": path, "depth": depth, "number": number, "parent": parent, **dict(zip(states, state))}
+              "density": junction.density, "path": path, "depth": depth, "number": number, **dict(zip(states, state))}
     vertex_layout(states).write(store.vertices["words"], values, slot, keep)
+    dr.scatter(store.vertices["parent"], parent, slot, keep)
     if "hit" in store.vertices:
         dr.scatter(store.vertices["hit"], hit, slot, keep)
     return slot
@@ -71,8 +72,9 @@ def keep_vertex(store, junction, si, hit, towards, throughput, path, depth, numb
 def read_vertices(vertices, index, active, only=None, states=STATES):
     """The vertices at places `index`, a dictionary of all their fields (or those named in `only`); zero on inactive lanes."""
     record = vertex_layout(states).read(vertices["words"], index, active, only)
-    if "hit" in vertices and (only is None or "hit" in only):
-        record["hit"] = dr.gather(mi.PreliminaryIntersection3f, vertices["hit"], index, active)
+    for name in ("parent", "hit"):
+        if name in vertices and (only is None or name in only):
+            record[name] = dr.gather(type(vertices[name]), vertices[name], index, active)
     return record
 
 
@@ -185,12 +187,12 @@ def trace_light_subpaths(scene, lights, traits, weights, seed, n_paths: int, cap
 
 @dr.syntax
 def trace_camera_subpaths(scene, sensor, integrator, lights, traits, weights, seed, first, n_paths: int, camera_paths: int, wavelength_sample,
-                          max_depth: int, rr_depth: int, hide_emitters: bool, capacity: int, ledger=None):
+                          max_depth: int, rr_depth: int, hide_emitters: bool, capacity: int, ledger=None, shortest: int = 2):
     """Traces `n_paths` camera paths, numbers `first`, `first + 1`, ... of `film_samples`, with the light that they meet and that next-event estimation
     finds at each smooth vertex, weighted.
 
-    Returns `(radiance, alpha, splat position, vertices, count)`: the kept vertices are those that a light sub-path may be joined with; `count` as in
-    `trace_light_subpaths`. `ledger`, if given, learns every contribution: `met(path, depth, value, share, mask)` and `direct(...)`, with the length
+    Returns `(radiance, alpha, splat position, vertices, count)`: the kept vertices are those that a light sub-path, of at least `shortest` segments with
+    what joins the two, may be joined with; `count` as in `trace_light_subpaths`. `ledger`, if given, learns every contribution: `met(path, depth, value, share, mask)` and `direct(...)`, with the length
     of the joint path in segments, and the weight apart.
     """
     path, active, rng, ray, sensor_weight, splat, aperture = start_camera_paths(sensor, seed, first, 1, n_paths, camera_paths, wavelength_sample)
@@ -229,7 +231,7 @@ def trace_camera_subpaths(scene, sensor, integrator, lights, traits, weights, se
             ds = mi.DirectionSample3f(scene, si, origin)
             shown = active & (ds.emitter != None)  # noqa: E711 (array comparison)
             if dr.hint(hide_emitters, mode='scalar'):
-                shown &= (depth > 1) | si.is_valid()
+                shown &= visible                     # what is behind nothing but null surfaces is hidden, too
             later = shown & (depth > 1)
             share = weights.met(state, lights.pdf_direct(origin, ds, later), lights.emission_ratio(origin, ds, later), density)
             share = dr.select(later, share, 1)
@@ -239,9 +241,10 @@ def trace_camera_subpaths(scene, sensor, integrator, lights, traits, weights, se
                 ledger.met(path, depth, light, share, shown)
 
         active &= si.is_valid()
-        if dr.hint(max_depth > 0, mode='scalar'):
-            active &= depth < max_depth
         bsdf = si.bsdf(ray)
+        if dr.hint(max_depth > 0, mode='scalar'):
+            visible |= active & (depth >= max_depth) & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+            active &= depth < max_depth
         smooth = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
 
         # ---- Arrive
@@ -268,10 +271,10 @@ def trace_camera_subpaths(scene, sensor, integrator, lights, traits, weights, se
             if dr.hint(ledger is not None, mode='scalar'):
                 ledger.direct(path, depth + 1, light, share, reached)
 
-        # ---- Keep the vertex: a light sub-path needs two more segments
+        # ---- Keep the vertex
         wanted = smooth & (dr.max(throughput) > 0)
         if dr.hint(max_depth > 0, mode='scalar'):
-            wanted &= depth + 2 <= max_depth
+            wanted &= depth + shortest <= max_depth
         slot = keep_vertex(store, junction, si, hit, towards, throughput, path, depth, number, parent, state, weights.states, capacity, wanted)
         number = dr.select(wanted, number + 1, number)
         parent = dr.select(wanted, slot, parent)

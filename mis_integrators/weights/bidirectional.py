@@ -56,7 +56,8 @@ def reciprocal(density):
 def nearer(near, far, p_back, beta, eta=0.0):
     """A_i = near_i + P' far_i + eta (the brackets of equations 40 and 41): all techniques nearer to the sub-path's start than the one that
     joins x_i with the other side, over p<(x_i). `p_back`: P', the other side's density at x_i for the direction to x_{i-1}."""
-    return norm(norm(near, at_most(p_back * far, LARGEST), beta), eta, beta)
+    inner = norm(near, at_most(p_back * far, LARGEST), beta)
+    return inner if isinstance(eta, float) and eta == 0 else norm(inner, eta, beta)
 
 
 def near_of(p_forward, geometry):

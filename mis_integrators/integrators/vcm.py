@@ -1,0 +1,157 @@
+"""Plugin `vcm`: vertex connection and merging."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..transport.merging import merge, vertex_map
+from ..transport.photon_map import smallest_cell
+from ..transport.subpaths import read_vertices
+from .bdpt import BDPT, BDPTSession
+from .connection_weights import ConnectionWeights
+
+RADIUS_SHARE = 0.004
+"""The automatic radius, in units of the spread of what the camera sees."""
+PILOT_INDEX = 1 << 30
+"""Iteration number of the pilot that looks at it, so that its random numbers are its own."""
+
+
+class VCM(BDPT):
+    r"""
+    .. _integrator-vcm:
+
+    Vertex connection and merging (:monosp:`vcm`)
+    ---------------------------------------------
+
+    .. pluginparameters::
+
+     * - beta
+       - |float|
+       - Exponent of the heuristic, from 1 to 8: 1 is Veach's balance heuristic, 2 his power heuristic. (Default: 1)
+     * - photon_count
+       - |int|
+       - Light sub-paths an iteration; 0 stands for as many as camera paths. (Default: 0)
+     * - initial_radius
+       - |float|
+       - Merge radius of the first iteration, in scene units; 0 stands for 0.4 % of the spread of what the camera sees. (Default: 0)
+     * - alpha
+       - |float|
+       - Radius reduction of progressive photon mapping, in (0, 1]: iteration i uses R_i^2 = R_0^2 (i + 1)^(alpha - 1). 1 keeps the
+         radius. (Default: 1)
+     * - camera_paths, variance, max_depth, rr_depth, hide_emitters
+       -
+       - As of :monosp:`bdpt`.
+
+    The techniques of :monosp:`bdpt`, and merging: at every smooth vertex of a camera path, all light sub-paths that end within the radius
+    contribute as photons do. All techniques share a path by Veach's heuristic, with the density of merges as Georgiev et al. 2012 have it, which
+    takes each light sub-path for a sample of its own.
+
+    Consistent: the bias of merging vanishes with the radius. Participating media, polarised variants, gradients and the film ``specfilm``
+    are refused by name.
+
+    .. tabs::
+        .. code-tab:: xml
+
+            <integrator type="vcm">
+                <float name="alpha" value="0.75"/>
+            </integrator>
+
+        .. code-tab:: python
+
+            'type': 'vcm',
+            'alpha': 0.75
+    """
+
+    def read_parameters(self, parameters):
+        self.read_heuristic(parameters)
+        self.photon_count = parameters.integer("photon_count", 0, 0, "at least 0 (0: as many as camera paths)", high=2 ** 31)
+        self.initial_radius = parameters.number("initial_radius", 0.0, lambda r: 0 <= r < float("inf"),
+                                                "finite and at least 0 (0: automatic)")
+        self.alpha = parameters.number("alpha", 1.0, lambda a: 0 < a <= 1, "in (0, 1]")
+
+    def settings(self):
+        settings = super().settings()
+        del settings["techniques"], settings["technique_weights"]
+        return {**settings, "photon_count": self.photon_count, "initial_radius": self.initial_radius, "alpha": self.alpha}
+
+    def new_session(self, scene, sensor, seed, iterations):
+        return VCMSession(self, scene, sensor, seed, iterations)
+
+
+class VCMSession(BDPTSession):
+    """Iterations of `vcm`: those of `bdpt`, and merging. Films that are rendered in parts have their light sub-paths in parts, too."""
+
+    shortest = 1
+
+    def __init__(self, integrator, scene, sensor, seed, iterations):
+        self.radius = integrator.initial_radius or None
+        super().__init__(integrator, scene, sensor, seed, iterations)
+
+    @property
+    def settings(self):
+        radius = {} if self.radius is None else {"radius": self.radius}
+        return {**super().settings, "photon_count": self.light_paths, **radius}
+
+    def light_count(self):
+        return -(-self.integrator.photon_count // self.chunks) or self.chunk
+
+    def _freeze(self):
+        super()._freeze()
+        self._merge_pass = self.recorded(self._merge_vertices)
+
+    def radius_at(self, iteration):
+        """R_i^2 = R_0^2 (i + 1)^(alpha - 1), a schedule of the iteration's index alone."""
+        return self.radius * (iteration + 1) ** (0.5 * (self.integrator.alpha - 1))
+
+    def _spectral(self, iteration):
+        spectral = super()._spectral(iteration)
+        if self.radius is None:
+            self._choose_radius(spectral)
+        spectral["radius"] = dr.opaque(mi.Float, self.radius_at(iteration))
+        return spectral
+
+    def _choose_radius(self, spectral):
+        """A share of the spread of the vertices that camera paths meet first: the diagonal, over the root of three, of the box that leaves out 2 % of
+        them at either end of each axis."""
+        self.radius = 1e-3 * float(dr.norm(self.traits.bounds.extents()))
+        if not self.bidirectional:
+            return
+        first = dr.opaque(mi.UInt32, 0)
+        spectral = {**spectral, "radius": dr.opaque(mi.Float, self.radius)}
+        while True:
+            *_, camera, count, _ = self._camera_pass(self.scene, self.sensor, self._tables, self._seed(PILOT_INDEX, 0), first, spectral)
+            if not self._grown("camera", count):
+                break
+        vertices = read_vertices(camera, dr.arange(mi.UInt32, int(count[0])), True, ("p", "number"))
+        points = np.array(vertices["p"])[:, np.array(vertices["number"]) == 0]
+        if points.shape[1]:
+            low, high = np.percentile(points, [2, 98], axis=1)
+            self.radius = max(RADIUS_SHARE * float(np.linalg.norm(high - low)) / 3 ** 0.5, 1e-3 * self.radius)
+
+    def weights(self, spectral):
+        plain = super().weights(spectral)
+        eta = dr.pi * dr.square(spectral["radius"]) * self.light_chunk
+        return ConnectionWeights(self.lights, plain.beta, plain.ratio, eta)
+
+    def _merge_vertices(self, tables, radiance, camera, count, light, spectral):
+        vertices, light_count, _ = light
+        cell = dr.maximum(spectral["radius"], smallest_cell(self.traits.bounds, self.capacity["light"]))
+        photon_map = vertex_map(vertices, light_count, self.capacity["light"], self.traits.bounds, cell)
+        index = dr.arange(mi.UInt32, self.capacity["camera"])
+        active = index < dr.gather(mi.UInt32, count, 0)
+        z = read_vertices(camera, index, active)
+        weights = self.weights(spectral)
+
+        def weigh(state, back_at_light, back_at_camera):
+            return weights.merged(z, state, back_at_light, back_at_camera)
+
+        merged = merge(self.traits, photon_map, z, spectral["radius"], spectral["wavelengths"], self.light_chunk, self.integrator.max_depth,
+                       weigh, active)
+        total = mi.Spectrum(radiance)
+        dr.scatter_reduce(dr.ReduceOp.Add, total, merged, z["path"], active)
+        return total
+
+    def _merge(self, radiance, camera, count, light, spectral):
+        return self._merge_pass(self._tables, radiance, camera, count, light, spectral)
