@@ -93,14 +93,15 @@ class LightEnds:
 def list_ends(vertices, count, lengths, first, paths: int, capacity: int, room: int):
     """Places of the vertices of the light sub-paths `first`, `first + 1`, ..., `paths` of them, in the order of paths and of each one's vertices, and their
     number (width one; above `room`: the surplus is missing). `lengths`: how many vertices each sub-path has."""
-    start = dr.prefix_sum(lengths, exclusive=False)
+    start = dr.prefix_sum(lengths)
     dr.eval(start)
-    before = dr.gather(mi.UInt32, start, first - 1, first > 0)
+    last = first + (paths - 1)
+    before = dr.gather(mi.UInt32, start, first)
     index = dr.arange(mi.UInt32, capacity)
     active = index < dr.gather(mi.UInt32, count, 0)
     vertex = read_vertices(vertices, index, active, ("path", "number"), END)
     active &= (vertex["path"] >= first) & (vertex["path"] < first + paths)
-    rank = dr.gather(mi.UInt32, start, vertex["path"] - 1, active & (vertex["path"] > 0)) + vertex["number"] - before
+    rank = dr.gather(mi.UInt32, start, vertex["path"], active) + vertex["number"] - before
     places = dr.zeros(mi.UInt32, room)
     dr.scatter(places, index, rank, active & (rank < room))
-    return places, dr.gather(mi.UInt32, start, first + (paths - 1)) - before
+    return places, dr.gather(mi.UInt32, start, last) + dr.gather(mi.UInt32, lengths, last) - before
