@@ -186,7 +186,7 @@ class ResampledSession(IterativeSession):
         active = ends.unblocked(scene, z["p"], z["n"], sent, active)
         share = self._share(weights, camera, z, sent, value, forward, back, segments, active)
         estimate = carried * (share * dr.rcp(integrator.light_paths * integrator.resamples * dr.maximum(probability, 1e-20)))
-        total = mi.Spectrum(radiance)
+        total = radiance + dr.zeros(mi.Spectrum, self.chunk)        # radiance may be a single zero
         dr.scatter_reduce(dr.ReduceOp.Add, total, estimate, z["path"], active)
         return total
 
@@ -196,7 +196,7 @@ class ResampledSession(IterativeSession):
         row = weights.row(z["p"], dr.mulsign(z["n"], dr.dot(z["n"], sent.d)))
         own = weights.gain(sent.mean * weights.softened(row, cosine, dr.square(sent.distance)), row, sent.vertices, active)
         nearer = sum_before(camera, z, z["parent"], sent.across * cosine, sent.mean * dr.rcp(dr.maximum(sent.across, 1e-20)),
-                            scattered_mean(value, z["n"], sent.d), back, segments, weights.gain, active)
+                            scattered_mean(value, z["n"], sent.d), back, segments, weights, active)
         return own * dr.rcp(dr.maximum(own + forward * cosine * sent.behind + nearer, 1e-20))
 
     def _meet(self, tables, radiance, camera, hits, hit_count):
@@ -205,8 +205,8 @@ class ResampledSession(IterativeSession):
         active = index < dr.gather(mi.UInt32, hit_count, 0)
         hit = hit_layout().read(hits, index, active)
         nearer = sum_before(camera, hit, hit["parent"], hit["start"], hit["light_mean"], mi.Float(1), hit["across"], hit["depth"],
-                            self.weights().gain, active)
-        total = mi.Spectrum(radiance)
+                            self.weights(), active)
+        total = radiance + dr.zeros(mi.Spectrum, self.chunk)        # radiance may be a single zero
         dr.scatter_reduce(dr.ReduceOp.Add, total, hit["value"] * dr.rcp(1 + nearer), hit["path"], active)
         return total
 

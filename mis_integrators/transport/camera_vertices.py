@@ -33,6 +33,37 @@ def hit_layout():
                    **{name: mi.Float for name in HIT}})
 
 
+def not_left(width):
+    """What `leave` returns before anything was left: densities of both sides, BSDF, row and cosine of the last vertex that scattered smoothly."""
+    return [dr.ones(mi.Float, width), *[dr.zeros(mi.Float, width) for _ in range(4)]]
+
+
+def leave(soften, left, si, value, p_forward, p_back, wo, mask):
+    """After the lanes `mask` have scattered smoothly towards `wo`: what the next vertex must know of this one."""
+    cosine = dr.dot(si.n, wo)
+    row = mi.Float(soften.row(si.p, dr.mulsign(si.n, cosine)))
+    new = [p_forward, p_back, scattered_mean(value, si.n, wo), row, dr.abs(cosine)]
+    return [dr.select(mask, a, b) for a, b in zip(new, left)]
+
+
+def step_to_vertex(soften, left, density, cosine, squared):
+    """The fields of `STEP` at a vertex that was sampled with `density` per solid angle (zero: by a delta function) and meets the ray under `cosine`."""
+    forward, back, scattered, row, there = left
+    near = dr.select(density > 0, squared * dr.rcp(dr.maximum(density * cosine, 1e-20)), 0)
+    geometry = soften.softened(mi.UInt32(row), there * cosine * dr.rcp(squared), squared)
+    return [dr.minimum(near, 1e15), geometry, forward, back, scattered, row]
+
+
+def step_to_hit(lights, soften, left, density, origin, ds, light, squared, mask):
+    """The fields of `STEP` and `HIT` of emission `light` met in the point or direction `ds`, seen from the vertex `origin`."""
+    forward, back, scattered, row, there = left
+    start = lights.start_density(origin, ds, mask)
+    geometry = soften.softened(mi.UInt32(row), there, squared)
+    near = dr.select(density > 0, dr.rcp(dr.maximum(density, 1e-20)), 0)
+    return dict(zip((*STEP, *HIT), (near, geometry, forward, back, scattered, row, dr.mean(light) * dr.rcp(dr.maximum(start, 1e-20)), start,
+                                    lights.forward_density(origin, ds, mask))))
+
+
 @dr.syntax
 def trace_camera_vertices(scene, sensor, integrator, lights, traits, soften, seed, first, n_paths: int, camera_paths: int, wavelength_sample,
                           ratio: float, max_depth: int, rr_depth: int, hide_emitters: bool, capacity: int, hit_capacity: int):
@@ -59,8 +90,7 @@ def trace_camera_vertices(scene, sensor, integrator, lights, traits, soften, see
     parent = mi.UInt32(NO_PARENT)                    # the last vertex that scattered smoothly
     eta = mi.Float(1)
     density = mi.Float(0)                            # with which the direction was sampled, per solid angle; zero after a delta function
-    forward, back, scattered, row = mi.Float(1), mi.Float(0), mi.Float(0), mi.UInt32(0)
-    cosine_there = mi.Float(0)                       # at the parent
+    left = not_left(n_paths)                         # of the parent
     origin = dr.zeros(mi.Interaction3f)              # the last vertex, of whichever kind
     context = mi.BSDFContext()
     store = Store(vertices=new_vertices(traits, capacity, STEP), count=dr.zeros(mi.UInt32, 1), hits=hit_layout().room(hit_capacity),
@@ -88,14 +118,10 @@ def trace_camera_vertices(scene, sensor, integrator, lights, traits, soften, see
             light = ds.emitter.eval(si, shown)
             radiance[shown & (depth == 1)] += throughput * light
             met = shown & (depth > 1) & (dr.max(light * throughput) > 0)
-            start = lights.start_density(origin, ds, met)
             slot = dr.scatter_inc(store.hit_count, mi.UInt32(0), met)
             met &= slot < hit_capacity
-            softened = soften.softened(row, cosine_there, dr.select(si.is_valid(), squared, dr.inf))
-            step = (dr.select(density > 0, dr.rcp(density), 0), softened, forward, back, scattered, mi.Float(row))
-            values = dict(zip(STEP, step)) | {
-                "value": throughput * light, "path": path, "depth": depth, "parent": parent, "start": start,
-                "light_mean": dr.mean(light) * dr.rcp(dr.maximum(start, 1e-20)), "across": lights.forward_density(origin, ds, met)}
+            values = step_to_hit(lights, soften, left, density, origin, ds, light, dr.select(si.is_valid(), squared, dr.inf), met)
+            values |= {"value": throughput * light, "path": path, "depth": depth, "parent": parent}
             hit_layout().write(store.hits, values, slot, met)
 
         active &= si.is_valid()
@@ -108,12 +134,10 @@ def trace_camera_vertices(scene, sensor, integrator, lights, traits, soften, see
         # ---- Keep the vertex
         cosine = dr.abs(dr.dot(si.n, towards))
         begin = active & (depth == 1)
-        near = dr.select(density > 0, squared * dr.rcp(dr.maximum(density * cosine, 1e-20)), 0)
+        step = step_to_vertex(soften, left, density, cosine, squared)
         if dr.hint(lens.connects, mode='scalar'):
             of_rays = cosine * lens.density(si.p, si.time, aperture, begin & inside)
-            near = dr.select(begin, dr.select(of_rays > 0, ratio * dr.rcp(dr.maximum(of_rays, 1e-20)), 0), near)
-        geometry = soften.softened(row, cosine_there * cosine * dr.rcp(squared), squared)
-        step = (dr.minimum(near, 1e15), geometry, forward, back, scattered, mi.Float(row))
+            step[0] = dr.select(begin, dr.select(of_rays > 0, ratio * dr.rcp(dr.maximum(of_rays, 1e-20)), 0), step[0])
         junction = Junction.at(traits, si, bsdf, smooth)
         wanted = smooth & (dr.max(throughput) > 0)
         slot = keep_vertex(store, junction, si, hit, towards, throughput, path, depth, number, parent, step, STEP, capacity, wanted)
@@ -125,13 +149,8 @@ def trace_camera_vertices(scene, sensor, integrator, lights, traits, soften, see
         visible |= active & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
         wo = si.to_world(bs.wo)
         value, p_forward, p_back = junction.between(towards, wo, active & ~delta)
-        left = active & ~delta
-        parent = dr.select(left, slot, parent)
-        forward = dr.select(left, p_forward, forward)
-        back = dr.select(left, p_back, back)
-        scattered = dr.select(left, scattered_mean(value, si.n, wo), scattered)
-        row = dr.select(left, soften.row(si.p, dr.mulsign(si.n, dr.dot(si.n, wo))), row)
-        cosine_there = dr.select(left, dr.abs(dr.dot(si.n, wo)), cosine_there)
+        parent = dr.select(active & ~delta, slot, parent)
+        left = leave(soften, left, si, value, p_forward, p_back, wo, active & ~delta)
         density = dr.select(delta, 0, p_forward * dr.abs(dr.dot(si.n, wo)))
         origin = mi.Interaction3f(si)
         throughput *= weight
@@ -150,12 +169,12 @@ def trace_camera_vertices(scene, sensor, integrator, lights, traits, soften, see
 
 
 @dr.syntax
-def sum_before(vertices, step, parent, p_made, strength, scattered, back, segments, gain, active):
+def sum_before(vertices, step, parent, p_made, strength, scattered, back, segments, weights, active):
     """Sum over the techniques nearer to the camera than the one at hand, of their samples times densities, over the density of the latter.
 
     `step`, `parent`: those of the vertex, or hit, at the camera's end; `p_made` [1/m^2]: the density with which the light's side makes it; `strength`:
     flux, over the density of that; `scattered`, `back`: BSDF there, and density per projected solid angle with which the light's side goes on
-    to the parent; `segments`: of the joint path. `gain(r, row, s, active)`: what resampling makes of the technique that joins a light sub-path of s
+    to the parent; `segments`: of the joint path. `weights.gain(r, row, s, active)`: what resampling makes of the technique that joins a light sub-path of s
     vertices, which sends r = q*/p, to a vertex of that row. Joining to the sensor (the last step, without a parent) has the gain one.
     """
     layout = vertex_layout(STEP)
@@ -169,7 +188,7 @@ def sum_before(vertices, step, parent, p_made, strength, scattered, back, segmen
     while dr.hint(active, label="techniques"):
         joined = parent != NO_PARENT
         depth = layout.read(vertices["words"], parent, active & joined, ("depth",))["depth"]
-        better = gain(strength * scattered * geometry, mi.UInt32(row), segments - depth, active & joined)
+        better = weights.gain(strength * scattered * geometry, mi.UInt32(row), segments - depth, active & joined)
         total = dr.select(active, total + ratio * near * dr.select(joined, better, 1), total)
         ratio = dr.minimum(ratio * (back * dr.rcp(dr.maximum(forward, 1e-20))), 1e15)
         strength = dr.minimum(strength * (scattered * dr.rcp(dr.maximum(back, 1e-20))), 1e15)
