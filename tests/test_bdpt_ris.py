@@ -249,7 +249,7 @@ def test_one_dominant_sub_path(rgb):
         "wide": {"type": "point", "position": [0, 0, 40], "intensity": 2000.0},
         "near": {"type": "point", "position": [0, 0, 1], "intensity": 10.0},
         "sensor": {"type": "perspective", "fov": 40, "to_world": look((0, -2, 3), (0, 0, 0)), "film": film(16)}})
-    agree(plugin("bdpt_ris", light_paths=10), path(), scene, blocks=1, whole=0.1, block=0.1, most=1500)
+    agree(plugin("bdpt_ris", light_paths=10), path(), scene, blocks=1, whole=0.2, block=0.2, most=900)
 
 
 @pytest.mark.parametrize("parameters", [{}, {"max_depth": 0}, {"max_depth": 1}, {"max_depth": 2}])

@@ -28,10 +28,8 @@ from .resampled_weights import LENGTHS, ResampledWeights, doubt, tabulate
 
 CHUNK = 1 << 18
 """Camera paths, and as many light sub-paths, traced at once at most; larger films are traced in parts (bounds memory)."""
-BLIND_COSINE = 0.0
-CACHE_SHARE = 1 / 300
-FEWEST_CACHE_POINTS = 256
-"""Cache points: this share of a part's camera vertices, but at least so many."""
+CACHE_SHARE, FEWEST_CACHE_POINTS = 1 / 300, 256
+"""Cache points: this share of a part's camera vertices, but at least so many. More of them cost shadow rays."""
 MOST_PAIRS = 1 << 24
 """Pairs of a cache point and a light vertex at most, four bytes each (and some more while they are made); beyond that there are fewer cache points."""
 PILOT_SETS = 8
@@ -142,7 +140,7 @@ class ResampledSession(IterativeSession):
         if target == "f_y_rho_g_v":
             n = dr.mulsign(z["n"], dr.dot(z["n"], z["towards"]))
             cosine = dr.dot(n, sent.d)
-            cosine = dr.select(z["through"], dr.abs(cosine), dr.maximum(cosine, BLIND_COSINE))
+            cosine = dr.select(z["through"], dr.abs(cosine), dr.maximum(cosine, 0))
             r = dr.mean(sent.light) * cosine
         else:
             r = dr.mean(sent.light * junction_of(self.traits, z, spectral["wavelengths"], active).between(z["towards"], sent.d, active)[0])
