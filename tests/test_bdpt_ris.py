@@ -186,7 +186,7 @@ def test_emitting_sphere(rgb, name):
 # plugin, emitter, family, sensor, variant, parameters
 DEFAULT = [
     ("bdpt_ris", "rectangle", "mixed0", "perspective", SPECTRAL, {}),
-    ("bdpt_ris", "envmap rotated", "mixed2", "thinlens", RGB, {"light_paths": 1}),
+    ("bdpt_ris", "envmap rotated", "mixed2", "thinlens", RGB, {"light_paths": 50}),
     ("pcbpt", "several", "smooth1", "orthographic", MONO, {}),
     ("bdpt_ris", "textured", "smooth0", "perspective", MONO, {"resamples": 4, "target": "f_y_f_yz"}),
 ]
@@ -195,7 +195,7 @@ DEFAULT = [
 @pytest.mark.parametrize("name, emitter, family, sensor, variant_name, parameters", DEFAULT, ids=["-".join(row[:5]).replace(" ", "_") for row in DEFAULT])
 def test_agrees(name, emitter, family, sensor, variant_name, parameters):
     mi.set_variant(variant_name)
-    agree(plugin(name, **parameters), path(rr_depth=50), tray(family, emitter, sensor), whole=0.02, block=0.08, most=800)
+    agree(plugin(name, camera_paths=16, **parameters), path(rr_depth=50), tray(family, emitter, sensor), whole=0.03, block=0.1, most=200)
 
 
 @pytest.mark.full
@@ -212,7 +212,7 @@ def test_agrees_full(rgb, emitter, family, name):
 @pytest.mark.parametrize("emitter", ["directionalarea"])
 def test_caustics_against_ptracer(rgb, emitter):
     """Light that reaches a floor by mirror and glass: only joining to the sensor makes it, and the emitter has no start to be joined with."""
-    agree(plugin("bdpt_ris", max_depth=-1), ptracer(rr_depth=50), caustic_scene(emitter), whole=0.02, block=0.08, most=800)
+    agree(plugin("bdpt_ris", max_depth=-1, camera_paths=16), ptracer(rr_depth=50), caustic_scene(emitter), whole=0.03, block=0.1, most=200)
 
 
 @pytest.mark.parametrize("scene", ["door", "window"])

@@ -5,9 +5,9 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-UNIFORM_SHARE = 0.1
+UNIFORM_SHARE = 0.2
 """Share of draws that ignore the cache: what no near cache point is sent is still drawn."""
-BLIND_SHARE = 0.15
+BLIND_SHARE = 0.4
 """Share of the cached pmfs that ignores what stands between: a cache point in the shadow knows little of a place near it in the light."""
 
 
