@@ -28,9 +28,10 @@ LENGTHS = 16
 """Lengths of light sub-paths whose shares are told apart; longer ones count with the last."""
 UNEXPECTED = 0.1
 """A cache point's light is unexpected if the points around it have less than this share of its own pmf for it."""
-CAP = 1000
 LEAST_DOUBT = 0.05
 """Some of the light may always be unexpected."""
+MOST_GAIN = 3.0
+"""A draw counts as that many connections to a light sub-path of its own at most: a cache that promises more is not to be believed (fireflies)."""
 
 
 class ResampledWeights:
@@ -64,7 +65,8 @@ class ResampledWeights:
         record = dr.gather(mi.Vector4f, self.records, row, active)
         share = dr.gather(mi.Float, self.shares, row * LENGTHS + dr.minimum(dr.maximum(s, 1), LENGTHS) - 1, active)
         spare = record.z * r + record.y
-        return dr.minimum(resampling.gain(resampling.doubtful_ratio(record.x * r + spare, spare, record.w), share, self.M, self.N), CAP)
+        ratio = resampling.doubtful_ratio(record.x * r + spare, spare, record.w)
+        return dr.minimum(resampling.gain(ratio, share, self.M, self.N), MOST_GAIN * self.N)
 
     # ------------------------------------------------------------------ hooks of the light sub-paths
 
