@@ -15,7 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from errors import RELATIVE_OFFSET
+from mis_integrators.analysis.metrics import RELATIVE_OFFSET
 from mis_integrators import loading
 from mis_integrators.session import PATHS_PER_PASS
 from mis_integrators.volume.shifts import SHIFTS, Sections, majorant_at, optical_depth

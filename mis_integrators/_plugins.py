@@ -14,7 +14,8 @@ from . import llvm
 _PACKAGE = "mis_integrators.integrators"
 
 # Modules to load anew for a variant, those that others import first.
-MODULES: tuple[str, ...] = ("common", "bdpm", "weighted", "bdpm_balance", "bdpm_opt", "bdpt", "vcm", "volpath_multiview")
+MODULES: tuple[str, ...] = ("common", "bdpm", "weighted", "bdpm_balance", "bdpm_opt", "bdpt", "vcm", "resampled", "bdpt_ris",
+                            "volpath_multiview")
 
 # Plugin name -> (module, class)
 PLUGINS: dict[str, tuple[str, str]] = {
@@ -24,6 +25,8 @@ PLUGINS: dict[str, tuple[str, str]] = {
     "bdpm_opt2": ("bdpm_opt", "BDPMOpt2"),
     "bdpm_opt3": ("bdpm_opt", "BDPMOpt3"),
     "bdpt": ("bdpt", "BDPT"),
+    "bdpt_ris": ("bdpt_ris", "BDPTRIS"),
+    "pcbpt": ("bdpt_ris", "PCBPT"),
     "vcm": ("vcm", "VCM"),
     "volpath_multiview": ("volpath_multiview", "VolpathMultiview"),
 }

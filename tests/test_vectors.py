@@ -1,6 +1,7 @@
 """Weights of strategies that make the same paths: on discrete worlds, where the best ones are known, and on anything at all.
 
 With `--vectors DIR` the worlds and answers of DIR/optimal_weights.json are used; else worlds generated here, their answers by brute force.
+(Those of DIR/resampling.json: `test_resampling`, whose tests of worlds run here too.)
 """
 
 import dataclasses
@@ -15,6 +16,8 @@ from hypothesis import given, settings, strategies as st
 from hypothesis.extra.numpy import arrays
 
 import discrete_worlds as worlds
+import test_resampling
+from test_resampling import test_any_pmf_is_unbiased, test_densities_are_those_of_the_variance, test_variance_is_exact  # noqa: F401
 from mis_integrators.weights import heuristics, mis2, mis3, recursion
 
 GENERATED = [(K, seed) for K in (2, 3, 4, 5) for seed in range(6)]
@@ -30,6 +33,7 @@ def generated(K, seed, **options):
 
 def pytest_generate_tests(metafunc):
     """The worlds, of as many strategies as the mark `strategies` says (without it: any)."""
+    test_resampling.pytest_generate_tests(metafunc)
     if "case" not in metafunc.fixturenames:
         return
     mark = metafunc.definition.get_closest_marker("strategies")

@@ -31,7 +31,7 @@ class ConnectionWeights:
 
     # ------------------------------------------------------------------ hooks of the sub-paths
 
-    def lit(self, si, source, reachable, active):
+    def lit(self, si, source, reachable, active, flux=None):
         ds = dr.copy(source)
         ds.d = ds.p - si.p
         ds.dist = dr.norm(ds.d)
@@ -46,11 +46,11 @@ class ConnectionWeights:
     def seen(self, density, active):
         return [dr.select(active & (density > 0), theory.camera_start(density, self.ratio), 0), mi.Float(0)]
 
-    def left(self, state, p_forward, p_back, delta):
+    def left(self, state, p_forward, p_back, delta, scattered=None):
         near, far = state
         return [near, dr.select(delta, far, theory.far_of(self._nearer(state, p_back), p_forward))]
 
-    def arrived(self, state, density):
+    def arrived(self, state, density, si=None, squared=None, depth=None):
         return [dr.select(density > 0, theory.reciprocal(density), 0), state[1]]
 
     def met(self, state, direct, emission, sampled):

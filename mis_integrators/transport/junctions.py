@@ -16,6 +16,11 @@ ROUGH = -1.0
 """What `Junction.density` holds where the surface is not Lambertian."""
 
 
+def scattered_mean(value, n, to_light):
+    """Mean over the channels of the BSDF [1/sr], where `value` is that of `Junction.between`: what geometric cosines turn into the light that goes on."""
+    return dr.mean(value) * dr.rcp(dr.maximum(dr.abs(dr.dot(n, to_light)), SMALLEST_COSINE))
+
+
 class Junction:
     """A vertex, seen from one side of it.
 

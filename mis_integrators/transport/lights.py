@@ -93,7 +93,7 @@ class Lights:
         power = np.array([_mean_power(e) for e in self.emitters])
         if guide is not None:
             power = guide.useful_power(power[np.argsort(order)])[order]
-        self.total_power = power.sum()
+        self.total_power = float(power.sum())
         if not self.emitters:
             return
         uniform = UNIFORM_SHARE * power.sum() / max(np.count_nonzero(power), 1)
@@ -269,7 +269,8 @@ class Lights:
 
         Returns `(ray, flux, unreachable, source)`: the ray, the flux it carries (emitted radiance times cosine over all densities,
         so that its mean over sub-paths is the power that leaves the emitters), whether next-event estimation cannot make
-        the light of this ray's first vertex, and a `DirectionSample3f` of which the emitter, the point and the normal there are set.
+        the light of this ray's first vertex, and a `DirectionSample3f` of which the emitter, the point, and the normal and texture coordinates
+        there are set.
         """
         index, probability = self.choice.sample(rng.next_float32() if self.choice.count > 1 else mi.Float(0))
         emitter = self.pointer(index)
@@ -289,8 +290,8 @@ class Lights:
             o, d, value, *surface = getattr(self, "_emit_" + name)(emitter, index, sample_a, sample_b, extra, time, wavelengths, chosen)
             ray.o = dr.select(chosen, o, ray.o)
             ray.d = dr.select(chosen, d, ray.d)
-            p, n = surface or (o, mi.Normal3f(0))
-            source.p, source.n = dr.select(chosen, p, source.p), dr.select(chosen, n, source.n)
+            p, n, uv = surface or (o, mi.Normal3f(0), mi.Point2f(0))
+            source.p, source.n, source.uv = dr.select(chosen, p, source.p), dr.select(chosen, n, source.n), dr.select(chosen, uv, source.uv)
             flux = dr.select(chosen, value, flux)
             if name == "directionalarea":
                 unreachable |= chosen
@@ -309,6 +310,87 @@ class Lights:
                 chosen = active & (kind == number)
                 ratio = dr.select(chosen, getattr(self, "_ratio_" + name)(ref, ds, index, chosen), ratio)
         return ratio
+
+    # ------------------------------------------------------------------ starts of light sub-paths, apart from what follows
+
+    def start_density(self, ref, ds, active):
+        """Density with which light sub-paths start from the light's point or direction in `ds`, emitter's choice included: per solid angle at `ref`
+        (points of area lights have one per area; the geometric term turns it); a probability for lights that no ray can meet."""
+        index = lookup(self.numbers, ds.emitter, mi.UInt32, active)
+        density = mi.Float(1)
+        if "area" in self.kinds or "directionalarea" in self.kinds:
+            on_surface = active & self._of_kind(index, "area", "directionalarea", active=active)
+            area = dr.select(on_surface, ds.emitter.get_shape().surface_area(), 1)
+            cosine = dr.maximum(-dr.dot(ds.d, ds.n), 1e-6)
+            density = dr.select(on_surface, dr.square(ds.dist) * dr.rcp(area * cosine), density)
+        if "environment" in self.kinds:
+            sky = active & self._of_kind(index, "environment", active=active)
+            own = ds.emitter.pdf_direction(ref, ds, sky)
+            density = dr.select(sky, self.guide.direction_density(own, ds.d, sky), density)
+        return dr.select(active, density * self.choice.probability(index), 0)
+
+    def forward_density(self, ref, ds, active):
+        """Density per unit area across the ray [1/m^2] at `ref` of light sub-paths that have started from the point or direction in `ds`."""
+        index = lookup(self.numbers, ds.emitter, mi.UInt32, active)
+        density = mi.Float(0)
+        for name in set(self.kinds) - {"directionalarea"}:
+            chosen = active & self._of_kind(index, name, active=active)
+            if name == "area":
+                value = dr.maximum(-dr.dot(ds.d, ds.n), 0) * dr.rcp(dr.pi * dr.square(ds.dist))
+            elif name == "environment":
+                row = self.guide.row_of_emitter(self._scene_index(index)) + direction_cell(ds.d)
+                value = self.guide.position_density(ds.d, row, ref.p, chosen)
+            else:
+                value = getattr(self, "_ratio_" + name)(ref, ds, index, chosen)
+            density = dr.select(chosen, value, density)
+        return density
+
+    def can_be_met(self, emitter, active):
+        """Whether a ray can meet the emitter and see light there."""
+        return active & self._of_kind(lookup(self.numbers, emitter, mi.UInt32, active), "area", "environment", active=active)
+
+    def untold(self, emitter, active):
+        """Emitters whose light rays Mitsuba samples without telling their density; `forward_density` is made up."""
+        return active & self._of_kind(lookup(self.numbers, emitter, mi.UInt32, active), "ray", active=active)
+
+    def _of_kind(self, index, *names, active=True):
+        kind = dr.gather(mi.UInt32, self.kind_table, index, active)
+        result = mi.Bool(False)
+        for name in names:
+            result |= kind == _KINDS.index(name)
+        return result
+
+    def emitted(self, ref, emitter, p, n, uv, active):
+        """Light that reaches `ref` from the start of a light sub-path: the point `p` of an emitter (its normal, texture coordinates), or, of an
+        environment, the unit vector `p` towards it; unoccluded.
+
+        Returns `(ds, light)`: a `DirectionSample3f` (of infinite emitters `dist` is infinite), and radiance, or what lights without extent send per area
+        across the ray.
+        """
+        index = lookup(self.numbers, emitter, mi.UInt32, active)
+        ds = dr.zeros(mi.DirectionSample3f, dr.width(ref.p))
+        ds.emitter, ds.p, ds.n, ds.uv = emitter, p, n, uv
+        offset = p - ref.p
+        ds.dist = dr.sqrt(dr.maximum(dr.squared_norm(offset), 1e-20))
+        ds.d = offset * dr.rcp(ds.dist)
+        light = mi.Spectrum(0)
+        for name in set(self.kinds) - {"directionalarea"}:
+            chosen = active & self._of_kind(index, name, active=active)
+            if name in ("area", "environment"):
+                si = dr.zeros(mi.SurfaceInteraction3f, dr.width(ref.p))
+                si.p, si.n, si.uv, si.time, si.wavelengths = p, n, uv, ref.time, ref.wavelengths
+                si.sh_frame = mi.Frame3f(n)
+                if name == "environment":
+                    ds.d = dr.select(chosen, mi.Vector3f(p), ds.d)
+                si.wi = si.to_local(-ds.d) if name == "area" else -ds.d
+                light = dr.select(chosen, emitter.eval(si, chosen), light)
+            else:
+                sampled, value = emitter.sample_direction(ref, mi.Point2f(0.5), chosen)
+                light = dr.select(chosen, value, light)
+                ds.d, ds.dist = dr.select(chosen, sampled.d, ds.d), dr.select(chosen, sampled.dist, ds.dist)
+        if self.guide is not None:
+            ds.dist = dr.select(self._of_kind(index, "environment", "directional", active=active), dr.inf, ds.dist)
+        return ds, dr.select(dr.isfinite(luminance_of(light)), light, 0)
 
     @staticmethod
     def _ratio_point(ref, ds, index, active):
@@ -388,7 +470,7 @@ class Lights:
         si.wi = mi.warp.square_to_cosine_hemisphere(sample_b)
         radiance = emitter.eval(si, active)
         ray = si.spawn_ray(si.to_world(si.wi))
-        return ray.o, ray.d, radiance * dr.select(ps.pdf > 0, dr.pi * dr.rcp(ps.pdf), 0), ps.p, ps.n
+        return ray.o, ray.d, radiance * dr.select(ps.pdf > 0, dr.pi * dr.rcp(ps.pdf), 0), ps.p, ps.n, ps.uv
 
     def _emit_directionalarea(self, emitter, index, sample_a, sample_b, extra, time, wavelengths, active):
         return self._emit_ray(emitter, index, sample_a, sample_b, extra, time, wavelengths, active)

@@ -5,13 +5,14 @@ before it. Delta scattering leaves no vertex, but counts as a segment; a BSDF wi
 
 What weights must know of a sub-path travels with it as a state, a list of floats. The object `weights` makes it:
 
-    lit(si, source, reachable, active)         state of a light sub-path at its first vertex; `source`: the point of the light, as of `sample_emission`;
-                                               `reachable`: next-event estimation could bring the same light
+    lit(si, source, reachable, active, flux)   state of a light sub-path at its first vertex; `source`: the point of the light, as of `sample_emission`;
+                                               `reachable`: next-event estimation could bring the same light; `flux`: what the path carries
     seen(density, active)                      state of a camera sub-path at its first vertex; `density` [1/m^2]: that of camera rays there (see
                                                `Lens.connect`), zero where the vertex cannot be joined to the sensor
-    left(state, p_forward, p_back, delta)      after scattering; densities per projected solid angle with which this side goes on, and the
-                                               other side would go back
-    arrived(state, density)                    at the next vertex, made with `density` [1/m^2]; zero where the vertex before scattered by a delta function
+    left(state, p_forward, p_back, delta, scattered)   after scattering; densities per projected solid angle with which this side goes on, and the
+                                               other side would go back; `scattered` [1/sr]: BSDF, channel mean
+    arrived(state, density, si, squared, depth)   at the next vertex, made with `density` [1/m^2]; zero where the vertex before scattered by a delta
+                                               function; its interaction, squared distance from the vertex before, and depth
     met(state, direct, emission, sampled)      weight of emission that a camera path meets beyond the last vertex, sampled there with density `sampled`
                                                per solid angle (zero: by a delta function), where next-event estimation has density `direct`; `emission`:
                                                `Lights.emission_ratio`; state: after `left`
@@ -25,7 +26,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .camera_pass import behind_emitters, start_camera_paths
-from .junctions import Junction
+from .junctions import Junction, scattered_mean
 from .lenses import Lens
 from .light_pass import PATHS_PER_LANE, scatter_light
 from .packing import Store
@@ -151,8 +152,9 @@ def trace_light_subpaths(scene, lights, traits, weights, seed, n_paths: int, cap
 
         # ---- Arrive
         first = active & begin
-        arrival = density * dr.abs(dr.dot(si.n, towards)) * dr.rcp(dr.maximum(dr.squared_norm(si.p - origin), 1e-20))
-        state = _either(first, weights.lit(si, source, ~unreachable, first), weights.arrived(state, arrival))
+        squared = dr.maximum(dr.squared_norm(si.p - origin), 1e-20)
+        arrival = density * dr.abs(dr.dot(si.n, towards)) * dr.rcp(squared)
+        state = _either(first, weights.lit(si, source, ~unreachable, first, flux), weights.arrived(state, arrival, si, squared, depth))
         smooth = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
         junction = Junction.at(traits, si, bsdf, smooth)
         slot = keep_vertex(store, junction, si, hit, towards, flux, path, depth, number, parent, state, weights.states, capacity, smooth)
@@ -164,8 +166,8 @@ def trace_light_subpaths(scene, lights, traits, weights, seed, n_paths: int, cap
         if dr.hint(max_depth > 0, mode='scalar'):
             active &= depth + 2 <= max_depth
         bs, delta, weight, wo, active = scatter_light(traits, si, bsdf, rng, active)
-        unused, p_back, p_forward = junction.between(wo, towards, active & ~delta)
-        state = _either(active, weights.left(state, p_forward, p_back, delta), state)
+        value, p_back, p_forward = junction.between(wo, towards, active & ~delta)
+        state = _either(active, weights.left(state, p_forward, p_back, delta, scattered_mean(value, si.n, towards)), state)
         density = dr.select(delta, 0, p_forward * dr.abs(dr.dot(si.n, wo)))
         origin = mi.Point3f(si.p)
         flux *= weight
@@ -251,8 +253,9 @@ def trace_camera_subpaths(scene, sensor, integrator, lights, traits, weights, se
         of_rays = mi.Float(0)
         if dr.hint(lens.connects, mode='scalar'):
             of_rays = cosine * lens.density(si.p, si.time, aperture, begin & inside)
-        arrival = density * cosine * dr.rcp(dr.maximum(dr.squared_norm(si.p - origin.p), 1e-20))
-        state = _either(begin, weights.seen(of_rays, begin), weights.arrived(state, arrival))
+        squared = dr.maximum(dr.squared_norm(si.p - origin.p), 1e-20)
+        arrival = density * cosine * dr.rcp(squared)
+        state = _either(begin, weights.seen(of_rays, begin), weights.arrived(state, arrival, si, squared, depth))
         junction = Junction.at(traits, si, bsdf, smooth)
 
         # ---- Direct light
@@ -281,8 +284,8 @@ def trace_camera_subpaths(scene, sensor, integrator, lights, traits, weights, se
         delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         visible |= active & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
         wo = si.to_world(bs.wo)
-        unused, p_forward, p_back = junction.between(towards, wo, active & ~delta)
-        state = _either(active, weights.left(state, p_forward, p_back, delta), state)
+        value, p_forward, p_back = junction.between(towards, wo, active & ~delta)
+        state = _either(active, weights.left(state, p_forward, p_back, delta, scattered_mean(value, si.n, wo)), state)
         density = dr.select(delta, 0, p_forward * dr.abs(dr.dot(si.n, wo)))
         origin = mi.Interaction3f(si)
         throughput *= weight

@@ -1,0 +1,97 @@
+"""Plugins `pcbpt` and `bdpt_ris`: bidirectional path tracing with resampled light sub-paths."""
+
+from __future__ import annotations
+
+from .resampled import ResampledIntegrator
+
+
+class PCBPT(ResampledIntegrator):
+    r"""
+    .. _integrator-pcbpt:
+
+    Bidirectional path tracing with probabilistic connections (:monosp:`pcbpt`)
+    ---------------------------------------------------------------------------
+
+    .. pluginparameters::
+
+     * - light_paths, resamples, cache_neighbors, target, camera_paths, variance, max_depth, rr_depth, hide_emitters
+       -
+       - As of :monosp:`bdpt_ris`.
+
+    The connections of :monosp:`bdpt_ris` (Popov, Ramamoorthi, Durand and Drettakis 2015) under weights that know nothing of the resampling: the
+    balance heuristic of the densities with which a light sub-path and a camera sub-path make a path. For comparison.
+
+    .. tabs::
+        .. code-tab:: xml
+
+            <integrator type="pcbpt">
+                <integer name="light_paths" value="100"/>
+            </integrator>
+
+        .. code-tab:: python
+
+            'type': 'pcbpt',
+            'light_paths': 100
+    """
+
+    aware = False
+
+
+class BDPTRIS(ResampledIntegrator):
+    r"""
+    .. _integrator-bdpt_ris:
+
+    Bidirectional path tracing with resampled light sub-paths (:monosp:`bdpt_ris`)
+    ------------------------------------------------------------------------------
+
+    .. pluginparameters::
+
+     * - light_paths
+       - |int|
+       - Light sub-paths (M) that all camera paths of an iteration share; from 1 to 100000. (Default: 200)
+     * - resamples
+       - |int|
+       - Connections (N) of each camera vertex, each to a light vertex drawn anew; from 1 to 1024. (Default: 1)
+     * - cache_neighbors
+       - |int|
+       - Cache points whose pmfs a camera vertex mixes (N_c); from 1 to 16. (Default: 3)
+     * - target
+       - |string|
+       - What the pmfs are proportional to: ``f_y_rho_g_v`` is a light vertex's light at the cache point, visibility included; ``f_y_f_yz`` also has the
+         BSDF there. (Default: ``f_y_rho_g_v``)
+     * - camera_paths
+       - |int|
+       - Camera paths per pixel and iteration. (Default: 1)
+     * - variance
+       - |bool|
+       - Adds the channels ``var.R``, ``var.G``, ``var.B`` (mono: ``var.Y``): the estimated variance of the pixel mean over the
+         iterations, of which there must be two at least. (Default: no, i.e. |false|)
+     * - max_depth
+       - |int|
+       - Longest path in segments (-1: unlimited). A value of 1 shows only directly visible emitters, 2 adds direct light, and so on. (Default: -1)
+     * - rr_depth
+       - |int|
+       - Depth from which Russian roulette may end a sub-path, in each half. (Default: 5)
+     * - hide_emitters
+       - |bool|
+       - Hide directly visible emitters. (Default: no, i.e. |false|)
+
+    Each iteration traces light sub-paths and, at cache points strewn over what the camera sees, makes the pmf of the light vertices of M of them,
+    with shadow rays. A camera vertex draws the light vertices that it connects to from the pmfs of the cache points near it. Light tracing and
+    emission that camera paths meet are techniques beside it, and the weights of all know that the connections were resampled (Nabata, Iwasaki and Dobashi
+    2020). Unbiased.
+
+    Participating media, polarised variants, gradients and the film ``specfilm`` are refused by name.
+
+    .. tabs::
+        .. code-tab:: xml
+
+            <integrator type="bdpt_ris">
+                <integer name="light_paths" value="400"/>
+            </integrator>
+
+        .. code-tab:: python
+
+            'type': 'bdpt_ris',
+            'light_paths': 400
+    """

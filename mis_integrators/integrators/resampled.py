@@ -1,0 +1,338 @@
+"""What `pcbpt` and `bdpt_ris` share: connections to light sub-paths drawn from pmfs of cache points."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..transport.cache_points import CacheGrid
+from ..transport.camera_pass import film_sample_count
+from ..transport.camera_vertices import STEP, hit_layout, sum_before, trace_camera_vertices
+from ..transport.connections import join_sensor
+from ..transport.film import as_camera_weights, colour_channels, expected_weight, shared_wavelengths, splat_channels, splat_samples, with_colour
+from ..transport.guide import EnvironmentGuide, infinite_emitters
+from ..transport.junctions import scattered_mean
+from ..transport.lenses import Lens
+from ..transport.light_ends import END, LightEnds, list_ends
+from ..transport.light_starts import sample_light_starts
+from ..transport.lights import Lights
+from ..transport.packing import rounded_up
+from ..transport.proposals import Proposals, cumulative_sums
+from ..transport.random import mix, next_2d, vertex_streams
+from ..transport.recording import recorder
+from ..transport.subpaths import junction_of, read_vertices, trace_light_subpaths
+from ..transport.traits import SceneTraits
+from .common import IterativeIntegrator, IterativeSession
+from .resampled_weights import LENGTHS, ResampledWeights, doubt, tabulate
+
+CHUNK = 1 << 18
+"""Camera paths, and as many light sub-paths, traced at once at most; larger films are traced in parts (bounds memory)."""
+CACHE_SHARE, FEWEST_CACHE_POINTS = 1 / 300, 256
+"""Cache points: this share of a part's camera vertices, but at least so many. More of them cost shadow rays."""
+MOST_PAIRS = 1 << 24
+"""Pairs of a cache point and a light vertex at most, four bytes each (and some more while they are made); beyond that there are fewer cache points."""
+PILOT_SETS = 8
+"""Sets of M light sub-paths from which Q and Q_s are estimated before the first iteration, if as many are traced."""
+
+
+class ResampledIntegrator(IterativeIntegrator):
+    """Parameters of both plugins; `aware` tells them apart."""
+
+    aware = True
+
+    def read_parameters(self, parameters):
+        self.light_paths = parameters.integer("light_paths", 200, 1, "from 1 to 100000", high=100000)
+        self.resamples = parameters.integer("resamples", 1, 1, "from 1 to 1024", high=1024)
+        self.cache_neighbors = parameters.integer("cache_neighbors", 3, 1, "from 1 to 16", high=16)
+        self.target = parameters.choice("target", "f_y_rho_g_v", ("f_y_rho_g_v", "f_y_f_yz"))
+
+    def settings(self):
+        return {**super().settings(), "light_paths": self.light_paths, "resamples": self.resamples, "cache_neighbors": self.cache_neighbors,
+                "target": self.target}
+
+    def new_session(self, scene, sensor, seed, iterations):
+        return ResampledSession(self, scene, sensor, seed, iterations)
+
+
+class ResampledSession(IterativeSession):
+    """Iterations of both plugins: light sub-paths, pmfs of the cache points, camera sub-paths, connections, emission met, light that meets the sensor."""
+
+    def __init__(self, integrator, scene, sensor, seed, iterations):
+        super().__init__(integrator, scene, sensor, seed, iterations)
+        self.traits = SceneTraits(scene)
+        guide = EnvironmentGuide(scene, sensor) if infinite_emitters(scene) else None
+        self.lights = Lights(scene, integrator.plugin, guide)
+        self.path_count = film_sample_count(sensor) * integrator.camera_paths
+        self.chunks = -(-self.path_count // CHUNK)
+        self.chunk = -(-self.path_count // self.chunks)
+        self.light_chunk = max(self.chunk, integrator.light_paths)
+        width, height = sensor.film().crop_size()
+        self.pixel_paths = width * height * integrator.camera_paths
+        self.ratio = self.light_chunk * self.chunks / self.pixel_paths
+        self.capacity = {"light": rounded_up(4 * self.light_chunk), "camera": rounded_up(4 * self.chunk), "hits": rounded_up(self.chunk),
+                         "ends": rounded_up(6 * integrator.light_paths)}
+        depth = integrator.max_depth
+        self.lit = not self.lights.dark and (depth < 0 or depth >= 2)
+        self.lens = Lens(sensor).connects
+        bounds = self.traits.bounds
+        self.reach = 4 * float(np.linalg.norm(np.array(bounds.max).ravel() - np.array(bounds.min).ravel()))
+        self.expected_weight = expected_weight(sensor.film(), integrator.camera_paths)
+        self.recorded = recorder()
+        self.grid = CacheGrid(mi.Point3f(0), mi.Normal3f(0, 0, 1), integrator.cache_neighbors)
+        self.records, self.shares = dr.ones(mi.Float, 4 * self.grid.rows), dr.ones(mi.Float, LENGTHS * self.grid.rows)
+        self.cache = None
+        self._freeze()
+
+    def _freeze(self):
+        """Records the passes anew; from the second iteration on, their kernels run without their Python."""
+        dr.eval(self.records, self.shares)
+        self._tables = [self.traits.lambertian, self.traits.perturbed, self.records, self.shares, *self.grid.tables(), *self.lights.tables()]
+        self._light_pass = self.recorded(self._trace_light)
+        self._target_pass = self.recorded(self._own_targets)
+        self._camera_pass = self.recorded(self._trace_camera)
+        self._connection_pass = self.recorded(self._connect)
+        self._hit_pass = self.recorded(self._meet)
+        self._sensor_pass = self.recorded(self._join_sensor)
+
+    def weights(self):
+        """The weights of this session."""
+        integrator = self.integrator
+        return ResampledWeights(self.lights, self.grid, self.records, self.shares, integrator.light_paths, integrator.resamples, integrator.aware,
+                                self.ratio)
+
+    # ------------------------------------------------------------------ passes
+
+    def _trace_light(self, scene, sensor, tables, seed, spectral):
+        return trace_light_subpaths(scene, self.lights, self.traits, self.weights(), seed, self.light_chunk, self.capacity["light"],
+                                    spectral["wavelengths"], sensor.shutter_open(), sensor.shutter_open_time(), self.integrator.max_depth,
+                                    self.integrator.rr_depth)
+
+    def _trace_camera(self, scene, sensor, tables, seed, first, spectral):
+        integrator = self.integrator
+        return trace_camera_vertices(scene, sensor, integrator, self.lights, self.traits, self.weights(), seed, first, self.chunk,
+                                     integrator.camera_paths, spectral["sample"], self.ratio, integrator.max_depth, integrator.rr_depth,
+                                     integrator.hide_emitters, self.capacity["camera"], self.capacity["hits"])
+
+    def _starts(self, sensor, seed, spectral):
+        return sample_light_starts(self.lights, seed, self.integrator.light_paths, spectral["wavelengths"], mi.Float(sensor.shutter_open()))
+
+    def _ends(self, starts, light, places, found):
+        M = self.integrator.light_paths
+        return LightEnds(self.traits, self.lights, starts, M, light, places, dr.minimum(found, self.capacity["ends"]) + M, self.reach)
+
+    def _targets(self, scene, sensor, tables, seed, light, count, lengths, first, cache, spectral, target):
+        """q*/p of every light vertex of M sub-paths (from the number `first` on) at every cache point if nothing stood between, row by row; whether nothing
+        does; and what makes their `LightEnds`."""
+        room, M = self.capacity["ends"], self.integrator.light_paths
+        places, found = list_ends(light, count, lengths, first, M, self.capacity["light"], room)
+        starts = self._starts(sensor, seed, spectral)
+        ends = self._ends(starts, light, places, found)
+        width = M + room
+        points = dr.width(cache["depth"])
+        index = dr.arange(mi.UInt32, points * width)
+        point, end = index // width, index % width
+        active = end < dr.gather(mi.UInt32, ends.count, 0)
+        z = {name: dr.gather(type(values), values, point, active) for name, values in cache.items()}
+        sent = ends.send(z["p"], end, mi.Float(sensor.shutter_open()), spectral["wavelengths"], active)
+        if self.integrator.max_depth > 0:
+            active &= z["depth"] + sent.vertices <= self.integrator.max_depth
+        if target == "f_y_rho_g_v":
+            n = dr.mulsign(z["n"], dr.dot(z["n"], z["towards"]))
+            cosine = dr.dot(n, sent.d)
+            cosine = dr.select(z["through"], dr.abs(cosine), dr.maximum(cosine, 0))
+            r = dr.mean(sent.light) * cosine
+        else:
+            r = dr.mean(sent.light * junction_of(self.traits, z, spectral["wavelengths"], active).between(z["towards"], sent.d, active)[0])
+        active &= (r > 0) & dr.isfinite(r)
+        seen = ends.unblocked(scene, z["p"], z["n"], sent, active)
+        return dr.select(active, r, 0), seen, starts, places, found, sent.vertices
+
+    def _own_targets(self, scene, sensor, tables, seed, light, count, lengths, cache, spectral):
+        """The same of the first M sub-paths for the target at hand (the last array is not needed)."""
+        return self._targets(scene, sensor, tables, seed, light, count, lengths, mi.UInt32(0), cache, spectral, self.integrator.target)[:5]
+
+    def _pmfs(self, r, seen, found):
+        """Cumulative sums of the cache points' pmfs."""
+        M, room = self.integrator.light_paths, self.capacity["ends"]
+        cumulative = cumulative_sums(r, seen, dr.minimum(found, room) + M, M + room)
+        dr.eval(cumulative)                                        # a recording cannot make it
+        return cumulative
+
+    def _connect(self, scene, sensor, tables, radiance, camera, count, light, starts, places, found, cumulative, seed, spectral):
+        """Radiance of camera paths with that of connections to drawn light sub-paths added."""
+        integrator, weights = self.integrator, self.weights()
+        ends = self._ends(starts, light, places, found)
+        proposals = Proposals(self.grid, cumulative, ends.count, integrator.light_paths + self.capacity["ends"])
+        index = dr.arange(mi.UInt32, self.capacity["camera"] * integrator.resamples)
+        vertex = index // integrator.resamples
+        active = vertex < dr.gather(mi.UInt32, count, 0)
+        z = read_vertices(camera, vertex, active, states=STEP)
+        rng = vertex_streams(z["path"] * integrator.resamples + index % integrator.resamples, z["number"], seed)
+        row = self.grid.row(z["p"], dr.mulsign(z["n"], dr.dot(z["n"], z["towards"])))
+        drawn = proposals.draw(row, rng, active)
+        active &= drawn < dr.gather(mi.UInt32, ends.count, 0)
+        probability = proposals.probability(row, drawn, active)
+
+        sent = ends.send(z["p"], drawn, mi.Float(sensor.shutter_open()), spectral["wavelengths"], active)
+        segments = z["depth"] + sent.vertices
+        if integrator.max_depth > 0:
+            active &= segments <= integrator.max_depth
+        value, forward, back = junction_of(self.traits, z, spectral["wavelengths"], active).between(z["towards"], sent.d, active)
+        carried = z["throughput"] * value * sent.light
+        active &= (dr.max(carried) > 0) & dr.all(dr.isfinite(carried))
+        active = ends.unblocked(scene, z["p"], z["n"], sent, active)
+        share = self._share(weights, camera, z, sent, value, forward, back, segments, active)
+        estimate = carried * (share * dr.rcp(integrator.light_paths * integrator.resamples * dr.maximum(probability, 1e-20)))
+        total = radiance + dr.zeros(mi.Spectrum, self.chunk)        # radiance may be a single zero
+        dr.scatter_reduce(dr.ReduceOp.Add, total, estimate, z["path"], active)
+        return total
+
+    def _share(self, weights, camera, z, sent, value, forward, back, segments, active):
+        """Weight w_t of a connection among all techniques of its joint path."""
+        cosine = dr.abs(dr.dot(z["n"], sent.d))
+        row = weights.row(z["p"], dr.mulsign(z["n"], dr.dot(z["n"], sent.d)))
+        own = weights.gain(sent.mean * weights.softened(row, cosine, dr.square(sent.distance)), row, sent.vertices, active)
+        nearer = sum_before(camera, z, z["parent"], sent.across * cosine, sent.mean * dr.rcp(dr.maximum(sent.across, 1e-20)),
+                            scattered_mean(value, z["n"], sent.d), back, segments, weights, active)
+        return own * dr.rcp(dr.maximum(own + forward * cosine * sent.behind + nearer, 1e-20))
+
+    def _meet(self, tables, radiance, camera, hits, hit_count):
+        """Radiance of camera paths with that of emission that they meet beyond the first vertex added."""
+        index = dr.arange(mi.UInt32, self.capacity["hits"])
+        active = index < dr.gather(mi.UInt32, hit_count, 0)
+        hit = hit_layout().read(hits, index, active)
+        nearer = sum_before(camera, hit, hit["parent"], hit["start"], hit["light_mean"], mi.Float(1), hit["across"], hit["depth"],
+                            self.weights(), active)
+        total = radiance + dr.zeros(mi.Spectrum, self.chunk)        # radiance may be a single zero
+        dr.scatter_reduce(dr.ReduceOp.Add, total, hit["value"] * dr.rcp(1 + nearer), hit["path"], active)
+        return total
+
+    def _join_sensor(self, scene, sensor, tables, light, count, seed, spectral):
+        """Block of the light that meets the sensor."""
+        index = dr.arange(mi.UInt32, self.capacity["light"])
+        active = index < dr.gather(mi.UInt32, count, 0)
+        y = read_vertices(light, index, active, states=END)
+        aperture = next_2d(vertex_streams(y["path"], y["number"], seed)) if sensor.needs_aperture_sample() else mi.Point2f(0.5)
+        joined = join_sensor(scene, self.integrator, self.traits, Lens(sensor), y, aperture, mi.Float(sensor.shutter_open()),
+                             spectral["wavelengths"], self.integrator.hide_emitters, active)
+        value = joined.value * (self.weights().seen_by_sensor(joined, y) / self.ratio)
+        return splat_channels(sensor.film(), joined.film, list(colour_channels(value, spectral["matrix"])), joined.active)
+
+    # ------------------------------------------------------------------ before the first iteration
+
+    def _prepare(self):
+        """Draws the cache points, and estimates Q and Q_s there."""
+        spectral = shared_wavelengths(self.sensor, mix(self.seed, PILOT, WAVELENGTH))
+        traced = self._camera(PILOT, mi.UInt32(0), spectral)
+        light = self._light(PILOT, 0, spectral)
+        vertices, M = min(int(traced[4][0]), self.capacity["camera"]), self.integrator.light_paths
+        wanted = min(max(FEWEST_CACHE_POINTS, int(vertices * CACHE_SHARE)), max(vertices, 1))
+        self.cache = self._cache_points(traced[3], vertices, min(wanted, FEWEST_CACHE_POINTS))
+        self._ends_fit(lambda: self._targets(self.scene, self.sensor, self._tables, self._seed(PILOT, START), *light, mi.UInt32(0), self.cache, spectral,
+                                             "f_y_rho_g_v"))
+        self.cache = self._cache_points(traced[3], vertices, max(min(wanted, MOST_PAIRS // (M + self.capacity["ends"])), 1))
+        normals = dr.mulsign(self.cache["n"], dr.dot(self.cache["n"], self.cache["towards"]))
+        self.grid = CacheGrid(self.cache["p"], normals, self.integrator.cache_neighbors)
+        if self.integrator.aware:
+            self.records, self.shares = tabulate(self.grid, *self._integrals(light, spectral))
+        self._freeze()
+
+    def _cache_points(self, camera, vertices, count):
+        """`count` of the camera's vertices, at random (a single one in nothingness if there is none)."""
+        active = mi.Bool(vertices > 0)
+        order = read_vertices(camera, dr.arange(mi.UInt32, max(vertices, 1)), active, ("path", "number"), STEP)
+        order = np.lexsort((np.array(order["number"]), np.array(order["path"])))        # places in the buffer are accidental
+        chosen = np.random.default_rng(mix(self.seed, PILOT, CAMERA)).choice(order, count, replace=False)
+        cache = read_vertices(camera, mi.UInt32(chosen.astype(np.uint32)), active, states=STEP)
+        cache = {name: cache[name] for name in ("p", "n", "ns", "towards", "value", "density", "depth", "hit") if name in cache}
+        cache["through"] = dr.full(mi.Bool, False, count)
+        if "hit" in cache:
+            flags = dr.select(active, cache["hit"].shape, dr.zeros(mi.ShapePtr)).bsdf().flags()
+            cache["through"] |= (flags & (mi.BSDFFlags.GlossyTransmission | mi.BSDFFlags.DiffuseTransmission)) != 0
+        dr.eval(cache)
+        return cache
+
+    def _integrals(self, light, spectral):
+        """`Q_s`, `Q_blind`, `doubts` and `ends_s` as `tabulate` takes them."""
+        M, points, cache = self.integrator.light_paths, dr.width(self.cache["depth"]), self.cache
+        sets = max(min(PILOT_SETS, self.light_chunk // M), 1)
+        place = np.array(cache["p"]).T, np.array(dr.mulsign(cache["n"], dr.dot(cache["n"], cache["towards"]))).T
+        Q_s, Q_blind, doubts, ends_s = np.zeros((points, LENGTHS)), np.zeros(points), np.zeros(points), np.zeros(LENGTHS)
+        for k in range(sets):
+            r, seen, _, _, found, vertices = self._ends_fit(lambda: self._targets(
+                self.scene, self.sensor, self._tables, self._seed(PILOT, START, k), *light, dr.opaque(mi.UInt32, k * M), cache, spectral, "f_y_rho_g_v"))
+            used = M + int(found[0])
+            r, seen = (np.array(x).reshape(points, M + self.capacity["ends"])[:, :used] for x in (r, seen))
+            length = np.minimum(np.array(vertices)[:used], LENGTHS) - 1
+            Q_s += np.where(seen, r, 0) @ np.eye(LENGTHS)[length]
+            Q_blind += r.sum(axis=1)
+            doubts += doubt(*place, r, seen, self.integrator.cache_neighbors, self.grid.normal_cost)
+            ends_s += np.bincount(length, minlength=LENGTHS)
+        return Q_s / (sets * M), Q_blind / (sets * M), doubts / sets, ends_s / (sets * M)
+
+    # ------------------------------------------------------------------ iterations
+
+    def _grown(self, name, count):
+        """Whether the `count` (an array of width one) found more than there is room for; then there will be more room."""
+        found = int(count[0])
+        if found <= self.capacity[name]:
+            return False
+        self.capacity[name] = rounded_up(found + found // 8)
+        self._freeze()
+        return True
+
+    def _light(self, iteration, chunk, spectral):
+        """What `trace_light_subpaths` returns."""
+        while True:
+            light = self._light_pass(self.scene, self.sensor, self._tables, self._seed(iteration, LIGHT, chunk), spectral)
+            if not self._grown("light", light[1]):
+                return light
+
+    def _camera(self, iteration, first, spectral):
+        """What `trace_camera_vertices` returns."""
+        while True:
+            traced = self._camera_pass(self.scene, self.sensor, self._tables, self._seed(iteration, CAMERA), first, spectral)
+            if not self.lit or not (self._grown("camera", traced[4]) or self._grown("hits", traced[6])):
+                return traced
+
+    def _ends_fit(self, compute):
+        """Result of `compute()`, repeated with more room for ends if there were more (its fifth entry counts them)."""
+        while True:
+            result = compute()
+            dr.eval(result)
+            if not self._grown("ends", result[4]):
+                return result
+
+    def _chunk(self, iteration, chunk, spectral):
+        """Blocks of one part of the paths: of camera paths, and of light that met the sensor (or None)."""
+        first = dr.opaque(mi.UInt32, chunk * self.chunk)
+        radiance, alpha, position, camera, count, hits, hit_count = self._camera(iteration, first, spectral)
+        block = None
+        if self.lit:
+            light = self._light(iteration, chunk, spectral)
+            r, seen, starts, places, found = self._ends_fit(lambda: self._target_pass(
+                self.scene, self.sensor, self._tables, self._seed(iteration, START, chunk), *light, self.cache, spectral))
+            radiance = self._connection_pass(self.scene, self.sensor, self._tables, radiance, camera, count, light[0], starts, places, found, self._pmfs(r, seen, found),
+                                             self._seed(iteration, DRAW, chunk), spectral)
+            radiance = self._hit_pass(self._tables, radiance, camera, hits, hit_count)
+            if self.lens:
+                block = self._sensor_pass(self.scene, self.sensor, self._tables, *light[:2], self._seed(iteration, APERTURE, chunk), spectral)
+        active = dr.arange(mi.UInt32, self.chunk) + first < self.path_count
+        if self.integrator.hide_emitters:
+            radiance = dr.select(alpha > 0, radiance, 0)       # as `path` does: what is behind nothing but null surfaces is hidden
+        return splat_samples(self.sensor.film(), position, radiance, alpha, spectral["matrix"], active), block
+
+    def _iteration(self, iteration):
+        if self.cache is None and self.lit:
+            self._prepare()
+        spectral = shared_wavelengths(self.sensor, mix(self.seed, iteration, WAVELENGTH))
+        parts = [self._chunk(iteration, chunk, spectral) for chunk in range(self.chunks)]
+        block, light = (None if blocks[0] is None else sum(blocks[1:], blocks[0]) for blocks in zip(*parts))
+        return block if light is None else with_colour(block, as_camera_weights(light, block, self.expected_weight))
+
+
+LIGHT, CAMERA, WAVELENGTH, APERTURE, START, DRAW = range(6)
+"""Purposes of an iteration's random seeds."""
+PILOT = 1 << 31
+"""The number of the iteration that never is: what is made before the first one draws from its seeds."""

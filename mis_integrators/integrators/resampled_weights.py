@@ -1,0 +1,149 @@
+"""Where resampled connections and their weights meet.
+
+Hooks of `transport.subpaths` and `transport.camera_vertices`, and what resampling makes of each technique of a joint path. All techniques of a path
+evaluate one function: a technique that joins a light sub-path Y to the camera vertex z is taken to draw it with
+
+    q/p = (a + c) r + b  if a cache point of z sees what z sees, else  c r + b,    r = f_y rho G softened,    G softened = G d^2 / (d^2 + h^2)
+
+where the parts are the cached pmfs' visible, blind and uniform ones (`proposals`), and the second case has a probability e. The five numbers of z and the
+lengths' shares Q_s/Q are looked up by place and by the side from which the light comes (`CacheGrid.row`); they are averages over the N_c cache points
+there, made once before the first iteration. So the weights depend neither on an iteration's light sub-paths nor on its pmfs, and the sum of
+the techniques stays unbiased. h^2 is the mean squared distance of the cache points: the cached pmf, made for their places, does not know that G has
+a pole at z. Left out are visibility (the ends of a joint path see each other), the camera's BSDF of `f_y_f_yz`, and delta functions' weights;
+colours enter by channel means.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..transport.light_ends import END
+from ..transport.proposals import BLIND_SHARE, UNIFORM_SHARE
+from ..weights import bidirectional as theory
+from ..weights import resampling
+
+LENGTHS = 16
+"""Lengths of light sub-paths whose shares are told apart; longer ones count with the last."""
+UNEXPECTED = 0.1
+"""A cache point's light is unexpected if the points around it have less than this share of its own pmf for it."""
+LEAST_DOUBT = 0.05
+"""Some of the light may always be unexpected."""
+MOST_GAIN = 3.0
+"""A draw counts as that many connections to a light sub-path of its own at most: a cache that promises more is not to be believed (fireflies)."""
+
+
+class ResampledWeights:
+    """`lights`, `grid` (a `CacheGrid`), `records` (float, four a row: a, b, c, e), `shares` (float, `LENGTHS` a row), M light sub-paths, N draws; `aware`: whether
+    the weights know of the resampling (else every technique has the density of its path alone); `ratio`: N_t, light sub-paths that are joined to
+    the sensor over camera paths, of all the film."""
+
+    states = END
+
+    def __init__(self, lights, grid, records, shares, M, N, aware, ratio):
+        self.lights, self.grid, self.records, self.shares = lights, grid, records, shares
+        self.M, self.N, self.aware, self.ratio = M, N, aware, ratio
+
+    # ------------------------------------------------------------------ resampling
+
+    def row(self, p, n):
+        """Row of a place, `n` its normal on the light's side."""
+        return self.grid.row(p, n) if self.aware else mi.UInt32(0)
+
+    def softened(self, row, geometry, squared):
+        """The geometric term without its pole; unchanged for lights infinitely far away."""
+        if not self.aware:
+            return geometry
+        spread = dr.gather(mi.Float, self.grid.spread, row)
+        return geometry * dr.rcp(1 + spread * dr.rcp(squared))
+
+    def gain(self, r, row, s, active=True):
+        """p_t / p of the technique that joins a light sub-path of `s` vertices, which sends r = q*/p, to a camera vertex of that row."""
+        if not self.aware:
+            return mi.Float(1)
+        record = dr.gather(mi.Vector4f, self.records, row, active)
+        share = dr.gather(mi.Float, self.shares, row * LENGTHS + dr.minimum(dr.maximum(s, 1), LENGTHS) - 1, active)
+        spare = record.z * r + record.y
+        ratio = resampling.doubtful_ratio(record.x * r + spare, spare, record.w)
+        return dr.minimum(resampling.gain(ratio, share, self.M, self.N), MOST_GAIN * self.N)
+
+    # ------------------------------------------------------------------ hooks of the light sub-paths
+
+    @staticmethod
+    def blank(width):
+        return [dr.zeros(mi.Float, width) for _ in range(3)]
+
+    def lit(self, si, source, reachable, active, flux):
+        ds = dr.copy(source)
+        ds.d = ds.p - si.p
+        ds.dist = dr.norm(ds.d)
+        infinite = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
+        ds.d = dr.select(active, dr.select(infinite, si.to_world(si.wi), ds.d * dr.rcp(ds.dist)), mi.Vector3f(0, 0, 1))
+        start = self.lights.start_density(si, ds, active)
+        across = self.lights.forward_density(si, ds, active)
+        made = across * dr.abs(dr.dot(si.n, ds.d))
+        strength = dr.select(self.lights.untold(ds.emitter, active), self.lights.total_power, dr.mean(flux))
+        row = self.row(si.p, dr.mulsign(si.n, dr.dot(si.n, ds.d)))
+        better = self.gain(strength * self.softened(row, made, dr.select(infinite, dr.inf, dr.square(ds.dist))), row, mi.UInt32(1), active)
+        met = self.lights.can_be_met(ds.emitter, active)
+        return [dr.select(reachable, better * theory.reciprocal(made), 0),
+                dr.select(reachable & met, theory.reciprocal(start * across), 0), strength]
+
+    def left(self, state, p_forward, p_back, delta, scattered):
+        near, far, strength = state
+        return [near, dr.select(delta, far, theory.far_of(near + p_back * far, p_forward)),
+                dr.select(delta, strength, dr.minimum(strength * scattered * theory.reciprocal(p_forward), theory.LARGEST))]
+
+    def arrived(self, state, density, si, squared, depth):
+        row = self.row(si.p, dr.mulsign(si.n, dr.dot(si.n, si.to_world(si.wi))))
+        better = self.gain(state[2] * self.softened(row, density, squared), row, depth)
+        return [dr.select(density > 0, better * theory.reciprocal(density), 0), state[1], state[2]]
+
+    # ------------------------------------------------------------------ techniques
+
+    def seen_by_sensor(self, connection, light):
+        """Weight of a `LensConnection` of a light vertex (t = 1)."""
+        a_light = light["near"] + connection.back * light["far"]
+        return theory.connection(connection.density * (1 / self.ratio), a_light, 0, 0, 1)
+
+
+def doubt(p, n, r, seen, neighbors, normal_cost):
+    """How much of a cache point's light comes from light vertices that the cache points around it do not expect: a number each (C).
+
+    NumPy arrays `p`, `n` (C x 3), `r`, `seen` (C x light vertices, as for `cumulative_sums`); `normal_cost` as of `CacheGrid` [length^2]."""
+    if len(p) < 2:
+        return np.ones(len(p))
+    cost = np.sum(p ** 2, axis=1)[:, None] + np.sum(p ** 2, axis=1) - 2 * p @ p.T + normal_cost * (1 - n @ n.T)
+    np.fill_diagonal(cost, np.inf)
+    around = np.argsort(cost, axis=1)[:, :min(neighbors, len(p) - 1)]
+    pmf = np.where(seen, r, 0)
+    pmf = pmf / np.maximum(pmf.sum(axis=1, keepdims=True), 1e-30)
+    expected = sum(pmf[column] for column in around.T) / around.shape[1]
+    return np.sum(pmf * (expected < UNEXPECTED * pmf), axis=1)
+
+
+def tabulate(grid, Q_s, Q_blind, doubts, ends_s):
+    """`(records, shares)` of the rows, as `ResampledWeights` takes them.
+
+    NumPy arrays: `Q_s` (C x LENGTHS), integrals at the C cache points, visibility included; `Q_blind` (C), of all lengths, visibility not; `doubts`
+    (C); `ends_s` (LENGTHS): light vertices that a light sub-path has of each length on average.
+    """
+    near = np.array(grid.table).reshape(-1, grid.neighbors)
+    cached = 1 - UNIFORM_SHARE
+
+    def inverse(Q):
+        return np.where(Q > 0, 1 / np.where(Q > 0, Q, 1), 0)
+
+    Q = Q_s.sum(axis=1)
+    blind = np.where(Q > 0, BLIND_SHARE, 1)
+    ends = max(ends_s.sum(), 1e-9)
+    nothing = (~(Q_blind > 0))[near].mean(axis=1)
+    uniform = UNIFORM_SHARE + cached * nothing
+    # What a darker neighbour has least of is what matters here: 1/Q of the mean, not the mean of 1/Q.
+    a = cached * (1 - blind)[near].mean(axis=1) * inverse(Q[near].mean(axis=1))
+    c = cached * blind[near].mean(axis=1) * inverse(Q_blind[near].mean(axis=1))
+    e = np.clip(doubts[near].mean(axis=1), LEAST_DOUBT, 1)
+    shares = (Q_s * inverse(Q)[:, None])[near].mean(axis=1) + (~(Q > 0))[near].mean(axis=1)[:, None] * (ends_s / ends)
+    records = np.stack([a, uniform / ends, c, e], axis=1)
+    return mi.Float(records.ravel().astype(np.float32)), mi.Float(shares.ravel().astype(np.float32))

@@ -1,0 +1,59 @@
+"""Drawing light vertices for camera vertices, from the pmfs of near cache points."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+UNIFORM_SHARE = 0.2
+"""Share of draws that ignore the cache: what no near cache point is sent is still drawn."""
+BLIND_SHARE = 0.4
+"""Share of the cached pmfs that ignores what stands between: a cache point in the shadow knows little of a place near it in the light."""
+
+
+def cumulative_sums(r, seen, count, width):
+    """Cumulative sums, up to one in each row, of the pmfs of C cache points over up to `width` light vertices.
+
+    `r` (float, C x width, one row a cache point): q*/p of each light vertex if nothing stood between, zero in unused places; `seen` (bool, alike):
+    whether nothing does; `count` (uint32 of width one): light vertices in use, the first ones. The pmf is that of what is seen, with
+    `BLIND_SHARE` of what is not told apart; one of the two alone if the other is nothing, uniform if both are.
+    """
+    place = dr.arange(mi.UInt32, dr.width(r))
+    last = (place // width) * width + (width - 1)
+    all_sums, seen_sums = (dr.block_prefix_sum(x, width, exclusive=False) for x in (r, dr.select(seen, r, 0)))
+    every, some = (dr.gather(mi.Float, x, last) for x in (all_sums, seen_sums))
+    uniform = mi.Float(dr.minimum(place % width + 1, count)) / mi.Float(dr.maximum(count, 1))
+    blind = dr.select(every > 0, dr.minimum(all_sums / dr.select(every > 0, every, 1), 1), uniform)
+    share = dr.select(some > 0, mi.Float(BLIND_SHARE), 1)
+    return dr.fma(share, blind, (1 - share) * dr.minimum(seen_sums / dr.select(some > 0, some, 1), 1))
+
+
+class Proposals:
+    """For every row of a `CacheGrid` a mixture of the pmfs of its cache points: `cumulative` as of `cumulative_sums`, `count` and `width` as there.
+
+    The probability of a light vertex is what the cumulative sums give it: they are what is drawn from, rounding included.
+    """
+
+    def __init__(self, grid, cumulative, count, width):
+        self.grid, self.cumulative, self.count, self.width = grid, cumulative, count, width
+
+    def draw(self, row, rng, active=True):
+        """Light vertex for each row: one of the row's cache points at random, then a light vertex from its pmf, or any at the uniform share."""
+        which = dr.minimum(mi.UInt32(rng.next_float32(active) * self.grid.neighbors), self.grid.neighbors - 1)
+        start = self.grid.neighbor(row, which, active) * self.width
+        uniform = rng.next_float32(active) < UNIFORM_SHARE
+        u = rng.next_float32(active)
+        chosen = dr.binary_search(0, self.width, lambda i: dr.gather(mi.Float, self.cumulative, start + dr.minimum(i, self.width - 1), active) <= u)
+        anywhere = mi.UInt32(u * mi.Float(self.count))
+        last = dr.maximum(self.count, 1) - 1
+        return dr.minimum(dr.select(uniform, anywhere, chosen), last)
+
+    def probability(self, row, vertex, active=True):
+        """P_r of the light vertex `vertex`: the mean of the row's pmfs, mixed with the uniform one."""
+        mean = mi.Float(0)
+        for number in range(self.grid.neighbors):
+            start = self.grid.neighbor(row, number, active) * self.width
+            upper = dr.gather(mi.Float, self.cumulative, start + vertex, active)
+            lower = dr.gather(mi.Float, self.cumulative, start + vertex - 1, active & (vertex > 0))
+            mean += dr.maximum(upper - lower, 0)
+        return mean * ((1 - UNIFORM_SHARE) / self.grid.neighbors) + UNIFORM_SHARE / mi.Float(dr.maximum(self.count, 1))

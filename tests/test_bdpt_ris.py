@@ -1,0 +1,306 @@
+"""The plugins `pcbpt` and `bdpt_ris`: one weight function whichever technique makes a path, the images, and where resampling could fail.
+
+Comparisons of renders as in `test_against_path`: false-alarm rate 1e-6 each, and the errors named are seen with a probability of 0.95.
+"""
+
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from comparing import Estimate, SessionBatches, agree, assert_same, collect_until
+from test_against_path import MONO, RGB, SPECTRAL, caustic_scene
+from test_analytic import inside_sphere, series
+from test_bdpm import last_words
+from test_bdpt import JointPaths, room
+from worlds import EMITTERS, POINT_LIKE, T, diffuse, film, has_delta, look, path, ptracer, tray
+from mis_integrators.transport.camera_vertices import STEP, leave, not_left, step_to_hit, step_to_vertex, sum_before
+from mis_integrators.transport.connections import join_sensor
+from mis_integrators.transport.junctions import Junction, scattered_mean
+from mis_integrators.transport.light_ends import END, LightEnds
+from mis_integrators.transport.subpaths import NO_PARENT, junction_of, new_vertices, read_vertices, vertex_layout
+
+
+SCENES = Path(__file__).parents[1] / "scenes"
+
+
+def plugin(name, **parameters):
+    return mi.load_dict({"type": name, "max_depth": 4, "camera_paths": 4, **parameters})
+
+
+# --- One weight function ---------------------------------------------------------------------------------
+
+
+class ResampledPaths(JointPaths):
+    """The same joint paths, written into buffers as the passes write them, and weighted by the passes' own code."""
+
+    def __init__(self, scene, length, **parameters):
+        super().__init__(scene, length)
+        self.session = plugin(parameters.pop("name", "bdpt_ris"), max_depth=-1, **parameters).session(scene, 0, seed=1, spp=0)
+        self.session._prepare()
+        self.lights, self.traits = self.session.lights, self.session.traits
+
+    def keep(self, buffer, states, number, side, state, parent):
+        hit, si, _, to_camera, to_light, _ = self.vertices[number]
+        towards = to_camera if side == "camera" else to_light
+        seen = mi.SurfaceInteraction3f(si)
+        seen.wi = si.to_local(towards)
+        depth = number + 1 if side == "camera" else self.length - number
+        slot = dr.arange(mi.UInt32, self.COUNT) + number * self.COUNT
+        junction = Junction.at(self.traits, seen, si.bsdf(), self.valid)
+        values = {"p": si.p, "n": junction.n, "ns": junction.ns, "towards": towards, "throughput": 1, "value": junction.value, "density": junction.density,
+                  "path": slot, "depth": depth, "number": number, **dict(zip(states, state))}
+        vertex_layout(states).write(buffer["words"], values, slot, self.valid)
+        dr.scatter(buffer["parent"], parent, slot, self.valid)
+        if "hit" in buffer:
+            dr.scatter(buffer["hit"], mi.PreliminaryIntersection3f(hit), slot, self.valid)
+        dr.eval(buffer)
+        return slot
+
+    def camera_buffer(self, weights):
+        """`(buffer, slot of each vertex, what `leave` says after the last one)`."""
+        buffer = new_vertices(self.traits, self.capacity, STEP)
+        left, parent, slots = not_left(self.COUNT), dr.full(mi.UInt32, NO_PARENT, self.COUNT), []
+        for number in range(self.length):
+            _, si, _, to_camera, to_light, delta = self.vertices[number]
+            p_camera, p_light = self.densities(number)
+            if number:
+                _, cosine, squared = self.segment(number - 1, number)
+                state = step_to_vertex(weights, left, density, cosine, squared)
+            else:
+                of_rays = self.lens.density(si.p, si.time, self.aperture, self.valid) * dr.abs(dr.dot(si.n, to_camera))
+                state = [weights.ratio / of_rays if self.lens.connects else mi.Float(0), *[mi.Float(0)] * 5]
+            slot = self.keep(buffer, STEP, number, "camera", state, parent)
+            value, *_ = self.junction(number).between(to_camera, to_light, self.valid)
+            left = leave(weights, left, si, value, p_camera, p_light, to_light, ~delta)
+            density = dr.select(delta, 0, p_camera * dr.abs(dr.dot(si.n, to_light)))
+            parent = dr.select(delta, parent, slot)
+            slots.append(slot)
+            dr.eval(left, density, parent)
+        return buffer, slots, left, density, parent
+
+    def light_buffer(self, weights):
+        """`(buffer, slot of each vertex)`."""
+        buffer = new_vertices(self.traits, self.capacity, END)
+        last, slots = self.vertices[-1][1], [None] * self.length
+        source = dr.zeros(mi.DirectionSample3f, self.COUNT)
+        source.p, source.n, source.emitter = self.light.p, self.light.n, self.light.emitter
+        seen = mi.SurfaceInteraction3f(last)
+        seen.wi = last.to_local(self.light.d)
+        flux = self.brought / (self.lights.start_density(last, self.light, self.valid) * self.lights.forward_density(last, self.light, self.valid))
+        state = weights.lit(seen, source, dr.full(mi.Bool, True, self.COUNT), self.valid, flux)
+        for number in range(self.length - 1, -1, -1):
+            _, si, _, to_camera, to_light, delta = self.vertices[number]
+            slots[number] = self.keep(buffer, END, number, "light", state, dr.full(mi.UInt32, NO_PARENT, self.COUNT))
+            if number:
+                p_camera, p_light = self.densities(number)
+                value, *_ = self.junction(number).between(to_camera, to_light, self.valid)
+                left = weights.left(state, p_light, p_camera, delta, scattered_mean(value, si.n, to_light))
+                near, far, squared = self.segment(number, number - 1)
+                seen = mi.SurfaceInteraction3f(self.vertices[number - 1][1])
+                seen.wi = seen.to_local(self.vertices[number - 1][4])
+                state = weights.arrived(left, dr.select(delta, 0, p_light * near * far / squared), seen, squared, mi.UInt32(self.length - number + 1))
+                dr.eval(state)
+        return buffer, slots
+
+    def weights(self):
+        """{s: weight of technique s}, zero where it cannot make the path (numpy)."""
+        session, weights, last = self.session, self.session.weights(), self.vertices[-1][1]
+        self.capacity = self.COUNT * self.length
+        infinite = mi.has_flag(self.light.emitter.flags(), mi.EmitterFlags.Infinite)
+        place = dr.select(infinite, mi.Point3f(self.light.d), self.light.p)
+        self.light, self.brought = self.lights.emitted(last, self.light.emitter, place, self.light.n, self.light.uv, self.valid)
+        self.valid &= (dr.max(self.brought) > 0) & (self.light.dist > 1e-2)      # not of a vertex on the lamp itself
+        camera, camera_slots, left, density, parent = self.camera_buffer(weights)
+        light, light_slots = self.light_buffer(weights)
+        delta = [np.array(v[-1]) for v in self.vertices]
+        starts = {"emitter": self.light.emitter, "p": place, "n": self.light.n, "uv": self.light.uv}
+        index = dr.arange(mi.UInt32, self.COUNT)
+        result = {}
+
+        hit = step_to_hit(self.lights, weights, left, density, last, self.light, self.brought, dr.square(self.light.dist), self.valid)
+        nearer = sum_before(camera, hit, parent, hit["start"], hit["light_mean"], mi.Float(1), hit["across"], mi.UInt32(self.length + 1), weights,
+                            self.valid)
+        result[0] = np.array(dr.select(self.lights.can_be_met(self.light.emitter, self.valid), 1 / (1 + nearer), 0))
+        for z in range(self.length - 1, -1, -1):
+            places = dr.zeros(mi.UInt32, self.COUNT) if z == self.length - 1 else light_slots[z + 1]
+            ends = LightEnds(self.traits, self.lights, starts, self.COUNT, light, places, mi.UInt32(2 * self.COUNT), session.reach)
+            vertex = read_vertices(camera, camera_slots[z], self.valid, states=STEP)
+            sent = ends.send(vertex["p"], index if z == self.length - 1 else index + self.COUNT, mi.Float(0), [], self.valid)
+            value, forward, back = self.junction_at(camera, camera_slots[z]).between(vertex["towards"], sent.d, self.valid)
+            share = session._share(weights, camera, vertex, sent, value, forward, back, vertex["depth"] + sent.vertices, self.valid)
+            blocked = delta[z] if z == self.length - 1 else delta[z] | delta[z + 1]
+            result[self.length - z] = np.array(share) * ~blocked
+        y = read_vertices(light, light_slots[0], self.valid, states=END)
+        seen = join_sensor(self.scene, None, self.traits, self.lens, y, self.aperture, mi.Float(0), [], False, self.valid)
+        self.valid &= seen.active | mi.Bool(delta[0])
+        result[self.length + 1] = np.array(weights.seen_by_sensor(seen, y)) * ~delta[0] if self.lens.connects else 0 * result[0]
+        valid = np.array(self.valid)
+        return {s: np.broadcast_to(w, self.COUNT)[valid] for s, w in result.items()}
+
+    def junction_at(self, buffer, slots):
+        return junction_of(self.traits, read_vertices(buffer, slots, self.valid, states=STEP), [], self.valid)
+
+
+@pytest.mark.parametrize("name, bsdf, light, sensor, length, parameters", [
+    ("bdpt_ris", "rough", "area", "thinlens", 3, {"resamples": 4}), ("bdpt_ris", "plastic", "point", "orthographic", 3, {"light_paths": 1}),
+    ("bdpt_ris", "plastic", "sphere", "perspective", 3, {"cache_neighbors": 1}), ("bdpt_ris", "bump", "constant", "perspective", 2, {}),
+    ("pcbpt", "plastic", "area", "perspective", 3, {})])
+def test_weights_sum_to_one(rgb, name, bsdf, light, sensor, length, parameters):
+    """Each technique's weight for the same joint path, from its own code; some in a thousand lose by rounding at grazing angles."""
+    by_technique = ResampledPaths(room(bsdf, light, sensor), length, name=name, **parameters).weights()
+    total = sum(by_technique.values())
+    assert len(total) > 0.3 * JointPaths.COUNT
+    assert np.mean(np.abs(total - 1) < 1e-4) > 0.9 and np.mean(np.abs(total - 1) < 2e-3) > 0.995, np.sort(np.abs(total - 1))[-20:]
+    smooth = {s for s, w in by_technique.items() if w.max() > 1e-3}
+    assert smooth == set(by_technique) - ({0} if light in ("point", "spot") else set())      # each of them counts somewhere
+
+
+# --- Images ------------------------------------------------------------------------------------------------
+
+
+def assert_value(integrator, scene, value, whole=0.01):
+    batches = SessionBatches(integrator, scene, 1)
+    assert_same(*collect_until(batches, Estimate.exact(np.full((2, 3), value)), whole, whole, most=1500), whole, whole)
+
+
+@pytest.mark.parametrize("name, parameters", [
+    ("bdpt_ris", {}), ("pcbpt", {}), ("bdpt_ris", {"light_paths": 1}), ("bdpt_ris", {"resamples": 4, "target": "f_y_f_yz", "light_paths": 30})],
+    ids=["aware", "unaware", "one_light_path", "four_draws"])
+def test_point_in_sphere(rgb, name, parameters):
+    """A point light in the middle of a diffuse sphere: L = rho I / pi (1 + rho + rho^2 + ...), here four terms."""
+    rho, intensity = 0.6, 2.0
+    scene = inside_sphere({"light": {"type": "point", "position": [0, 0, 0], "intensity": intensity}}, diffuse(rho))
+    assert_value(plugin(name, max_depth=5, **parameters), scene, series(rho * intensity / np.pi, rho, 4))
+
+
+@pytest.mark.parametrize("name", ["bdpt_ris", "pcbpt"])
+def test_emitting_sphere(rgb, name):
+    """A furnace: walls of albedo rho that emit L, any length of paths: L / (1 - rho)."""
+    scene = inside_sphere({}, diffuse(0.5), {"type": "area", "radiance": 0.7})
+    assert_value(plugin(name, max_depth=-1, light_paths=50), scene, 1.4)
+
+
+# plugin, emitter, family, sensor, variant, parameters
+DEFAULT = [
+    ("bdpt_ris", "rectangle", "mixed0", "perspective", SPECTRAL, {}),
+    ("bdpt_ris", "envmap rotated", "mixed2", "thinlens", RGB, {"light_paths": 50}),
+    ("pcbpt", "several", "smooth1", "orthographic", MONO, {}),
+    ("bdpt_ris", "textured", "smooth0", "perspective", MONO, {"resamples": 4, "target": "f_y_f_yz"}),
+]
+
+
+@pytest.mark.parametrize("name, emitter, family, sensor, variant_name, parameters", DEFAULT, ids=["-".join(row[:5]).replace(" ", "_") for row in DEFAULT])
+def test_agrees(name, emitter, family, sensor, variant_name, parameters):
+    mi.set_variant(variant_name)
+    agree(plugin(name, camera_paths=16, **parameters), path(rr_depth=50), tray(family, emitter, sensor), whole=0.03, block=0.1, most=200)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("emitter", EMITTERS)
+@pytest.mark.parametrize("family", ["mixed0", "mixed1", "mixed2", "smooth0", "smooth1", "smooth2"])
+@pytest.mark.parametrize("name", ["bdpt_ris", "pcbpt"])
+def test_agrees_full(rgb, emitter, family, name):
+    if has_delta(family) and emitter in POINT_LIKE:
+        pytest.skip("path is blind there")
+    oracle = ptracer if emitter == "directionalarea" else path
+    agree(plugin(name), oracle(rr_depth=50), tray(family, emitter), block=0.05, most=4096)
+
+
+@pytest.mark.parametrize("emitter", ["directionalarea"])
+def test_caustics_against_ptracer(rgb, emitter):
+    """Light that reaches a floor by mirror and glass: only joining to the sensor makes it, and the emitter has no start to be joined with."""
+    agree(plugin("bdpt_ris", max_depth=-1, camera_paths=16), ptracer(rr_depth=50), caustic_scene(emitter), whole=0.03, block=0.1, most=200)
+
+
+@pytest.mark.parametrize("scene", ["door", "window"])
+def test_bundled_scenes(rgb, scene):
+    """Against `bdpt`, in rooms most of whose light sub-paths a cache point does not see."""
+    scene = mi.load_file(str(SCENES / f"{scene}.xml"), resx=24, resy=24)
+    a, b = (SessionBatches(mi.load_dict({"type": name, "max_depth": 5, "camera_paths": paths}), scene, 2)
+            for name, paths in (("bdpt_ris", 4), ("bdpt", 16)))
+    assert_same(*collect_until(a, b, 0.03, 0.08, most=1000), 0.03, 0.08)
+
+
+# --- Where resampling could fail ----------------------------------------------------------------------------
+
+
+def test_nothing_is_visible(rgb):
+    """A lamp in a box of its own: no cache point sees any light vertex, every pmf falls back, and the image is black and finite."""
+    scene = mi.load_dict({
+        "type": "scene", "floor": {"type": "rectangle", "to_world": T().scale(2), "bsdf": diffuse(0.6)},
+        "box": {"type": "cube", "to_world": T().translate([0, 0, 1.5]).scale(0.4), "flip_normals": True, "bsdf": {"type": "twosided", "bsdf": diffuse(0.5)}},
+        "lamp": {"type": "sphere", "center": [0, 0, 1.5], "radius": 0.1, "emitter": {"type": "area"}},
+        "sensor": {"type": "perspective", "fov": 40, "to_world": look((0, -2, 3), (0, 0, 0)), "film": film(16)}})
+    for name in ("bdpt_ris", "pcbpt"):
+        session = plugin(name).session(scene, 0, 1, 0)
+        session.iterate()
+        assert np.all((session.image() >= 0) & (session.image() < 1e-4))      # rays start a little beside their surface
+        assert all(np.isfinite(np.array(x)).all() for x in (session.records, session.shares))
+
+
+def test_one_dominant_sub_path(rgb):
+    """Beside a lamp that lights everything, one so small, bright and rarely chosen that a light sub-path of its carries most of the light when there is one:
+    nothing is lost, though Q then rises with it."""
+    scene = mi.load_dict({
+        "type": "scene", "floor": {"type": "rectangle", "to_world": T().scale(2), "bsdf": diffuse(0.6)},
+        "wide": {"type": "point", "position": [0, 0, 40], "intensity": 2000.0},
+        "near": {"type": "point", "position": [0, 0, 1], "intensity": 10.0},
+        "sensor": {"type": "perspective", "fov": 40, "to_world": look((0, -2, 3), (0, 0, 0)), "film": film(16)}})
+    agree(plugin("bdpt_ris", light_paths=10), path(), scene, blocks=1, whole=0.2, block=0.2, most=900)
+
+
+@pytest.mark.parametrize("parameters", [{}, {"max_depth": 0}, {"max_depth": 1}, {"max_depth": 2}])
+def test_dark_and_short(rgb, parameters):
+    """A scene without light is black; depths 0, 1 and 2 show what `path` shows."""
+    floor = {"floor": {"type": "rectangle", "to_world": T().scale(2), "bsdf": diffuse(0.6)},
+             "sensor": {"type": "perspective", "fov": 40, "to_world": look((0, -2, 3), (0, 0, 0)), "film": film(16)}}
+    if not parameters:
+        assert np.all(np.array(mi.render(mi.load_dict({"type": "scene", **floor}), integrator=plugin("bdpt_ris"), spp=8)) == 0)
+        return
+    scene = mi.load_dict({"type": "scene", **floor, "lamp": {"type": "rectangle", "to_world": look((0, 0, 1.5), (0, 0.6, 0)) @ T().scale(0.3),
+                                                             "bsdf": {"type": "twosided", "bsdf": diffuse(0.5)}, "emitter": {"type": "area"}}})
+    images = [np.array(mi.render(scene, integrator=i, spp=512)) for i in (plugin("bdpt_ris", **parameters), path(**parameters))]
+    np.testing.assert_allclose(*[x.mean(axis=(0, 1)) for x in images], rtol=0.03)
+
+
+# --- Repeatability, memory, parameters ----------------------------------------------------------------------
+
+
+def test_same_seed_same_image(rgb):
+    """Cache points, draws and ends do not depend on the order of threads; iterations, whose light sub-paths all pixels share, are uncorrelated."""
+    scene = room("rough", "area")
+    sessions = [plugin("bdpt_ris").session(scene, 0, seed, 0) for seed in (3, 3, 4)]
+    means = [[], [], []]
+    for session, mean in zip(sessions, means):
+        for _ in range(30):
+            before = session.image() * session.iterations if session.iterations else 0
+            session.iterate()
+            mean.append((session.image() * session.iterations - before).mean())
+    np.testing.assert_allclose(sessions[0].image(), sessions[1].image(), rtol=1e-4, atol=1e-6)
+    same, other = np.array(means[0]), np.array(means[2])
+    assert abs(np.corrcoef(same, other)[0, 1]) < 0.75 and abs(np.corrcoef(same[1:], same[:-1])[0, 1]) < 0.75      # 1e-6 for 30 pairs
+
+
+def test_memory_is_bounded(rgb, monkeypatch):
+    """Beyond the bound on pairs there are fewer cache points, and the image is the same."""
+    from mis_integrators.integrators import resampled
+    scene = room("diffuse", "area")
+    monkeypatch.setattr(resampled, "MOST_PAIRS", 6000)
+    session = plugin("bdpt_ris", light_paths=50).session(scene, 0, 1, 0)
+    session.iterate()
+    width = 50 + session.capacity["ends"]
+    assert 1 <= dr.width(session.cache["depth"]) <= 6000 // width < resampled.FEWEST_CACHE_POINTS
+    agree(plugin("bdpt_ris", light_paths=50), path(), scene, blocks=1, whole=0.05, block=0.05, most=600)
+
+
+@pytest.mark.parametrize("parameters, words", [
+    ({"light_paths": 0}, ("light_paths", "from 1")), ({"resamples": 1.5}, ("resamples", "integer")), ({"cache_neighbors": 17}, ("cache_neighbors", "16")),
+    ({"target": "f"}, ("target", "f_y_rho_g_v")), ({"beta": 2.0}, ("beta", "unknown", "light_paths"))])
+def test_parameters_are_checked(rgb, parameters, words):
+    for name in ("pcbpt", "bdpt_ris"):
+        with pytest.raises(Exception) as error:
+            plugin(name, **parameters)
+        assert all(word in last_words(error.value) for word in (name, *words))
