@@ -309,7 +309,8 @@ def test_each_technique_in_an_emitting_sphere(rgb):
 
 @pytest.mark.parametrize("kind, rfilter", [("orthographic", "box"), ("thinlens", "gaussian"), ("perspective", "tent")])
 def test_light_tracing_to_each_sensor(rgb, kind, rfilter):
-    """A floor in the even part of a spot light, seen straight from above through a crop window: next-event estimation and light tracing alone, by blocks."""
+    """A floor in the even part of a spot light, seen straight from above through a crop window: next-event estimation and light
+    tracing alone, by blocks."""
     window = {"crop_offset_x": 8, "crop_offset_y": 16, "crop_width": 16, "crop_height": 8}
     view = {"type": kind, "film": film(32, rfilter, **window), "to_world": look((0, 0, 3), (0, 0, 0))}
     if kind == "orthographic":
@@ -555,7 +556,8 @@ def test_bad_parameter(rgb, name, value, allowed):
 
 
 def test_darkness_and_refusals(rgb):
-    scene = {"type": "scene", "floor": {"type": "rectangle"}, "sensor": {"type": "perspective", "to_world": look((0, 0, 3), (0, 0, 0)), "film": film(8)}}
+    scene = {"type": "scene", "floor": {"type": "rectangle"},
+             "sensor": {"type": "perspective", "to_world": look((0, 0, 3), (0, 0, 0)), "film": film(8)}}
     assert (render(mi.load_dict(scene)) == 0).all()
     with pytest.raises(Exception) as error:
         render(mi.load_dict({**scene, "fog": {"type": "sphere", "bsdf": {"type": "null"}, "interior": {"type": "homogeneous"}}}))

@@ -4,8 +4,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from comparing import Estimate, SessionBatches, agree, assert_same, collect_until, differences
-from test_analytic import floor_from_above, inside_sphere, series
+from comparing import Estimate, SessionBatches, agree, assert_same, collect_until
+from test_analytic import inside_sphere, series
 from test_bdpm import box_scene, glossy_box
 from worlds import T, diffuse, film, look, path, tray
 

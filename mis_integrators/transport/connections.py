@@ -54,7 +54,8 @@ def join(traits, camera, light, wavelengths, active):
 
 
 def by_path(vertices, count, lengths, capacity: int):
-    """`(start, order)`: the kept vertices of sub-path i, in the order of their `number`, are at the places `order[start[i]]`, `order[start[i] + 1]`, ..."""
+    """`(start, order)`: the kept vertices of sub-path i, in the order of their `number`, are at the places `order[start[i]]`,
+    `order[start[i] + 1]`, ..."""
     start = dr.prefix_sum(lengths)
     dr.eval(start)
     index = dr.arange(mi.UInt32, capacity)

@@ -53,7 +53,8 @@ def splat_channels(film, position, channels, active):
 
 
 def expected_weight(film, camera_paths):
-    """Expected sum of filter weights that `camera_paths` samples a pixel leave in each pixel of a block, border included: a tensor (height, width, 1).
+    """Expected sum of filter weights that `camera_paths` samples a pixel leave in each pixel of a block, border included:
+    a tensor (height, width, 1).
 
     What light sub-paths bring to the sensor is divided by this, not by the weights that the camera's samples happen to have."""
     rfilter = film.rfilter()

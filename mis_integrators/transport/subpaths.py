@@ -48,8 +48,8 @@ def vertex_layout(states=STATES):
 
 
 def new_vertices(traits, capacity, states=STATES):
-    """Room for `capacity` vertices, a dictionary: `words` (records of `vertex_layout`), `parent` (the place of the vertex before, or `NO_PARENT`), and
-    where surfaces are not all Lambertian `hit`, from which the surface interaction is made again. Only the places below the count are valid."""
+    """Room for `capacity` vertices, a dictionary: `words` (records of `vertex_layout`), `parent` (the place of the vertex before, or `NO_PARENT`),
+    and where surfaces are not all Lambertian `hit`, from which the surface interaction is made again. Only the places below the count are valid."""
     buffer = {"words": vertex_layout(states).room(capacity), "parent": dr.empty(mi.UInt32, capacity)}
     if traits.has_rough:
         buffer["hit"] = dr.empty(mi.PreliminaryIntersection3f, capacity)
@@ -101,8 +101,8 @@ def trace_light_subpaths(scene, lights, traits, weights, seed, n_paths: int, cap
                          shutter_time: float, max_depth: int, rr_depth: int):
     """Traces `n_paths` light sub-paths.
 
-    Returns `(vertices, count, lengths)`: the kept vertices, how many there were (width one; more than `capacity`: the surplus is missing), and the number
-    of kept vertices of each path. `throughput` is flux through the surface, for one sub-path.
+    Returns `(vertices, count, lengths)`: the kept vertices, how many there were (width one; more than `capacity`: the surplus is missing), and the
+    number of kept vertices of each path. `throughput` is flux through the surface, for one sub-path.
     """
     lanes = n_paths
     if dr.hint(dr.backend_v(mi.Float) == dr.JitBackend.LLVM, mode='scalar'):
@@ -188,12 +188,12 @@ def trace_light_subpaths(scene, lights, traits, weights, seed, n_paths: int, cap
 @dr.syntax
 def trace_camera_subpaths(scene, sensor, integrator, lights, traits, weights, seed, first, n_paths: int, camera_paths: int, wavelength_sample,
                           max_depth: int, rr_depth: int, hide_emitters: bool, capacity: int, ledger=None, shortest: int = 2):
-    """Traces `n_paths` camera paths, numbers `first`, `first + 1`, ... of `film_samples`, with the light that they meet and that next-event estimation
-    finds at each smooth vertex, weighted.
+    """Traces `n_paths` camera paths, numbers `first`, `first + 1`, ... of `film_samples`, with the light that they meet and that next-event
+    estimation finds at each smooth vertex, weighted.
 
-    Returns `(radiance, alpha, splat position, vertices, count)`: the kept vertices are those that a light sub-path, of at least `shortest` segments with
-    what joins the two, may be joined with; `count` as in `trace_light_subpaths`. `ledger`, if given, learns every contribution: `met(path, depth, value, share, mask)` and `direct(...)`, with the length
-    of the joint path in segments, and the weight apart.
+    Returns `(radiance, alpha, splat position, vertices, count)`: the kept vertices are those that a light sub-path, of at least `shortest` segments
+    with what joins the two, may be joined with; `count` as in `trace_light_subpaths`. `ledger`, if given, learns every contribution:
+    `met(path, depth, value, share, mask)` and `direct(...)`, with the length of the joint path in segments, and the weight apart.
     """
     path, active, rng, ray, sensor_weight, splat, aperture = start_camera_paths(sensor, seed, first, 1, n_paths, camera_paths, wavelength_sample)
     lens = Lens(sensor)
