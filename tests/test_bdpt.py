@@ -372,7 +372,7 @@ def test_agrees_full(rgb, emitter, family, sensor):
     agree(bdpt(), oracle(rr_depth=50), tray(family, emitter, "perspective" if oracle is ptracer else sensor), block=0.05, most=4096)
 
 
-@pytest.mark.parametrize("emitter", ["point", "directionalarea"])
+@pytest.mark.parametrize("emitter", [pytest.param("point", marks=pytest.mark.full), "directionalarea"])
 def test_caustics_against_ptracer(rgb, emitter):
     """Light that reaches a floor by mirror and glass: only joining to the sensor makes it."""
     agree(bdpt(), ptracer(rr_depth=50), caustic_scene(emitter), whole=0.02, block=0.08, most=600)
@@ -394,7 +394,7 @@ def test_mirror_caustic_in_closed_form(rgb):
     assert_same(*collect_until(batches, Estimate.exact(np.repeat(values, 3, axis=1)), 0.01, 0.02), 0.01, 0.02, 1e-4)
 
 
-@pytest.mark.parametrize("tilt", [-0.5, 0.5])
+@pytest.mark.parametrize("tilt", [-0.5, pytest.param(0.5, marks=pytest.mark.full)])
 def test_shading_normals_seen_from_the_light(rgb, tilt):
     """A wall whose normal map tilts all its normals, lit by a narrow spot, lights a floor; Veach 1997, section 5.3. Each technique alone."""
     normals = np.broadcast_to(np.array([0.0, tilt, np.sqrt(1 - tilt * tilt)]) * 0.5 + 0.5, (4, 4, 3))
