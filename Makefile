@@ -15,7 +15,7 @@ render: $(VENV)/installed
 	$(VENV)/bin/mis-render scenes/cornell_glossy.xml -i bdpm_opt3 -o out/cornell_glossy.exr
 
 test: $(VENV)/installed-test
-	$(VENV)/bin/python -m pytest
+	$(VENV)/bin/python -m pytest -n 2
 
 gallery: $(VENV)/installed
 	@mkdir -p docs/images out

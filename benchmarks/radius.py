@@ -21,6 +21,7 @@ from scene_files import OpenScene, open_scene, scaled_size
 from turns import Contender, take_turns
 
 STEP = 2**0.5
+FEWEST_ITERATIONS = 12
 TRIMMED = " trimmed"
 COLUMNS = ("scene", "bdd", "time", "automatic", "best radius trimmed", "auto / best trimmed", "choice / best trimmed", "best radius",
            "auto / best", "choice / best", "set-up", "bias share")
@@ -85,6 +86,7 @@ def sweep(opened: OpenScene, references: References, bdd: int, times: list[float
     centre = float(np.exp(np.mean([np.log(central_radius(pilot.session.settings)) for pilot in pilots])))
     fixed = [Contender.begin(maker.method.label, maker.make, seed=0) for maker in sweep_around(centre, radii, bdd, opened, rendering)]
     take_turns([*chosen_for_free, *fixed], rendering, tell)
+    take_turns([*chosen_for_free, *fixed], 0, tell, FEWEST_ITERATIONS)
     automatic = [law(free, references) for free in chosen_for_free]
     automatic = [replace(own, set_up=pilot.first - own.seconds) for own, pilot in zip(automatic, pilots)]
     return automatic, [law(one, references) for one in fixed]
