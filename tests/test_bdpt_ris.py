@@ -184,18 +184,23 @@ def test_emitting_sphere(rgb, name):
 
 
 # plugin, emitter, family, sensor, variant, parameters
-DEFAULT = [
-    ("bdpt_ris", "rectangle", "mixed0", "perspective", SPECTRAL, {}),
+ROWS = [
     ("bdpt_ris", "envmap rotated", "mixed2", "thinlens", RGB, {"light_paths": 50}),
     ("pcbpt", "several", "smooth1", "orthographic", MONO, {}),
     ("bdpt_ris", "textured", "smooth0", "perspective", MONO, {"resamples": 4, "target": "f_y_f_yz"}),
 ]
 
 
-@pytest.mark.parametrize("name, emitter, family, sensor, variant_name, parameters", DEFAULT, ids=["-".join(row[:5]).replace(" ", "_") for row in DEFAULT])
+@pytest.mark.parametrize("name, emitter, family, sensor, variant_name, parameters", ROWS, ids=["-".join(row[:5]).replace(" ", "_") for row in ROWS])
 def test_agrees(name, emitter, family, sensor, variant_name, parameters):
     mi.set_variant(variant_name)
     agree(plugin(name, camera_paths=16, **parameters), path(rr_depth=50), tray(family, emitter, sensor), whole=0.03, block=0.1, most=200)
+
+
+@pytest.mark.full
+def test_agrees_in_spectral_variants():
+    mi.set_variant(SPECTRAL)
+    agree(plugin("bdpt_ris", camera_paths=16), path(rr_depth=50), tray("mixed0", "rectangle"), whole=0.03, block=0.1, most=200)
 
 
 @pytest.mark.full
@@ -215,7 +220,7 @@ def test_caustics_against_ptracer(rgb, emitter):
     agree(plugin("bdpt_ris", max_depth=-1, camera_paths=16), ptracer(rr_depth=50), caustic_scene(emitter), whole=0.03, block=0.1, most=200)
 
 
-@pytest.mark.parametrize("scene", ["door", "window"])
+@pytest.mark.parametrize("scene", [pytest.param("door", marks=pytest.mark.full), "window"])
 def test_bundled_scenes(rgb, scene):
     """Against `bdpt`, in rooms most of whose light sub-paths a cache point does not see."""
     scene = mi.load_file(str(SCENES / f"{scene}.xml"), resx=24, resy=24)

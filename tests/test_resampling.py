@@ -45,6 +45,11 @@ def enumerate_world(world, uniform=0.0, cached=None):
     return mean, square - mean ** 2
 
 
+def countable(world):
+    """Whether the outcomes are few enough to go through."""
+    return np.prod([float(len(x)) ** world["M"] for x in world["p"]]) <= 1e5
+
+
 def pytest_generate_tests(metafunc):
     if "world" in metafunc.fixturenames:
         directory = metafunc.config.getoption("vectors")
@@ -70,11 +75,12 @@ def moment(world, g=None):
 # ---------------------------------------------------------------- exact worlds
 
 def test_variance_is_exact(world):
-    mean, spread = enumerate_world(world)
-    given = "variance" in world
-    assert variance(world) == pytest.approx(world["variance"] if given else spread, rel=1e-9)
-    assert spread == pytest.approx(variance(world), rel=1e-9)
-    assert mean == pytest.approx(world["mean"] if given else sum(g.sum() for g in world["g"]), rel=1e-9)
+    total = sum(g.sum() for g in world["g"])
+    if "variance" in world:
+        assert variance(world) == pytest.approx(world["variance"], rel=1e-9)
+        assert total == pytest.approx(world["mean"], rel=1e-9)
+    if countable(world):
+        assert enumerate_world(world) == pytest.approx((total, variance(world)), rel=1e-9)
 
 
 def test_densities_are_those_of_the_variance(world):
@@ -86,6 +92,8 @@ def test_densities_are_those_of_the_variance(world):
 
 def test_any_pmf_is_unbiased(world):
     """A pmf of another target, with zeros where there is light: the uniform share keeps the mean."""
+    if not countable(world):
+        return
     rng = np.random.default_rng(1)
     cached = [q * rng.choice([0, 0.1, 3], len(q)) for q in world["q_star"]]
     expected = sum(g.sum() for g in world["g"])

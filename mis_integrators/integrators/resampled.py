@@ -313,8 +313,8 @@ class ResampledSession(IterativeSession):
             light = self._light(iteration, chunk, spectral)
             r, seen, starts, places, found = self._ends_fit(lambda: self._target_pass(
                 self.scene, self.sensor, self._tables, self._seed(iteration, START, chunk), *light, self.cache, spectral))
-            radiance = self._connection_pass(self.scene, self.sensor, self._tables, radiance, camera, count, light[0], starts, places, found, self._pmfs(r, seen, found),
-                                             self._seed(iteration, DRAW, chunk), spectral)
+            radiance = self._connection_pass(self.scene, self.sensor, self._tables, radiance, camera, count, light[0], starts, places, found,
+                                             self._pmfs(r, seen, found), self._seed(iteration, DRAW, chunk), spectral)
             radiance = self._hit_pass(self._tables, radiance, camera, hits, hit_count)
             if self.lens:
                 block = self._sensor_pass(self.scene, self.sensor, self._tables, *light[:2], self._seed(iteration, APERTURE, chunk), spectral)

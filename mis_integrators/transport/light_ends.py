@@ -48,12 +48,6 @@ class LightEnds:
         self.traits, self.lights, self.starts, self.paths = traits, lights, starts, paths
         self.vertices, self.places, self.count, self.reach = vertices, places, count, reach
 
-    def vertex_count(self, index, active):
-        """How many vertices the sub-paths `index` have."""
-        surface = active & (index >= self.paths)
-        place = dr.gather(mi.UInt32, self.places, index - self.paths, surface)
-        return dr.select(surface, read_vertices(self.vertices, place, surface, ("depth",), END)["depth"] + 1, 1)
-
     def send(self, p, index, time, wavelengths, active):
         """What the ends `index` send to points `p`: a `Sent`."""
         surface = active & (index >= self.paths)
