@@ -146,8 +146,8 @@ def surfaces(sensor, **objects):
 
 @pytest.mark.parametrize("hide_emitters", [False, True])
 def test_surfaces(rgb, hide_emitters):
-    """Without media `path` is the oracle. A lamp stands before the second view, so hiding it shows; `path` itself (3.9.1) misplaces what is behind a hidden
-    lamp, `volpath` does not."""
+    """Without media `path` is the oracle. A lamp stands before the second view, so hiding it shows; `path` itself (3.9.1)
+    misplaces what is behind a hidden lamp, `volpath` does not."""
     lens = {"kind": "thinlens", "aperture_radius": 0.08, "focus_distance": 4.0}
     views = [view((0.3, 1.0, 4.5)), view((1.5, 1.4, 4.0), **lens), view((-0.8, 3.4, 3.6))]
     scene = surfaces(batch(views), lamp=lamp((0.9, 0.85, 2.4), 0.3, 30.0))
