@@ -31,8 +31,8 @@ def coloured(scale=2.0):
 
 
 def smoky(sensor, **objects):
-    """A grid and, behind a boundary of its own, a coloured medium that shares a face with it."""
-    return world(sensor, grid(even, scale=1.5, g=0.5), second=container(coloured(), 0.6, (1.6, -0.4, 0)), **objects)
+    """A grid and, behind a boundary of its own, a coloured medium close to it (coincident boundaries are ambiguous, for Mitsuba too)."""
+    return world(sensor, grid(even, scale=1.5, g=0.5), second=container(coloured(), 0.6, (1.63, -0.4, 0)), **objects)
 
 
 def cloud(size=SIZE, g=0.0):
