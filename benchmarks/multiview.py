@@ -138,7 +138,8 @@ def compare(path: Path, options: argparse.Namespace) -> list[Row]:
         ratios = [a.mean() / b.mean() for a, b in zip(*(np.array_split(noise[n].mean(axis=-1), views, axis=1) for n in (name, "volpath")))]
         times = float(np.mean([s for s, _ in used[name]]) / np.mean([s for s, _ in used["volpath"]]))       # iterations overrun a little
         rows.append({"scene": path.stem, "views": views, "weights": name, "ratio": times * float(noise[name].mean() / noise["volpath"].mean()),
-                     "best view": times * float(min(ratios)), "worst view": times * float(max(ratios)), "mean ratio": float(np.mean(images[name]) / mean.mean()),
+                     "best view": times * float(min(ratios)), "worst view": times * float(max(ratios)),
+                     "mean ratio": float(np.mean(images[name]) / mean.mean()),
                      "samples": round(np.mean([n for _, n in used[name]])), "volpath samples": round(np.mean([n for _, n in used["volpath"]])),
                      "time ratio": times})
     return rows

@@ -110,6 +110,13 @@ def split(image, count):
     return np.split(image[:, :, :3], count, axis=1)
 
 
+def arrived(accumulator):
+    """What the sum of the weights at each pixel is over what it is expected to be, view by view (height, width, 1)."""
+    weight = np.array((accumulator.shared[0] + accumulator.shared[1])[:, :, 3:] / (accumulator.expected * accumulator.iterations))
+    left = accumulator.views.margin
+    return [weight[top:top + h, left:left + w] for (w, h), top in zip(accumulator.views.sizes, accumulator.views.tops)]
+
+
 class MultiviewBatches:
     """Region means of independent renders of all views, each of so many iterations, by one session."""
 
@@ -117,6 +124,7 @@ class MultiviewBatches:
         self.session = integrator.session(scene, sensor, spp=0) if sensor is not None else integrator.views_session(scene)
         self.blocks, self.iterations, self.seed, self.batches = blocks, iterations, seed, []
         self.statistics = {"tried": 0, "reached": 0, "lost": 0}
+        self.weights = []
 
     def add(self, count):
         for _ in range(count):
@@ -124,6 +132,7 @@ class MultiviewBatches:
             for _ in range(self.iterations):
                 self.session.iterate()
             self.batches.append(regions([np.array(t)[:, :, :3] for t in self.session.view_tensors()], self.blocks))
+            self.weights.append(regions(arrived(self.session.accumulator), self.blocks))
             for name, value in self.session.statistics.items():
                 self.statistics[name] += value
 
@@ -160,4 +169,7 @@ def views_agree(integrator, oracle, scene, whole=0.015, block=0.06, iterations=2
     apart = oracle if isinstance(oracle, Estimate) else OracleBatches(oracle, scene, blocks, oracle_spp)
     estimates = collect_until(together, apart, whole, block, most=most)
     assert_same(*estimates, whole, block)
+    # Weights sum to one on the mean. Pictures say little about that: their means are nearly ratios of two sums that err alike.
+    weights = Estimate.of(together.weights)
+    assert_same(weights, Estimate.exact(np.ones_like(weights.mean)), whole, block)
     return together, estimates[1]

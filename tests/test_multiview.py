@@ -31,8 +31,8 @@ def coloured(scale=2.0):
 
 
 def smoky(sensor, **objects):
-    """A grid and, behind a boundary of its own, a coloured medium that shares a face with it."""
-    return world(sensor, grid(even, scale=1.5, g=0.5), second=container(coloured(), 0.6, (1.6, -0.4, 0)), **objects)
+    """A grid and, behind a boundary of its own, a coloured medium close to it (coincident boundaries are ambiguous, for Mitsuba too)."""
+    return world(sensor, grid(even, scale=1.5, g=0.5), second=container(coloured(), 0.6, (1.63, -0.4, 0)), **objects)
 
 
 def cloud(size=SIZE, g=0.0):
@@ -112,7 +112,7 @@ def test_weights(rgb, weights):
 def test_few_samples(rgb):
     """Two samples a pixel, on finer films: MIS is as right as ever, the mean of its other half included; MWIS is visibly biased."""
     batches = {weights: MultiviewBatches(multiview(weights=weights, camera_paths=1), cloud(64)) for weights in ("mis", "mwis")}
-    assert_same(*collect_until(batches["mis"], reference(0.0), 0.01, 0.04, start=40), 0.01, 0.04)
+    assert_same(*collect_until(batches["mis"], reference(0.0), 0.015, 0.05, start=40), 0.015, 0.05)
     batches["mwis"].add(40)
     assert differences(batches["mwis"].estimate(), reference(0.0))
 
@@ -146,8 +146,8 @@ def surfaces(sensor, **objects):
 
 @pytest.mark.parametrize("hide_emitters", [False, True])
 def test_surfaces(rgb, hide_emitters):
-    """Without media `path` is the oracle. A lamp stands before the second view, so hiding it shows; `path` itself (3.9.1) misplaces what is behind a hidden
-    lamp, `volpath` does not."""
+    """Without media `path` is the oracle. A lamp stands before the second view, so hiding it shows; `path` itself (3.9.1)
+    misplaces what is behind a hidden lamp, `volpath` does not."""
     lens = {"kind": "thinlens", "aperture_radius": 0.08, "focus_distance": 4.0}
     views = [view((0.3, 1.0, 4.5)), view((1.5, 1.4, 4.0), **lens), view((-0.8, 3.4, 3.6))]
     scene = surfaces(batch(views), lamp=lamp((0.9, 0.85, 2.4), 0.3, 30.0))
@@ -176,14 +176,14 @@ def test_views_without_overlap(rgb):
 
 
 def test_hostile_views(rgb):
-    """Zero-density pockets and a majorant many times the density; one view inside a medium, one with its near plane behind pivots of the others,
+    """Zero-density pockets and a majorant many times the density; one view inside a medium, one whose near plane cuts off pivots of the others,
     one that sees half of them; forward-peaked phase functions under a point light; a glossy ball."""
     fog = {"type": "homogeneous", "sigma_t": grey(0.25), "albedo": 0.9, "phase": {"type": "hg", "g": 0.9}}
     smoke = grid(pockets, scale=4.0, g=0.9, albedo=0.95)
     room = {"type": "cube", "to_world": mi.ScalarTransform4f().translate([0, 0, 3.2]).scale([2.0, 1.0, 2.0]), "bsdf": {"type": "null"},
             "interior": {"type": "ref", "id": "fog"}}
     inside = view((0, 0.2, 3.4)) | {"medium": {"type": "ref", "id": "fog"}}
-    near = view((0.8, 0.3, 7.0), fov=30.0, near_clip=6.9)
+    near = view((0.8, 0.3, 7.0), fov=30.0, near_clip=5.5) | {"medium": {"type": "ref", "id": "fog"}}       # its near plane stands in the fog
     half = view((-2.5, 0.8, 6.0), (-0.8, 0, 0), fov=20.0)
     scene = world(None, smoke, fog=fog, room=room, a=inside, b=near, c=half,
                   ball={"type": "sphere", "radius": 0.3, "center": [0.3, 0, 0.4], "bsdf": {"type": "roughconductor", "alpha": 0.08}})
@@ -191,13 +191,13 @@ def test_hostile_views(rgb):
     assert together.statistics["lost"] == 0 and together.statistics["reached"] > 0.05 * together.statistics["tried"]
 
 
-@pytest.mark.parametrize("shift", STRETCHES)
+@pytest.mark.parametrize("shift", ["primary_sample", *(pytest.param(shift, marks=pytest.mark.full) for shift in STRETCHES[:2])])
 def test_thick_media(rgb, shift):
     """Optical depths of hundreds to thousands on lines of sight (exponentials of single precision end at 88)."""
     thick = grid(even, scale=300.0, albedo=0.7)
     homogeneous = {"type": "homogeneous", "sigma_t": grey(0.8), "scale": 500.0, "albedo": 0.8}
     scene = world(batch(orbit(2)), thick, second=container(homogeneous, 0.4, (1.5, 0, 0)))
-    views_agree(multiview(shift=shift, max_depth=4), volpath(max_depth=4), scene)
+    views_agree(multiview(shift=shift, max_depth=4), volpath(max_depth=4), scene, whole=0.02, block=0.1, most=200)
 
 
 # --- Films ------------------------------------------------------------------------------------------------------
@@ -294,6 +294,16 @@ def test_cameras_are_mitsubas(rgb):
         assert np.allclose(np.array(position)[:, seen], (np.array(unit) * [[20], [11]])[:, seen], atol=2e-3)
         assert np.allclose(np.array(d)[:, seen], -np.array(ray.d)[:, seen], atol=1e-4)
         assert np.allclose(np.array(distance)[seen], np.array(dr.norm(it.p - ray.o))[seen], atol=1e-3)
+
+
+@pytest.mark.parametrize("depth, lit", [(-1, False), (0, True), (1, True)])
+def test_little_light(rgb, depth, lit):
+    """Scenes without emitters, and depths at which nothing or only emitters are seen."""
+    light = {"sky": {"type": "constant", "radiance": grey(1.0)}} if lit else {}
+    scene = mi.load_dict({"type": "scene", "ball": {"type": "sphere"}, "sensor": batch(orbit(2)), "medium": container(grid(even), 2.0), **light})
+    image = np.array(mi.render(scene, integrator=multiview(max_depth=depth), spp=64))
+    expected = np.array(mi.render(scene, integrator=volpath(max_depth=depth), spp=256))
+    assert np.abs(image.mean() - expected.mean()) < 0.02 * max(expected.mean(), 1e-6) and (image.max() > 0) == (lit and depth == 1)
 
 
 # --- Errors -----------------------------------------------------------------------------------------------------

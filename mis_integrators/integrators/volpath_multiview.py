@@ -166,7 +166,7 @@ class MultiViewSession(IterativeSession):
 
     def _trace_first(self, scene, tables, number, seed, spectral):
         integrator = self.integrator
-        active = number < self.views.paths
+        active = (number < self.views.paths) & (integrator.max_depth != 0)
         pivot, radiance, rng = trace_first_segments(scene, self.views, self.traits, number, seed, streams(number, seed), spectral["wavelengths"],
                                                     spectral["weight"], integrator.hide_emitters, active)
         line, found = {}, mi.UInt32(0)

@@ -104,6 +104,7 @@ class Views:
         self.sensors = sensors = [sensor for m in members for sensor in m]
         self.count = len(sensors)
         films = [group.film() for group, m in zip(groups, members) for _ in m]
+        media = [sensor.get_medium() or group.get_medium() for group, m in zip(groups, members) for sensor in m]
         for group in groups:
             self.check_sensor(group, plugin)
         self._check(films, plugin)
@@ -123,7 +124,7 @@ class Views:
         self.table = {
             "first": mi.UInt32(np.cumsum([0] + counts[:-1])), "width": mi.UInt32([w for w, _ in self.sizes]),
             "height": mi.UInt32([h for _, h in self.sizes]), "border": mi.UInt32(self.borders), "top": mi.UInt32(self.tops),
-            "medium": _pointers([s.get_medium() for s in sensors], mi.MediumPtr),
+            "medium": _pointers(media, mi.MediumPtr),
             "pixels": mi.Float([float(w * h) for w, h in self.sizes]),
             "open": mi.Float([s.shutter_open() for s in sensors]), "shutter": mi.Float([s.shutter_open_time() for s in sensors]),
             **{name: mi.Float(np.stack([getattr(c, name) for c in cameras]).astype(np.float32).ravel().tolist()) for name in CAMERA},
