@@ -126,6 +126,7 @@ def test_caustics_against_ptracer(rgb, emitter, bdd):
 # --- Shading normals -----------------------------------------------------------------------------------
 
 
+@pytest.mark.thinned(2, 2)
 @pytest.mark.parametrize("bdd", [0, 1])
 @pytest.mark.parametrize("tilt", [-0.5, 0.5])
 def test_shading_normals_seen_from_the_light(rgb, bdd, tilt):
@@ -160,7 +161,7 @@ def test_textured_cube_light(rgb, bdd):
 # --- Bias ---------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("family, emitter", [("mixed0", "rectangle"), ("smooth1", "point")])
+@pytest.mark.parametrize("family, emitter", [("mixed0", "rectangle"), pytest.param("smooth1", "point", marks=pytest.mark.full)])
 def test_bias_is_below_resolution(rgb, family, emitter):
     """At twice the radius, four times the bias: if even that is not seen against half the radius, neither is the tests' own."""
     scene = tray(family, emitter)

@@ -155,7 +155,7 @@ def test_error_falls_with_iterations(rgb):
 # --- Variance AOV -------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("rfilter", ["box", "gaussian"])
+@pytest.mark.parametrize("rfilter", ["box", pytest.param("gaussian", marks=pytest.mark.full)])
 def test_variance_is_that_of_the_mean(rgb, rfilter):
     """Mean over the image of the estimated variance, against that of 32 seeds: within 15 % (its own error is 3 %)."""
     scene = box_scene(16, rfilter)
@@ -264,7 +264,7 @@ def test_light_that_meets_nothing(rgb):
     assert not render(scene).any()
 
 
-@pytest.mark.parametrize("max_depth", [0, 1, 2, 3, 4, 5])
+@pytest.mark.parametrize("max_depth", [0, 1, 2, 3, *(pytest.param(depth, marks=pytest.mark.full) for depth in (4, 5))])
 def test_max_depth(rgb, max_depth):
     """Whole paths are cut at the same length as `path` cuts them, for all bdd (1.5 % of the whole image)."""
     scene = glossy_box(size=24)
@@ -538,6 +538,7 @@ def test_every_variant_renders(variant):
     assert image.mean() == pytest.approx(oracle.mean(), rel=0.3 if mi.is_spectral else 0.03)
 
 
+@pytest.mark.full
 def test_spectral_colour():
     """Iterations share their wavelengths: their spread says how far the mean of 1500 may be off (t test at 1e-6)."""
     mi.set_variant("llvm_ad_spectral")

@@ -144,7 +144,11 @@ ROWS = [
 ]
 
 
-@pytest.mark.parametrize("emitter, family, parameters, sensor, variant_name, rfilter", ROWS,
+SLOW = ("sphere", "disk", "cube", "envmap rotated", "several", "sunsky", "point")
+
+
+@pytest.mark.parametrize("emitter, family, parameters, sensor, variant_name, rfilter",
+                         [pytest.param(*row, marks=[pytest.mark.full] if row[0] in SLOW else []) for row in ROWS],
                          ids=[f"{e}-{f}-{'-'.join(map(str, p.values()))}".replace(" ", "_") for e, f, p, *_ in ROWS])
 def test_agrees(emitter, family, parameters, sensor, variant_name, rfilter):
     mi.set_variant(variant_name)

@@ -256,6 +256,7 @@ class BDPTSession(IterativeSession):
                     break
             radiance, entries = self._connection_pass(self.scene, self._tables, radiance, camera, light[0], pairs, spectral, entries)
             radiance = self._merge(radiance, camera, count, light, spectral)
+            dr.eval(radiance)                              # else its sums may still wait when the film's are made
             if self.lens:
                 lit = self._sensor_pass(self.scene, self.sensor, self._tables, light, self._seed(iteration, APERTURE, chunk), spectral)
         return *self._splat(radiance, alpha, position, first, spectral, entries), lit

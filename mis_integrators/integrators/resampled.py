@@ -32,6 +32,8 @@ CACHE_SHARE, FEWEST_CACHE_POINTS = 1 / 300, 256
 """Cache points: this share of a part's camera vertices, but at least so many. More of them cost shadow rays."""
 MOST_PAIRS = 1 << 24
 """Pairs of a cache point and a light vertex at most, four bytes each (and some more while they are made); beyond that there are fewer cache points."""
+DOUBTFUL_RATIO = 10
+"""Light sub-paths over M beyond which images have been seen 1 % too dark (docs/bdpt_ris.md, known defect)."""
 PILOT_SETS = 8
 """Sets of M light sub-paths from which Q and Q_s are estimated before the first iteration, if as many are traced."""
 
@@ -70,6 +72,9 @@ class ResampledSession(IterativeSession):
         width, height = sensor.film().crop_size()
         self.pixel_paths = width * height * integrator.camera_paths
         self.ratio = self.light_chunk * self.chunks / self.pixel_paths
+        if self.light_chunk > DOUBTFUL_RATIO * integrator.light_paths:
+            mi.Log(mi.LogLevel.Warn, f"{integrator.plugin}: with {self.light_chunk} light sub-paths an iteration and light_paths = "
+                                     f"{integrator.light_paths} the image may be 1 % too dark (docs/bdpt_ris.md); use bdpt where that matters")
         self.capacity = {"light": rounded_up(4 * self.light_chunk), "camera": rounded_up(4 * self.chunk), "hits": rounded_up(self.chunk),
                          "ends": rounded_up(6 * integrator.light_paths)}
         depth = integrator.max_depth
@@ -316,6 +321,7 @@ class ResampledSession(IterativeSession):
             radiance = self._connection_pass(self.scene, self.sensor, self._tables, radiance, camera, count, light[0], starts, places, found,
                                              self._pmfs(r, seen, found), self._seed(iteration, DRAW, chunk), spectral)
             radiance = self._hit_pass(self._tables, radiance, camera, hits, hit_count)
+            dr.eval(radiance)                              # else its sums may still wait when the film's are made
             if self.lens:
                 block = self._sensor_pass(self.scene, self.sensor, self._tables, *light[:2], self._seed(iteration, APERTURE, chunk), spectral)
         active = dr.arange(mi.UInt32, self.chunk) + first < self.path_count
