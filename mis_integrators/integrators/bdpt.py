@@ -227,15 +227,6 @@ class BDPTSession(IterativeSession):
 
     # ------------------------------------------------------------------ iterations
 
-    def _grown(self, name, count):
-        """Whether the `count` (an array of width one) found more than there is room for; then there will be more room."""
-        found = int(count[0])
-        if found <= self.capacity[name]:
-            return False
-        self.capacity[name] = rounded_up(found + found // 8)
-        self._freeze()
-        return True
-
     def _chunk(self, iteration, chunk, spectral):
         """Blocks of one part of the paths: of camera paths, of their techniques, of light that met the sensor (None where there is none)."""
         first = dr.opaque(mi.UInt32, chunk * self.chunk)

@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..transport.film import Accumulator, variance_channels
+from ..transport.packing import rounded_up
 from ..transport.random import mix
 from ..transport.traits import UnsupportedScene, check_scene, check_variant
 from .parameters import Parameters
@@ -139,6 +140,16 @@ class IterativeSession:
 
     def _seed(self, iteration, *purpose):
         return dr.opaque(mi.UInt32, mix(self.seed, iteration, *purpose))
+
+    def _grown(self, name, count):
+        """Whether the `count` (an array of width one) found more than there is room for in the buffer of that name; then there
+        will be more room. For sessions with a dictionary `capacity` and a method `_freeze`, which records the passes anew."""
+        found = int(count[0])
+        if found <= self.capacity[name]:
+            return False
+        self.capacity[name] = rounded_up(found + found // 8)
+        self._freeze()
+        return True
 
     def fill_film(self):
         """Hands what has been rendered so far to the sensor's film, ready to develop."""

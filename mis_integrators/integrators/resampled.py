@@ -278,15 +278,6 @@ class ResampledSession(IterativeSession):
 
     # ------------------------------------------------------------------ iterations
 
-    def _grown(self, name, count):
-        """Whether the `count` (an array of width one) found more than there is room for; then there will be more room."""
-        found = int(count[0])
-        if found <= self.capacity[name]:
-            return False
-        self.capacity[name] = rounded_up(found + found // 8)
-        self._freeze()
-        return True
-
     def _light(self, iteration, chunk, spectral):
         """What `trace_light_subpaths` returns."""
         while True:

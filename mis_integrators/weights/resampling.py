@@ -29,11 +29,6 @@ def proposal_weight(q_star, p):
     return at_most(q_star / at_least(p, SMALLEST), LARGEST) * (p > 0)
 
 
-def normaliser(total, M):
-    """Q = (1/M) sum_s sum_i r_{s,i}, or Q_s = (1/M) sum_i r_{s,i}, from the sum `total`."""
-    return total / M
-
-
 def safe_share(total, uniform):
     """Share of the uniform pmf in the mixture: `uniform`, but all of it where nothing is worth drawing (`total` = 0)."""
     return uniform + (1 - uniform) * (total <= SMALLEST)
