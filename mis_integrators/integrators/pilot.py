@@ -22,12 +22,10 @@ PILOT_INDEX = 1 << 30
 UNPLANNED_ITERATIONS = 64
 MOST_PHOTONS = 160
 """Photons a vertex within the largest radius that is tried."""
-GATHER_COST = 0.055
-"""Cost of one gathered photon a vertex, in units of an iteration's light and camera passes (measured on the Cornell box)."""
-ROUGH_GATHER_COST = 0.15
-"""The same where photons need the BSDF evaluated (measured on the textured scene)."""
-PROBE_COST = 0.7
-"""Cost of the coverage probes, in the same units."""
+GATHER_COST = 0.013
+"""Cost of one gathered photon a vertex, in units of an iteration's light and camera passes (0.006 to 0.018 on the bundled scenes)."""
+PROBE_COST = 0.3
+"""Cost of the coverage probes, in the same units (0.05 to 0.36)."""
 USUAL_PHOTONS = 10
 """Photons a gather at which an iteration counts as one planned iteration: larger gathers must pay for themselves."""
 
@@ -152,8 +150,7 @@ class Pilot:
 
     def _cost(self, kind, corrected, radius):
         photons = self.photons[kind] * (radius / self.ladder[-1]) ** 2
-        price = ROUGH_GATHER_COST if self.session.traits.has_rough else GATHER_COST
-        return (1 + price * photons + PROBE_COST * corrected) / (1 + price * USUAL_PHOTONS)
+        return (1 + GATHER_COST * photons + PROBE_COST * corrected) / (1 + GATHER_COST * USUAL_PHOTONS)
 
     def cost_of_choice(self):
         """Relative cost of an iteration with the session's radii."""

@@ -23,10 +23,11 @@ LARGEST_SHARE = 0.08
 AT_EDGES, BY_CURVATURE = (1, 4.327), (4, 16 / 9)
 """Exponents q of the squared bias and what it is then in units of Q. At an edge a disk whose centre is u R away loses the share
 g(u) = (acos u - u sqrt(1 - u^2)) / pi, and the ratio is the integral of g(u)^2 over that of (g(u) - g(2u))^2."""
-REGAINED_BY_HALVING = 0.3655
-"""Share of what a disk loses at an edge that one of half the radius regains: the integral of g(u) (g(u) - g(2u)) over that of g(u)^2."""
-SCATTER_OF_REGAINED = 0.25
-"""How far real scenes stray from that, in its units."""
+LEAST_BIAS, MOST_BIAS = 0.003, 1.0
+"""Squared relative bias that disks of the ladder's largest radius can have, however little of it a short pilot sees. (In Cornell boxes, a
+corridor, rooms lit through a door or a window it is 0.002 to 0.04.)"""
+SHARES_STRAY = 0.3
+"""How far the share of what the correction at edges adds that plain estimates do lack strays from one, before anything was measured."""
 
 
 def ladder(points, weights):
@@ -82,21 +83,24 @@ def noise_and_difference(radii, samples, weights, at_first_vertex=True):
 
 
 def light_lost_at_edges(plain, corrected, weights):
-    """What the correction at edges adds, squared, one a radius, and the probability that plain estimates do lack it: near one where they
-    lose light at edges as the correction says, near zero where the correction (in clutter) finds edges that are none.
+    """What the correction at edges adds, squared; the share of it that plain estimates do lack, and that share's standard deviation. One a radius.
 
-    Disks of half the radius lose half as much. How much of what was added they regain, in units of what is expected at edges, is one or zero
-    under the two hypotheses; along the correction, which has little noise, that shows long before Q does.
+    As a disk grows, what the correction adds grows by a pattern over the pixels. Plain estimates lose light by the same pattern if the edges
+    are real (share one), and keep it where the correction takes clutter for edges (share zero). The share that each step of the ladder loses
+    is measured along that pattern, which has little noise, long before Q shows it; a disk lacks what all steps up to it have lost.
     `plain`, `corrected`: (iterations, radii, pixels) of the same photons.
     """
     added = corrected - plain
     squared = np.maximum(expected_products(added, added, weights), 0)
-    regained, error = with_error(plain[:, :-1] - plain[:, 1:], added[:, 1:], weights)
-    expected = REGAINED_BY_HALVING * squared[1:] + 1e-12
-    precision = 1 / ((error / expected) ** 2 + SCATTER_OF_REGAINED ** 2)
-    share = np.sum(regained / expected * precision) / np.sum(precision)
-    log_odds = (share - 0.5) / (1 / np.sum(precision) + SCATTER_OF_REGAINED ** 2)
-    return squared, float(1 / (1 + np.exp(-np.clip(log_odds, -50, 50))))
+    lost, error = with_error(plain[:, :-1] - plain[:, 1:], added[:, 1:], weights)
+    expected = np.maximum(expected_products(np.diff(added, axis=1), added[:, 1:], weights), 1e-12)
+    spread = error / expected
+    certainty = SHARES_STRAY ** 2 / (SHARES_STRAY ** 2 + spread ** 2)
+    share = np.concatenate([[1.0], 1 + certainty * (lost / expected - 1)])
+    variance = np.concatenate([[SHARES_STRAY ** 2], certainty * spread ** 2])
+    step = np.concatenate([[max(squared[0], 1e-12)], expected])
+    total = np.cumsum(step)
+    return squared, np.cumsum(step * share) / total, np.sqrt(np.cumsum(step ** 2 * variance)) / total
 
 
 def squared_bias_over_difference(exponent):
@@ -108,20 +112,21 @@ def squared_bias_over_difference(exponent):
 
 def expected_squared_bias(radii, difference, error, wanted):
     """Squared bias at the radii `wanted`, from noisy Q at the ladder: the mean over power laws Q = a R^q, each weighted by how well it
-    explains the values (flat in q between 1, edges, and 4, curvature, and in the logarithm of a).
+    explains the values (flat in q between 1, edges, and 4, curvature, and in the logarithm of the squared bias at the largest radius).
 
     Radii above the second that stands clearly out of its noise are left out: Q saturates, and small radii are what is asked for.
     """
     clear = np.flatnonzero((difference > 3 * error) & (difference > 0))
     used = slice(1, clear[1] + 1 if len(clear) > 1 else len(radii))
     slopes = np.linspace(AT_EDGES[0], BY_CURVATURE[0], 31)[:, None, None]
-    heights = np.geomspace(1e-9, 10, 200)[None, :, None]                  # Q at the largest radius
-    law = heights * (radii[used] / radii[-1]) ** slopes
+    ratio = squared_bias_over_difference(slopes)
+    heights = np.geomspace(LEAST_BIAS, MOST_BIAS, 100)[None, :, None]     # squared bias at the largest radius
+    law = heights / ratio * (radii[used] / radii[-1]) ** slopes
     spread = np.hypot(error[used], 0.15 * law) + 1e-12
     misfit = np.sum(((difference[used] - law) / spread) ** 2 + 2 * np.log(spread), axis=-1)
     weight = np.exp(-0.5 * (misfit - misfit.min()))
     weight /= weight.sum()
-    bias = squared_bias_over_difference(slopes) * heights * (wanted / radii[-1]) ** slopes
+    bias = heights * (wanted / radii[-1]) ** slopes
     return np.einsum("qh,qhr->r", weight, bias)
 
 
@@ -137,10 +142,10 @@ def best_radius(radii, plain, corrected, mean, iterations, at_first_vertex=True)
     fine = np.exp(np.linspace(np.log(radii[0]), np.log(radii[-1]), 16 * len(radii)))
     ways, best = {False: (plain, 0.0)}, plain
     if corrected is not None:
-        added, lacking = light_lost_at_edges(plain, corrected, weights)
-        added = between(fine, radii, np.maximum.accumulate(added))
-        ways = {False: (plain, lacking * added), True: (corrected, (1 - lacking) * added)}
-        best = plain + lacking * (corrected - plain)
+        added, lacking, doubt = light_lost_at_edges(plain, corrected, weights)
+        wrong = {False: lacking ** 2 + doubt ** 2, True: (1 - lacking) ** 2 + doubt ** 2}
+        ways = {way: (samples, between(fine, radii, added * wrong[way])) for way, samples in ((False, plain), (True, corrected))}
+        best = plain + lacking[:, None] * (corrected - plain)
     _, difference, error = noise_and_difference(radii, best, weights, at_first_vertex)
     blur = expected_squared_bias(radii, difference, error, fine)
     choices = []

@@ -1,0 +1,133 @@
+"""The pilot's arithmetic, on made-up pilots whose squared bias and noise are known exactly."""
+
+import numpy as np
+import pytest
+
+from mis_integrators.transport import radius
+
+RADII = 0.1 * 2.0 ** -np.arange(6, -1, -1.0)
+PIXELS = 4096
+FIVE_SIGMA = 4.9
+"""Two-sided false-alarm rate 1e-6 for a normal estimate."""
+
+
+def lost_share(u):
+    """Share of its area that a disk loses whose centre is u radii from a straight edge."""
+    u = np.clip(u, 0, 1)
+    return (np.arccos(u) - u * np.sqrt(1 - u * u)) / np.pi
+
+
+def losses(radii, reach):
+    """What the correction adds, and what plain estimates lack of it: disks larger than `reach` lose no more, because what lies beyond the edge
+    brings light too."""
+    distance = np.linspace(0, 0.5, PIXELS)
+    return lost_share(distance / radii), lost_share(distance / np.minimum(radii, reach))
+
+
+def pilot(iterations, seed, reach=np.inf, noise=0.05, curvature=0.0):
+    """Plain and corrected samples of a plane that ends at an edge.
+
+    `noise`: relative noise of the largest disks (it falls with the area); `curvature`: bias of both at the largest radius, growing as R^2.
+    """
+    rng = np.random.default_rng(seed)
+    radii = RADII[:, None]
+    added, lost = losses(radii, reach)
+    photons = rng.normal(size=(iterations, len(RADII), PIXELS)) * noise * (RADII[-1] / radii)
+    plain = 1 - lost + curvature * (radii / RADII[-1]) ** 2 + photons
+    return plain, plain + added
+
+
+def test_constants_of_edges():
+    u = (np.arange(200000) + 0.5) / 200000
+    whole, half = lost_share(u), lost_share(2 * u)
+    exponent, ratio = radius.AT_EDGES
+    assert exponent == 1
+    assert np.mean(whole ** 2) / np.mean((whole - half) ** 2) == pytest.approx(ratio, rel=1e-3)
+    exponent, ratio = radius.BY_CURVATURE                     # bias c R^2 against c (R^2 - R^2 / 4)
+    assert ratio == pytest.approx(1 / (1 - 1 / 4) ** 2) and exponent == 4
+
+
+def test_products_of_iterations_are_unbiased():
+    rng = np.random.default_rng(0)
+    truth = np.array([0.3, 1.0])[:, None] * np.ones(2000)
+    samples = truth + rng.normal(size=(5, 2, 2000))
+    value, error = radius.with_error(samples, samples, np.ones(2000))
+    spread = np.sqrt(2 / (5 * 4) / 2000 + 4 * truth[:, 0] ** 2 / (5 * 2000))
+    assert np.all(np.abs(value - truth[:, 0] ** 2) < FIVE_SIGMA * spread)
+    assert np.all(error < 4 * spread) and np.all(error > spread / 4)
+
+
+@pytest.mark.parametrize("reach", [np.inf, RADII[4]])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_share_lost_at_edges_is_found(reach, seed):
+    plain, corrected = pilot(16, seed, reach)
+    added, lost = losses(RADII[:, None], reach)
+    squared, share, doubt = radius.light_lost_at_edges(plain, corrected, np.ones(PIXELS))
+    assert squared[3:] == pytest.approx((added ** 2).mean(axis=1)[3:], rel=1e-6)
+    truth = (lost * added).mean(axis=1) / (added ** 2).mean(axis=1)
+    assert np.all(np.abs(share - truth)[-2:] < FIVE_SIGMA * doubt[-2:] + 0.05)
+    assert np.all(doubt[-2:] < 0.1)
+
+
+def test_edges_are_believed_in_without_evidence():
+    plain, corrected = pilot(3, 0, noise=30)
+    _, share, doubt = radius.light_lost_at_edges(plain, corrected, np.ones(PIXELS))
+    assert np.all(np.abs(share - 1) < 0.3) and np.all(doubt < 0.5)
+
+
+@pytest.mark.parametrize("exponent", [1, 2, 4])
+def test_squared_bias_follows_from_differences(exponent):
+    bias = 0.02 * (RADII / RADII[-1]) ** exponent
+    difference = np.concatenate([[0.0], bias[1:] / radius.squared_bias_over_difference(exponent)])
+    found = radius.expected_squared_bias(RADII, difference, 1e-3 * difference + 1e-9, RADII)
+    assert found[1:3] == pytest.approx(bias[1:3], rel=0.5)
+
+
+def test_a_blind_pilot_still_expects_blur():
+    error = np.full(len(RADII), 10.0)
+    found = radius.expected_squared_bias(RADII, np.zeros(len(RADII)), error, RADII)
+    assert radius.LEAST_BIAS < found[-1] < radius.MOST_BIAS
+    assert np.all(np.diff(found) > 0)
+
+
+@pytest.mark.parametrize("reach, corrects", [(np.inf, True), (RADII[1], False)])
+@pytest.mark.parametrize("count", [10, 100])
+def test_choice_is_nearly_the_best(reach, corrects, count):
+    """The true error of the choice stays within 1.25 times that of the best radius and way, in the geometric mean over twelve pilots of three
+    iterations each."""
+    noise, curvature = 0.02, 0.08
+
+    def true_error(r, way):
+        added, lost = losses(r, reach)
+        bias = curvature * (r / RADII[-1]) ** 2 - lost + way * added
+        return np.mean(bias ** 2) + (noise * RADII[-1] / r) ** 2 / count
+
+    best = min(true_error(r, way) for r in np.geomspace(RADII[0], RADII[-1], 60) for way in (False, True))
+    ratios, ways = [], []
+    for seed in range(12):
+        plain, corrected = pilot(3, seed, reach, noise, curvature)
+        chosen, way = radius.best_radius(RADII, plain, corrected, np.ones(PIXELS), lambda r, corrected: count * np.ones_like(r))
+        ratios.append(true_error(chosen, way) / best)
+        ways.append(way)
+    assert np.exp(np.mean(np.log(ratios))) < 1.25
+    assert round(np.mean(ways)) == corrects
+
+
+def test_more_iterations_mean_smaller_radii():
+    plain, corrected = pilot(4, 0, curvature=0.05)
+    chosen = [radius.best_radius(RADII, plain, corrected, np.ones(PIXELS), lambda r, way, n=n: n * np.ones_like(r))[0] for n in (1, 30, 1000)]
+    assert chosen[0] > chosen[1] > chosen[2]
+
+
+def test_noise_of_small_disks_is_what_large_ones_saw():
+    """One bright photon that only the largest disk met counts for the smaller ones too."""
+    seen = np.array([0.0, 0.0, 1.0])
+    radii = np.array([1.0, 2.0, 4.0])
+    assert radius.noise_of_photons(radii, seen, 0.0) == pytest.approx([16.0, 4.0, 1.0])
+
+
+def test_ladder_needs_vertices():
+    assert radius.ladder(np.zeros((3, 5)), np.zeros(5)) is None
+    points = np.random.default_rng(0).uniform(size=(3, 1000))
+    steps = radius.ladder(points, np.ones(1000))
+    assert steps[-1] == pytest.approx(0.08 * 0.96, rel=0.05) and np.allclose(steps[1:] / steps[:-1], 2)
