@@ -13,6 +13,7 @@ mi.set_variant("llvm_ad_rgb")
 
 import compare  # noqa: E402
 import converge  # noqa: E402
+import costs  # noqa: E402
 import freezing  # noqa: E402
 import multiview  # noqa: E402
 import opinions  # noqa: E402
@@ -113,6 +114,9 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument("--seeds", type=int, default=8, help="renders of each, at least two (default: 8)")
     command.add_argument("--scale", type=float, default=1, help="film size, scene's own = 1 (default: 1)")
     command.add_argument("--charts", action="store_true", help="draw the shifted densities (needs matplotlib)")
+
+    command = _measuring(commands, "costs", costs)
+    command.add_argument("--scale", type=float, default=1, help="film size, scene's own = 1 (default: 1)")
 
     for name, function in (("freeze-scenes", freezing.freeze), ("check-scenes", freezing.check)):
         command = commands.add_parser(name, help=function.__doc__, description=function.__doc__)

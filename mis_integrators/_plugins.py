@@ -15,11 +15,12 @@ _PACKAGE = "mis_integrators.integrators"
 
 # Modules to load anew for a variant, those that others import first.
 MODULES: tuple[str, ...] = ("common", "bdpm", "weighted", "bdpm_balance", "bdpm_opt", "bdpt", "vcm", "resampled", "bdpt_ris",
-                            "volpath_multiview")
+                            "volpath_multiview", "unidirectional", "choice", "bdpm_auto")
 
 # Plugin name -> (module, class)
 PLUGINS: dict[str, tuple[str, str]] = {
     "bdpm": ("bdpm", "BDPM"),
+    "bdpm_auto": ("bdpm_auto", "BDPMAuto"),
     "bdpm_balance": ("bdpm_balance", "BDPMBalance"),
     "bdpm_opt": ("bdpm_opt", "BDPMOpt"),
     "bdpm_opt2": ("bdpm_opt", "BDPMOpt2"),

@@ -134,6 +134,8 @@ class BDPMSession(IterativeSession):
         self.radii = {kind: integrator.initial_radius for kind in self.kinds()} if integrator.initial_radius else None
         self.corrected = {kind: False for kind in self.kinds()}
         self.seconds = None
+        self.forecast = self.judged_by = None      # what the pilot expects, and the image (of its pixels) that errors are relative to
+        self.photons_found = 0                     # by the last light pass
         self._sized = False
         self.recorded = recorder()
         self._freeze()
@@ -147,6 +149,11 @@ class BDPMSession(IterativeSession):
         radii = {f"radius.{kind}": radius for kind, radius in (self.radii or {}).items()}
         corrected = {f"edge_correction.{kind}": flag for kind, flag in self.corrected.items()}
         return {**super().settings, "photon_count": self.light_paths, **radii, **corrected}
+
+    @property
+    def last_vertex(self):
+        """The smooth camera vertex, counted from 0, beyond which no camera path is shaded."""
+        return self.integrator.bdd
 
     def kinds(self):
         """Photon maps that the scene needs."""
@@ -244,7 +251,7 @@ class BDPMSession(IterativeSession):
         while True:
             photons = self._light_pass(self.scene, self.sensor, self._tables, self._seed(iteration, LIGHT), spectral)
             dr.eval(photons)
-            found = int(photons[2][0])
+            found = self.photons_found = int(photons[2][0])
             room = rounded_up(found + found // 8 + 1024)
             spare = self.photon_capacity - 2 * room
             if found <= self.photon_capacity and (self._sized or spare < SPARE_PHOTONS):
@@ -256,7 +263,7 @@ class BDPMSession(IterativeSession):
     def _start(self):
         """What must be known before the first iteration."""
         if self.radii is None:
-            choose_radii(self)
+            self.forecast = choose_radii(self)
 
     def _iteration(self, iteration):
         self._start()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
@@ -11,7 +12,7 @@ import numpy as np
 
 from ..transport.camera_pass import film_sample_count
 from ..transport.gather import mean_photon_count
-from ..transport.radius import best_radius, ladder
+from ..transport.radius import best_radius, ladder, relative_weights, usual_mean
 
 PILOT_PIXELS = 4096
 FEWEST_ITERATIONS, FEWEST_TIMED_ITERATIONS, MOST_ITERATIONS = 4, 3, 16
@@ -31,10 +32,11 @@ USUAL_PHOTONS = 10
 
 
 def choose_radii(session):
-    """Sets `session.radii` and `session.corrected` for each kind of photon map that the session needs."""
+    """Sets `session.radii` and `session.corrected` for each kind of photon map that the session needs; returns what is expected of them (a
+    `Forecast`), or `None` where there are no photons to gather."""
     session.radii = {}
     if not session.kinds():
-        return
+        return None
     pilot = Pilot(session)
     count = session.iterations_planned or UNPLANNED_ITERATIONS
     started = time.perf_counter()
@@ -48,9 +50,9 @@ def choose_radii(session):
             over = done + 1 >= max(PILOT_SHARE * count, FEWEST_ITERATIONS)
         if over or pilot.ladder is None:
             break
-    pilot.decide(count)
+    choices = pilot.decide(count)
     if session.seconds is None:
-        return
+        return pilot.forecast(choices, count)
     seconds = now - start                                      # a pilot iteration takes about as long as one of the render
     if now - started < 2 * PILOT_SHARE * session.seconds:
         start = time.perf_counter()
@@ -59,9 +61,41 @@ def choose_radii(session):
         seconds = time.perf_counter() - start
     left = session.seconds - (time.perf_counter() - started)
     decided = dict(session.corrected)
-    pilot.decide(max(left / seconds * pilot.cost_of_choice(), 1))
+    count = max(left / seconds * pilot.cost_of_choice(), 1)
+    choices = pilot.decide(count)
     if session.corrected != decided:
         session._freeze()
+    return pilot.forecast(choices, count)
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """What a pilot expects of a session's iterations; errors are relative, by `relative_weights` of `mean`."""
+
+    squared_bias: float
+    variance: float
+    """Of one iteration, direct light included."""
+    gathered: float
+    """Photons within a vertex's merge disks."""
+    count: float
+    """Iterations of usual cost that were planned for."""
+    mean: np.ndarray
+    """(pixels,)"""
+    caustic_share: float
+    """Share of the light that caustic photons bring."""
+    iterations: int
+    """Of the pilot."""
+
+
+def pilot_pixels(session):
+    """`(stride, count)`: the pilot's pixels are numbers 0, stride, 2 stride, ... of the film's."""
+    pixels = film_sample_count(session.sensor)
+    count = min(pixels, PILOT_PIXELS)
+    stride = pixels // count
+    width = int(session.sensor.film().crop_size()[0])
+    while stride > 1 and math.gcd(stride, width) > 1:          # else the pixels would stand in columns
+        stride -= 1
+    return stride, count
 
 
 class Pilot:
@@ -73,12 +107,7 @@ class Pilot:
 
     def __init__(self, session):
         self.session = session
-        pixels = film_sample_count(session.sensor)
-        self.paths = min(pixels, PILOT_PIXELS)
-        stride = pixels // self.paths
-        width = int(session.sensor.film().crop_size()[0])
-        while stride > 1 and math.gcd(stride, width) > 1:      # else the pixels would stand in columns
-            stride -= 1
+        stride, self.paths = pilot_pixels(session)
         self.stride = stride * session.integrator.camera_paths
         self.ladder = None
         # Caustics have edges of their own; only the smooth indirect light gains from knowing the surfaces' edges, and only where the camera
@@ -149,8 +178,24 @@ class Pilot:
             self.photons[kind] = mean_photon_count(photon_map, vertices, radius)
 
     def _cost(self, kind, corrected, radius):
-        photons = self.photons[kind] * (radius / self.ladder[-1]) ** 2
+        photons = self.gathered(kind, radius)
         return (1 + GATHER_COST * photons + PROBE_COST * corrected) / (1 + GATHER_COST * USUAL_PHOTONS)
+
+    def forecast(self, choices, count):
+        """The `Forecast` for these choices; `None` if no camera path meets a surface that gathers."""
+        if self.ladder is None:
+            return None
+        mean = self.mean()
+        direct = usual_mean(relative_weights(mean) * np.var(self.direct, axis=0, ddof=1)) if len(self.direct) > 1 else np.inf
+        session, middle = self.session, self.samples.get(("caustic", False))
+        caustics = np.mean([step[len(self.ladder) * 2 // 3] for step in middle]) if middle else 0.0
+        return Forecast(sum(choice.squared_bias for choice in choices.values()), direct + sum(choice.variance for choice in choices.values()),
+                        sum(self.gathered(kind, session.radii[kind]) for kind in choices), count, mean,
+                        float(caustics / max(np.mean(mean), 1e-30)), len(self.direct))
+
+    def gathered(self, kind, radius):
+        """Photons of a kind within `radius` of a vertex, on average."""
+        return self.photons[kind] * (radius / self.ladder[-1]) ** 2
 
     def cost_of_choice(self):
         """Relative cost of an iteration with the session's radii."""
@@ -158,15 +203,25 @@ class Pilot:
                     if kind in self.photons), default=1.0)
 
     def decide(self, count):
-        """Sets the session's radii and corrections for `count` iterations of usual cost."""
+        """Sets the session's radii and corrections for `count` iterations of usual cost; returns the choice for each kind of photons."""
         session = self.session
         if self.ladder is None:
             session.radii = {kind: 1e-3 * float(dr.norm(session.traits.bounds.extents())) for kind in self.ways}
-            return
+            return {}
         samples = {key: np.array(values) for key, values in self.samples.items()}
+        choices = {kind: best_radius(
+            self.ladder, samples[kind, False], samples.get((kind, True)), self.mean(),
+            lambda radius, corrected, kind=kind: np.maximum(count / self._cost(kind, corrected, radius), 1), self.at_first_vertex)
+            for kind in self.ways}
+        session.radii = {kind: choice.radius for kind, choice in choices.items()}
+        session.corrected.update({kind: choice.correct for kind, choice in choices.items()})
+        return choices
+
+    def mean(self):
+        """The pilot's pixels, gathered at a middling radius: (pixels,), or those that the session is to be judged by."""
+        if self.session.judged_by is not None:
+            return self.session.judged_by
+        if self.ladder is None:
+            return np.mean(self.direct, axis=0)
         middle = len(self.ladder) * 2 // 3
-        mean = np.mean(self.direct, axis=0) + sum(samples[kind, False][:, middle].mean(axis=0) for kind in self.ways)
-        for kind in self.ways:
-            session.radii[kind], session.corrected[kind] = best_radius(
-                self.ladder, samples[kind, False], samples.get((kind, True)), mean,
-                lambda radius, corrected, kind=kind: np.maximum(count / self._cost(kind, corrected, radius), 1), self.at_first_vertex)
+        return np.mean(self.direct, axis=0) + sum(np.mean([step[middle] for step in self.samples[kind, False]], axis=0) for kind in self.ways)

@@ -32,6 +32,10 @@ class WeightedSession(BDPMSession):
         self._weighted = False
         super().__init__(integrator, scene, sensor, seed, iterations)
 
+    @property
+    def last_vertex(self):
+        return self.integrator.first_vertex + (self.integrator.strategies - 1 if self._weighted else 0)
+
     def mixes(self):
         """Whether the scene has paths that several strategies make."""
         return True

@@ -14,6 +14,8 @@ relative terms, pixel by pixel.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 LADDER_STEPS = 7
@@ -26,6 +28,8 @@ g(u) = (acos u - u sqrt(1 - u^2)) / pi, and the ratio is the integral of g(u)^2 
 LEAST_BIAS, MOST_BIAS = 0.003, 1.0
 """Squared relative bias that disks of the ladder's largest radius can have, however little of it a short pilot sees. (In Cornell boxes, a
 corridor, rooms lit through a door or a window it is 0.002 to 0.04.)"""
+RARE_PIXELS = 0.005
+"""Share of the pixels that direct light's noise is judged without."""
 SHARES_STRAY = 0.3
 """How far the share of what the correction at edges adds that plain estimates do lack strays from one, before anything was measured."""
 
@@ -130,13 +134,28 @@ def expected_squared_bias(radii, difference, error, wanted):
     return np.einsum("qh,qhr->r", weight, bias)
 
 
+def usual_mean(values):
+    """Mean over pixels without the largest `RARE_PIXELS` of them: one pixel at the edge of a lamp can outweigh all others."""
+    kept = np.sort(values)[:max(int(round(len(values) * (1 - RARE_PIXELS))), 1)]
+    return float(np.mean(kept))
+
+
+class Choice(NamedTuple):
+    """A radius, whether to correct estimates at edges, and what to expect then, in relative terms."""
+
+    radius: float
+    correct: bool
+    squared_bias: float
+    variance: float
+    """Of one iteration."""
+
+
 def best_radius(radii, plain, corrected, mean, iterations, at_first_vertex=True):
-    """The radius that minimises the predicted relative error, and whether to correct the estimate at edges.
+    """The `Choice` that minimises the predicted relative error.
 
     `radii`: the ladder; `plain`, `at_first_vertex`: see `noise_and_difference`; `corrected`: the same samples corrected at edges, or `None`;
     `mean`: (pixels,) mean radiance; `iterations(R, corrected)`: how many iterations there will be, so that larger gathers and the correction are
     charged for.
-    Returns `(radius, correct)`.
     """
     weights = relative_weights(mean)
     fine = np.exp(np.linspace(np.log(radii[0]), np.log(radii[-1]), 16 * len(radii)))
@@ -150,12 +169,12 @@ def best_radius(radii, plain, corrected, mean, iterations, at_first_vertex=True)
     blur = expected_squared_bias(radii, difference, error, fine)
     choices = []
     for way, (samples, edges) in ways.items():
-        variance, *_ = noise_and_difference(radii, samples, weights, at_first_vertex)
-        predicted = blur + edges + between(fine, radii, variance) / iterations(fine, way)
+        variance = between(fine, radii, noise_and_difference(radii, samples, weights, at_first_vertex)[0])
+        bias = blur + edges
+        predicted = bias + variance / iterations(fine, way)
         at = int(np.argmin(predicted))
-        choices.append((float(predicted[at]), float(fine[at]), way))
-    _, radius, way = min(choices)
-    return radius, way
+        choices.append((float(predicted[at]), Choice(float(fine[at]), way, float(bias[at]), float(variance[at]))))
+    return min(choices)[1]
 
 
 def between(wanted, radii, values):

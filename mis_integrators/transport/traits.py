@@ -121,13 +121,17 @@ def check_variant(scene, plugin):
                                f'({mi.variant()}); load it again after mi.set_variant()')
 
 
+def has_media(scene):
+    """Whether there are participating media in the scene."""
+    return any(isinstance(o, mi.Medium) for o in scene_objects(scene)) or any(s.is_medium_transition() for s in scene.shapes())
+
+
 def check_scene(scene, sensor, plugin):
     """Raises `UnsupportedScene` for what the surface integrators cannot render, before any sampling."""
     if mi.is_polarized:
         raise UnsupportedScene(f'{plugin}: polarised variants are not supported (active: {mi.variant()}); use an unpolarised '
                                'one such as "llvm_ad_rgb"')
-    objects = scene_objects(scene)
-    if any(isinstance(o, mi.Medium) for o in objects) or any(s.is_medium_transition() for s in scene.shapes()):
+    if has_media(scene):
         raise UnsupportedScene(f'{plugin}: participating media are not supported by this surface integrator; use "volpath"')
     check_emitters(scene, plugin)
     if mi.has_flag(sensor.film().flags(), mi.FilmFlags.Special):

@@ -1,0 +1,93 @@
+"""Plugin `bdpm_auto`: decides from the scene and a short pilot which integrator of this package, or Mitsuba's `path`, renders it."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+
+from ..transport.traits import check_scene, has_media
+from ..volume.traits import check_volume_scene
+from .choice import choose, handed_on
+from .common import IterativeIntegrator, IterativeSession
+
+
+class BDPMAuto(IterativeIntegrator):
+    r"""
+    .. _integrator-bdpm_auto:
+
+    Whatever suits the scene (:monosp:`bdpm_auto`)
+    ----------------------------------------------
+
+    .. pluginparameters::
+
+     * - camera_paths
+       - |int|
+       - Camera paths per pixel and iteration. (Default: 1)
+     * - variance
+       - |bool|
+       - Adds the channels ``var.R``, ``var.G``, ``var.B`` (mono: ``var.Y``): the estimated variance of the pixel mean over the
+         iterations, of which there must be two at least. (Default: no, i.e. |false|)
+     * - max_depth
+       - |int|
+       - Longest path in segments, both halves together (-1: unlimited). A value of 1 shows only directly visible emitters, 2 adds
+         direct light, and so on. (Default: -1)
+     * - rr_depth
+       - |int|
+       - Depth from which Russian roulette may end a sub-path, in each half. (Default: 5)
+     * - hide_emitters
+       - |bool|
+       - Hide directly visible emitters. (Default: no, i.e. |false|)
+
+    Chooses among ``path``, ``bdpm`` and ``bdpm_opt`` with two or three strategies: those that can see all the light of the scene are tried on a few
+    thousand pixels for a few iterations, and the one of which the least error is expected in the time that is planned renders the image. What an
+    iteration costs is counted (segments, photons) and priced, not clocked. Scenes with media are rendered by ``volpath_multiview``.
+
+    The settings of the image (in the EXR's header, and printed by ``mis-render``) say which integrator was chosen and why, with its prediction; that
+    integrator with the same seed and the same number of samples makes the same image.
+
+    .. tabs::
+        .. code-tab:: xml
+
+            <integrator type="bdpm_auto"/>
+
+        .. code-tab:: python
+
+            'type': 'bdpm_auto'
+    """
+
+    def check(self, scene, sensor):
+        if has_media(scene):
+            check_volume_scene(scene, self.plugin)
+        else:
+            check_scene(scene, sensor, self.plugin)
+
+    def new_session(self, scene, sensor, seed, iterations):
+        if has_media(scene):
+            volumetric = mi.load_dict({"type": "volpath_multiview", **handed_on(self)})
+            return volumetric.session(scene, sensor, seed, (iterations or 0) * self.camera_paths)
+        return AutoSession(self, scene, sensor, seed, iterations)
+
+
+class AutoSession(IterativeSession):
+    """Iterations of the integrator that is chosen before the first one."""
+
+    def __init__(self, integrator, scene, sensor, seed, iterations):
+        super().__init__(integrator, scene, sensor, seed, iterations)
+        self.seconds = self.decision = None
+
+    def plan_time(self, seconds):
+        """Rendering will last `seconds`: the choice is for as many iterations as fit."""
+        self.seconds = seconds
+
+    @property
+    def settings(self):
+        if self.decision is None:
+            return super().settings
+        chosen = self.decision.session.settings
+        return {**chosen, "integrator": self.integrator.plugin, "choice": chosen["integrator"],
+                **{f"choice.because.{number}": reason for number, reason in enumerate(self.decision.reasons, 1)},
+                **{f"choice.relmse.{name}": error for name, error in self.decision.errors.items()}}
+
+    def _iteration(self, iteration):
+        if self.decision is None:
+            self.decision = choose(self.integrator, self.scene, self.sensor, self.seed, self.iterations_planned, self.seconds)
+        return self.decision.session._iteration(iteration)

@@ -1,0 +1,174 @@
+"""The choice of `bdpm_auto`: which integrator will have the least error in the time that there is, predicted from a pilot.
+
+Every candidate is tried on the same few thousand pixels. Its error after n iterations is its squared bias (the blur of the photons' disks) plus its
+variance over n, both relative and pixel by pixel (`transport.radius`); n follows from what an iteration costs (`costs`). Candidates that cannot see
+some of the light are not tried.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..transport.census import mean_segments
+from ..transport.radius import relative_weights, usual_mean
+from . import costs
+from .pilot import FEWEST_ITERATIONS, PILOT_INDEX, UNPLANNED_ITERATIONS, pilot_pixels
+from .unidirectional import PathSession
+
+PHOTON_MAPPERS = (("bdpm", {"bdd": 0}), ("bdpm_opt2", {}), ("bdpm", {"bdd": 1}), ("bdpm_opt3", {}))
+"""In the order in which they are tried while the pilot's share of the time lasts: those first that are most often the best."""
+PILOT_SHARE = 0.05
+"""Share of the planned time that the pilot may have; `path` and the first photon mapper are tried however long that takes."""
+PATH_TRIALS = 12
+UNSEEN = 1e-3
+"""Share of the light, brought by caustics, from which on a `path` that cannot see them is out of the question."""
+RARE = 0.02
+"""The same for a `path` that meets them by chance only: so seldom that a pilot does not see how noisy they are."""
+
+
+@dataclass
+class Decision:
+    """The session that renders, why it does, and all that were tried."""
+
+    session: object
+    reasons: list[str]
+    trials: list[Trial] = field(default_factory=list)
+    usual_cost: float = 0.0
+    """Of an iteration of the first photon mapper, a pixel; the time planned for is counted in those."""
+    budget: float = 0.0
+    """The cost a pixel that errors are predicted for."""
+
+    @property
+    def errors(self):
+        return {trial.name: trial.error(self.budget) for trial in self.trials}
+
+
+@dataclass
+class Trial:
+    """What the pilot tells of one candidate."""
+
+    name: str
+    session: object
+    squared_bias: float
+    variance: float
+    cost: float
+    """Of one iteration, a pixel."""
+
+    def error(self, budget):
+        """Relative mean squared error when the cost a pixel is `budget`."""
+        return self.squared_bias + self.variance * self.cost / budget
+
+
+def handed_on(integrator):
+    """The parameters that every integrator of this package shares."""
+    return {name: getattr(integrator, name) for name in ("max_depth", "rr_depth", "hide_emitters", "camera_paths", "variance")}
+
+
+def name_of(plugin, parameters):
+    """A candidate's name: its plugin, and how it differs from the plugin's defaults."""
+    return " ".join([plugin, *(f"{name}={value}" for name, value in parameters.items())])
+
+
+def choose(integrator, scene, sensor, seed, iterations, seconds):
+    """The `Decision` for a render of so many iterations, or of so many seconds (either may be `None`)."""
+    path = PathSession(integrator, scene, sensor, seed, iterations)
+    plugin, parameters = PHOTON_MAPPERS[0]
+    first = _session(plugin, parameters, integrator, scene, sensor, seed, iterations)
+    if not first.kinds():
+        return Decision(path, [_no_photons(integrator, first)])
+    first.seconds = seconds
+    first._start()
+    forecast = first.forecast
+    if forecast is None:
+        return Decision(path, ["path: no camera path meets a surface that scatters smoothly"])
+
+    stride, pixels = pilot_pixels(path)
+    segments = mean_segments(scene, sensor, seed, stride * integrator.camera_paths, pixels, integrator.max_depth, integrator.rr_depth)
+    usual = costs.cost(plugin, costs.events(first, segments, first.last_vertex, forecast.gathered))
+    budget = (forecast.count if seconds else iterations or UNPLANNED_ITERATIONS) * usual
+    trials, reasons, spent = [_trial(plugin, parameters, first, segments)], [], _pilot_cost(first, segments)
+    blind = _why_not_path(first, forecast)
+    if blind:
+        reasons.append(blind)
+    else:
+        trials.insert(0, _try_path(path, segments, stride, pixels, forecast.mean))
+    for plugin, parameters in PHOTON_MAPPERS[1:]:
+        name = name_of(plugin, parameters)
+        if plugin.startswith("bdpm_opt") and not first.traits.has_rough:
+            reasons.append(f"not {name}: all smooth surfaces are diffuse, where one strategy does as well")
+            continue
+        if plugin == "bdpm_opt3" and not first.traits.has_mixed and trials[-1].name.endswith("bdd=1") and _worse(trials, budget):
+            reasons.append(f"not {name}: merging at the second vertex does not pay, let alone at the third")
+            continue
+        if spent + FEWEST_ITERATIONS * usual * 0.5 > PILOT_SHARE * budget:
+            reasons.append(f"not {name}: trying it would take more than {PILOT_SHARE:.0%} of the time")
+            continue
+        session = _session(plugin, parameters, integrator, scene, sensor, seed, max(int(budget / usual), 1))
+        session.judged_by = forecast.mean
+        session._start()
+        if session.forecast is None:
+            continue
+        trials.append(_trial(plugin, parameters, session, segments))
+        spent += _pilot_cost(session, segments)
+    best = min(trials, key=lambda trial: trial.error(budget))
+    reasons.insert(0, f"{best.name}: least predicted error in this time; bias {best.squared_bias:.2g}, noise "
+                      f"{best.variance * best.cost / budget:.2g} (squared, relative)")
+    best.session.iterations_planned = iterations
+    return Decision(best.session, reasons, trials, usual, budget)
+
+
+def _session(plugin, parameters, integrator, scene, sensor, seed, iterations):
+    made = mi.load_dict({"type": plugin, **handed_on(integrator), **parameters})
+    return made.new_session(scene, sensor, seed, iterations)
+
+
+def _no_photons(integrator, session):
+    if session.lights.dark:
+        return "path: the scene has no light"
+    return f"path: light of at most {integrator.max_depth} segments needs no photons"
+
+
+def _why_not_path(session, forecast):
+    """Why `path` is not tried, in one line; `None` if it is."""
+    if not session.has_caustics:
+        return None
+    if not session.traits.has_light_surfaces or session.lights.needs_photons_for_direct_light():
+        if forecast.caustic_share > UNSEEN:
+            return f"not path: it cannot see the caustics, {forecast.caustic_share:.1%} of the light"
+    elif forecast.caustic_share > RARE:
+        return f"not path: it would meet the caustics, {forecast.caustic_share:.1%} of the light, by chance only"
+    return None
+
+
+def _trial(plugin, parameters, session, segments):
+    forecast = session.forecast
+    counted = costs.events(session, segments, session.last_vertex, forecast.gathered)
+    return Trial(name_of(plugin, parameters), session, forecast.squared_bias, forecast.variance, costs.cost(plugin, counted))
+
+
+def _pilot_cost(session, segments):
+    """What a session's pilot took, a pixel: its light passes are whole, its camera paths few."""
+    _, light, _, _ = costs.events(session, segments, session.last_vertex, 0.0)
+    plugin = session.integrator.plugin
+    return session.forecast.iterations * costs.cost(plugin, (0.0, light, 0.0, 1.0))
+
+
+def _try_path(path, segments, stride, pixels, mean):
+    """`path` on the pilot's pixels."""
+    values = []
+    for number in range(PATH_TRIALS):
+        number += PILOT_INDEX
+        radiance, *_ = path.trace(number, 0, mi.UInt32(0), stride * path.samples_per_iteration, pixels, path._spectral(number))
+        values.append(np.broadcast_to(np.array(dr.mean(radiance)), pixels))
+    path.sampler.seed(0, 1)
+    variance = usual_mean(relative_weights(mean) * np.var(values, axis=0, ddof=1))
+    return Trial("path", path, 0.0, variance, costs.cost("path", costs.events(path, segments, None, 0.0)))
+
+
+def _worse(trials, budget):
+    """Whether the last trial is worse than the best by more than a pilot may err."""
+    return trials[-1].error(budget) > 2 * min(trial.error(budget) for trial in trials)

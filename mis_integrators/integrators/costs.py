@@ -1,0 +1,31 @@
+"""What an iteration costs: prices of events, counted and not clocked, so that a decision does not hang on how busy a machine is.
+
+The unit is the cost of one segment of Mitsuba's `path` (a ray, its surface, a shadow ray). The prices in `costs.json` were fitted to the bundled
+scenes by ``benchmarks/run.py costs``.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+EVENTS = ("camera", "light", "gathered", "pixel")
+"""A pixel's camera segments, light segments, and photons within its merge disk; and what does not depend on any of them."""
+PRICES = json.loads(Path(__file__).with_name("costs.json").read_text())
+
+
+def events(session, segments, last_vertex, gathered):
+    """Events of one iteration a pixel, in the order of `EVENTS`.
+
+    `segments`: `transport.census.mean_segments`; `last_vertex`: the last smooth vertex that shades (`None`: all); `gathered`: photons within a
+    vertex's merge disks.
+    """
+    camera = float(sum(segments if last_vertex is None else segments[:last_vertex + 1]))
+    paths = getattr(session, "light_paths", 0)
+    light = (paths + getattr(session, "photons_found", 0)) / session.path_count
+    return camera * session.integrator.camera_paths, light, gathered * session.integrator.camera_paths, 1.0
+
+
+def cost(plugin, counted):
+    """Cost of an iteration of `plugin` with these events a pixel, in segments of `path`."""
+    return sum(PRICES[plugin][name] * count for name, count in zip(EVENTS, counted))

@@ -1,0 +1,57 @@
+"""Mitsuba's `path` as iterations like those of this package: same films, same variance channels, same seeds."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from ..transport.camera_pass import film_sample_count, start_camera_paths
+from ..transport.film import shared_wavelengths, splat_samples
+from ..transport.random import mix
+from .common import IterativeSession
+
+CHUNK = 1 << 21
+"""Camera paths traced at once at most (bounds memory)."""
+PATHS, WAVELENGTH, SAMPLER = range(3)
+"""Purposes of an iteration's random seeds."""
+
+
+class PathSession(IterativeSession):
+    """Iterations of `path`: `camera_paths` samples a pixel each."""
+
+    def __init__(self, integrator, scene, sensor, seed, iterations):
+        super().__init__(integrator, scene, sensor, seed, iterations)
+        self.path_integrator = mi.load_dict({"type": "path", "max_depth": integrator.max_depth, "rr_depth": integrator.rr_depth,
+                                  "hide_emitters": integrator.hide_emitters})
+        self.sampler = mi.load_dict({"type": "independent"})
+        self.path_count = film_sample_count(sensor) * integrator.camera_paths
+        self.chunks = -(-self.path_count // CHUNK)
+        self.chunk = -(-self.path_count // self.chunks)
+
+    @property
+    def settings(self):
+        return {**super().settings, "integrator": "path"}
+
+    def trace(self, iteration, chunk, first, stride, paths, spectral):
+        """Radiance and alpha of camera paths `first`, `first + stride`, ..., and their positions on the film."""
+        seed = self._seed(iteration, PATHS)
+        _, active, _, ray, weight, position, _ = start_camera_paths(
+            self.sensor, seed, first, stride, paths, self.integrator.camera_paths, spectral["sample"])
+        differential = mi.RayDifferential3f(ray)
+        self.sampler.seed(self._seed(iteration, SAMPLER, chunk), paths)
+        radiance, valid, _ = self.path_integrator.sample(self.scene, self.sampler, differential, None, active)
+        return dr.select(active, weight * radiance, 0), dr.select(valid, mi.Float(1), 0), position, active
+
+    def _spectral(self, iteration):
+        return shared_wavelengths(self.sensor, mix(self.seed, iteration, WAVELENGTH))
+
+    def _iteration(self, iteration):
+        spectral, total = self._spectral(iteration), None
+        for chunk in range(self.chunks):
+            first = dr.opaque(mi.UInt32, chunk * self.chunk)
+            radiance, alpha, position, active = self.trace(iteration, chunk, first, 1, self.chunk, spectral)
+            block = splat_samples(self.sensor.film(), position, radiance, alpha, spectral["matrix"], active)
+            total = block if total is None else total + block
+        # Else the sampler's unused final state would be computed with the next iteration, by tracing these paths again.
+        self.sampler.seed(0, 1)
+        return total
