@@ -22,6 +22,7 @@ import references  # noqa: E402
 import stability  # noqa: E402
 import throughput  # noqa: E402
 import variance  # noqa: E402
+import view_counts  # noqa: E402
 from methods import COMPARED, VARIED, parse_method, registered  # noqa: E402
 from scene_files import bundled  # noqa: E402
 from sweeps import SWEEPS  # noqa: E402
@@ -61,6 +62,7 @@ def _parser() -> argparse.ArgumentParser:
     _variance(command, 16)
     _sweeps(command, 0.4)
     command.add_argument("--every-value", dest="coarse", action="store_false", help="all values of the sweeps instead of every other")
+    _views(command, view_counts.COUNTS, 0.8, 3)
 
     command = _measuring(commands, "compare", compare)
     _renders(command, 10)
@@ -114,6 +116,9 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument("--scale", type=float, default=1, help="film size, scene's own = 1 (default: 1)")
     command.add_argument("--charts", action="store_true", help="draw the shifted densities (needs matplotlib)")
 
+    command = _measuring(commands, "views", view_counts, scenes=False)
+    _views(command, view_counts.COUNTS, 2.0, 6)
+
     for name, function in (("freeze-scenes", freezing.freeze), ("check-scenes", freezing.check)):
         command = commands.add_parser(name, help=function.__doc__, description=function.__doc__)
         command.set_defaults(run=function)
@@ -155,6 +160,18 @@ def _sweeps(command: argparse.ArgumentParser, seconds: float) -> None:
                          help=f"rendering seconds of each point (default: {seconds})")
     command.add_argument("--room-reference-time", type=float, default=10, metavar="SECONDS",
                          help="rendering seconds of each of the two references of the scene swept (default: 10)")
+
+
+def _views(command: argparse.ArgumentParser, counts: tuple[int, ...], seconds: float, seeds: int) -> None:
+    """Which numbers of views of which scenes are compared, and how carefully."""
+    command.add_argument("--view-scenes", nargs="*", type=Path, default=view_counts.SCENES, metavar="FILE.xml",
+                         help="scenes with several views (default: the bundled ones whose views overlap)")
+    command.add_argument("--view-counts", nargs="+", type=int, default=list(counts), metavar="N",
+                         help=f"how many of their views (default: {' '.join(map(str, counts))})")
+    command.add_argument("--view-weights", nargs="+", default=["mis"], metavar="WEIGHTS", help="weights of volpath_multiview (default: mis)")
+    command.add_argument("--view-time", type=float, default=seconds, metavar="SECONDS", help=f"rendering seconds of each (default: {seconds})")
+    command.add_argument("--view-seeds", type=int, default=seeds, metavar="N", help=f"renders of each, at least two (default: {seeds})")
+    command.add_argument("--view-scale", type=float, default=0.5, metavar="SCALE", help="film size, scene's own = 1 (default: 0.5)")
 
 
 def _renders(command: argparse.ArgumentParser, seconds: float | None) -> None:
