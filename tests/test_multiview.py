@@ -183,7 +183,7 @@ def test_hostile_views(rgb):
     room = {"type": "cube", "to_world": mi.ScalarTransform4f().translate([0, 0, 3.2]).scale([2.0, 1.0, 2.0]), "bsdf": {"type": "null"},
             "interior": {"type": "ref", "id": "fog"}}
     inside = view((0, 0.2, 3.4)) | {"medium": {"type": "ref", "id": "fog"}}
-    near = view((0.8, 0.3, 7.0), fov=30.0, near_clip=5.5) | {"medium": {"type": "ref", "id": "fog"}}       # its near plane stands in the fog
+    near = view((0.8, 0.3, 7.0), fov=19.0, near_clip=5.0) | {"medium": {"type": "ref", "id": "fog"}}       # its near plane stands in the fog
     half = view((-2.5, 0.8, 6.0), (-0.8, 0, 0), fov=20.0)
     scene = world(None, smoke, fog=fog, room=room, a=inside, b=near, c=half,
                   ball={"type": "sphere", "radius": 0.3, "center": [0.3, 0, 0.4], "bsdf": {"type": "roughconductor", "alpha": 0.08}})
