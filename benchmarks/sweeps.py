@@ -94,7 +94,7 @@ class Sweep:
 
 OF_VIEWS = {"scene": smoke_views, "reference": "volpath", "labels": (
     "volpath", "volpath_multiview", "volpath_multiview:weights=power", "volpath_multiview:weights=mwis", "volpath_multiview:weights=none",
-    "volpath_multiview:shift=raw_depth", "volpath_multiview:shift=majorant_optical_depth_copy")}
+    "volpath_multiview:shift=majorant_optical_depth_copy")}
 """Sweeps of several views: what is compared is how they share paths."""
 
 SWEEPS = (
