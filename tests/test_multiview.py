@@ -200,6 +200,23 @@ def test_thick_media(rgb, shift):
     views_agree(multiview(shift=shift, max_depth=4), volpath(max_depth=4), scene, whole=0.02, block=0.1, most=200)
 
 
+def test_majorants_far_above_the_density(rgb):
+    """Thirty times: how many null interactions paths have then tells views apart, unless some are added; with them, sharing pays."""
+    def spiked(rng, n):
+        values = rng.uniform(0.2, 0.4, (n, n, n))
+        values[0, 0, 0] = 9.0
+        return values
+
+    scene = mi.load_dict({"type": "scene", "medium": container(grid(spiked, albedo=0.9)), "sensor": batch(orbit(4, 1.2)),
+                          "sky": {"type": "constant", "radiance": grey(0.2)}, "point": {"type": "point", "position": [-2, 2.5, 1], "intensity": grey(9.0)}})
+    spread = {}
+    for add in (True, False):
+        batches = MultiviewBatches(multiview(max_depth=3, add_nulls=add, camera_paths=4), scene, blocks=8, iterations=4)
+        batches.add(24)
+        spread[add] = np.var(batches.batches, axis=0)[1:].mean()
+    assert spread[True] < 0.75 * spread[False]
+
+
 # --- Films ------------------------------------------------------------------------------------------------------
 
 
