@@ -87,8 +87,8 @@ def overhead(options: argparse.Namespace) -> float:
               for sweep in SWEEPS if sweep.name in options.sweeps]
     points = sum(count for _, count in values) * options.point_time
     compiling = sum((0.3 if sweep.of_method else 1.0) * count for sweep, count in values) * 0.5 * COMPILING_SECONDS
-    each = (1 + len(options.view_weights)) * (options.view_seeds * options.view_time + COMPILING_SECONDS)
-    return scenes + points + compiling + len(options.view_scenes) * len(options.view_counts) * each
+    views = sum(options.view_seeds * options.view_time * count + COMPILING_SECONDS for count in options.view_counts)
+    return scenes + points + compiling + len(options.view_scenes) * (1 + len(options.view_weights)) * views
 
 
 def planned_time(options: argparse.Namespace) -> float:

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from mis_integrators.volume.views import views_of
-from multiview import Race, load, race
+from multiview import Race, draw_densities, load, race
 from reports import Row, save, show
 from scene_files import BUNDLED
 
@@ -26,11 +26,10 @@ def run(options: argparse.Namespace) -> None:
 
 
 def section(options: argparse.Namespace, folder: Path) -> str:
-    """The section of a page: the chart, pictures of some views, the table; CSV and JSON on the way. `options`: `view_scenes`, `view_counts`,
+    """The section of a page: charts, pictures of some views, the table; CSV and JSON on the way. `options`: `view_scenes`, `view_counts`,
     `view_time`, `view_seeds`, `view_scale`, `view_weights`."""
     import pages
 
-    how = argparse.Namespace(time=options.view_time, seeds=options.view_seeds)
     rows: list[Row] = []
     races: dict[str, Race] = {}
     for path in options.view_scenes:
@@ -39,11 +38,13 @@ def section(options: argparse.Namespace, folder: Path) -> str:
             if sum(len(views_of(sensor)) for sensor in scene.sensors()) < count:
                 break
             methods = {f"volpath_multiview:weights={weights}": {"weights": weights} for weights in options.view_weights}
+            how = argparse.Namespace(time=options.view_time * count, seeds=options.view_seeds)
             found = race(scene, parameters, methods, f"{path.stem}, {count} views", how)
             rows += [_row(path.stem, name, found) for name in methods]
             races[path.stem] = found
             save(options.out, "view_counts", rows, vars(options))
     show("Relative variance x time of volpath_multiview over that of volpath, by the number of views", rows)
+    draw_densities(folder / "multiview_densities.png")
     return pages.view_counts(rows, races, folder)
 
 

@@ -135,6 +135,17 @@ def cost_by_count(curves: Mapping[str, Sequence[tuple[int, float]]], style: Mapp
     return figure
 
 
+def by_share(curves: Mapping[str, Sequence[tuple[float, float]]]) -> Figure:
+    """Variances of estimators, relative to that of the first, against the share of the weights that other views bring."""
+    figure, axis = _axes(5.0, 3.4)
+    for number, (label, points) in enumerate(curves.items()):
+        axis.plot(*zip(*points), DASHES[number % len(DASHES)], marker=MARKERS[number % len(MARKERS)], ms=5, lw=1.6, color=OTHERS[number % len(OTHERS)],
+                  label=label)
+    axis.set(xlabel="share of other views in the pixel's weights", ylabel=f"variance, {next(iter(curves))} = 1", ylim=(0, None))
+    _legend(axis, "estimator")
+    return figure
+
+
 def variance_maps(labels: Sequence[str], images: Sequence[np.ndarray], maps: Sequence[np.ndarray], notes: Sequence[str]) -> Figure:
     """Pictures, (H, W, 3), above; maps of relative variance, (H, W), on one logarithmic scale below; a note under each label."""
     height, width = maps[0].shape
