@@ -61,7 +61,7 @@ class Apart:
             self.iterate()          # compile
 
     def tune(self, seconds):
-        """Chooses the samples of a pass so that about two passes last `seconds`."""
+        """Chooses the samples of a pass so that one lasts about `seconds`: small passes mostly wait for their longest paths."""
         used = []
         for self.spp in (1, 9):
             self.iterate()          # compile
@@ -70,7 +70,7 @@ class Apart:
             used.append(time.perf_counter() - start)
         per_sample = max((used[1] - used[0]) / 8, 1e-4)
         width, height = self.scene.sensors()[0].film().crop_size()
-        self.spp = int(np.clip((seconds / 2 - used[0]) / per_sample, 1, PATHS_PER_PASS // (width * height)))
+        self.spp = int(np.clip((seconds - used[0]) / per_sample, 1, PATHS_PER_PASS // (width * height)))
 
     def restart(self, seed):
         self.seed, self.passes, self.sum, self.samples = seed, 0, 0.0, 0
@@ -185,17 +185,19 @@ def compare(path: Path, options: argparse.Namespace) -> list[Row]:
 
 
 def equal_time(contenders: dict, seed: int, seconds: float) -> dict[str, float]:
-    """Lets each contender render for so long, in turns; returns what each has used."""
-    used = dict.fromkeys(contenders, 0.0)
+    """Lets each contender render for about so long, in turns: another iteration is begun if that brings the time used closer to it. Returns what
+    each has used."""
+    used, last = dict.fromkeys(contenders, 0.0), dict.fromkeys(contenders, 0.0)
     for contender in contenders.values():
         contender.restart(seed)
-    while unfinished := [name for name in contenders if used[name] < seconds]:
+    while unfinished := [name for name in contenders if used[name] + 0.5 * last[name] < seconds]:
         for name in unfinished:
             end = used[name] + SLICE_SECONDS
-            while used[name] < min(end, seconds):
+            while used[name] < end and used[name] + 0.5 * last[name] < seconds:
                 start = time.perf_counter()
                 contenders[name].iterate()
-                used[name] += time.perf_counter() - start
+                last[name] = time.perf_counter() - start
+                used[name] += last[name]
     return used
 
 

@@ -87,7 +87,7 @@ def overhead(options: argparse.Namespace) -> float:
               for sweep in SWEEPS if sweep.name in options.sweeps]
     points = sum(count for _, count in values) * options.point_time
     compiling = sum((0.3 if sweep.of_method else 1.0) * count for sweep, count in values) * 0.5 * COMPILING_SECONDS
-    views = sum(options.view_seeds * options.view_time * count + COMPILING_SECONDS for count in options.view_counts)
+    views = sum(options.view_seeds * options.view_time * max(count, view_counts.FEW) + COMPILING_SECONDS for count in options.view_counts)
     return scenes + points + compiling + len(options.view_scenes) * (1 + len(options.view_weights)) * views
 
 

@@ -203,9 +203,9 @@ def view_counts(rows: Sequence[Row], races: Mapping[str, Race], folder: Path) ->
                      f'<div class="pictures">{_view_cards(scene, race, labels, style, folder)}</div>')
     densities = charts.data_uri((folder / "multiview_densities.png").read_bytes(), "image/png")
     return f"""<h2 id="views">Many views at once</h2>
-<p>The first 2, 4, 8, ... views of a scene, rendered together by <b>volpath_multiview</b>, and by <b>volpath</b> one by one; the
-same time a view whatever their number. The charts show relative variance times seconds over that of volpath: below 1 is better. Variances are those between renders under different seeds. Pictures: some
-views of the largest number, after equal time, with relative errors |x - r| / (r + 0.1), r the mean of all other seeds of both.</p>
+<p>The first 2, 4, 8, ... views of a scene, rendered together by <b>volpath_multiview</b>, and by <b>volpath</b> one by one.
+The charts show relative variance times seconds over that of volpath: below 1 is better. Variances are those between renders under
+different seeds. Pictures: some views of the largest number, after equal time, with relative errors |x - r| / (r + 0.1), r the mean of all other seeds of both.</p>
 {"".join(parts)}{table(rows)}
 <h3>Shifted null interactions</h3><figure class="chart"><img alt="densities" src="{densities}"><figcaption>A segment of 9 m whose null interactions
 move to one of 3 m: their densities there by each stretch, next to the target's own of tentative, null and real interactions.</figcaption></figure>"""

@@ -63,7 +63,7 @@ def _parser() -> argparse.ArgumentParser:
     _variance(command, 16)
     _sweeps(command, 0.4)
     command.add_argument("--every-value", dest="coarse", action="store_false", help="all values of the sweeps instead of every other")
-    _views(command, (2, 8, 16, 64), 0.15, 2)
+    _views(command, (2, 8, 16, 64), 0.08, 2)
 
     command = _measuring(commands, "compare", compare)
     _renders(command, 10)
@@ -118,7 +118,7 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument("--charts", action="store_true", help="draw the shifted densities (needs matplotlib)")
 
     command = _measuring(commands, "views", view_counts, scenes=False)
-    _views(command, view_counts.COUNTS, 0.3, 3)
+    _views(command, view_counts.COUNTS, 0.25, 3)
 
     command = _measuring(commands, "view-weights", view_weights)
     command.set_defaults(scenes=[BUNDLED / "multiview" / "fly_through.xml"])
@@ -177,7 +177,7 @@ def _views(command: argparse.ArgumentParser, counts: tuple[int, ...], seconds: f
     command.add_argument("--view-counts", nargs="+", type=int, default=list(counts), metavar="N",
                          help=f"how many of their views (default: {' '.join(map(str, counts))})")
     command.add_argument("--view-weights", nargs="+", default=["mis"], metavar="WEIGHTS", help="weights of volpath_multiview (default: mis)")
-    command.add_argument("--view-time", type=float, default=seconds, metavar="SECONDS", help=f"rendering seconds of each, for every view (default: {seconds})")
+    command.add_argument("--view-time", type=float, default=seconds, metavar="SECONDS", help=f"rendering seconds of each for every view, for 16 at least (default: {seconds})")
     command.add_argument("--view-seeds", type=int, default=seeds, metavar="N", help=f"renders of each, at least two (default: {seeds})")
     command.add_argument("--view-scale", type=float, default=1, metavar="SCALE", help="film size, scene's own = 1 (default: 1)")
 

@@ -13,7 +13,7 @@ import pytest
 
 import mis_integrators
 from comparing import Estimate, assert_same, collect_until, differences, smallest_visible
-from foggy import (SIZE, MultiviewBatches, OracleBatches, around, batch, container, even, grid, lamp, multiview, orbit, pockets, sparse, uneven,
+from foggy import (SIZE, MultiviewBatches, OracleBatches, around, arrived, batch, container, even, grid, lamp, multiview, orbit, pockets, sparse, uneven,
                    view, views_agree, volpath, world)
 from mis_integrators import cli, output
 from mis_integrators.volume.media import transmittance
@@ -131,6 +131,13 @@ def test_variants(variant_name):
     """Media, surfaces and all kinds of light together; coloured where there are colours."""
     mi.set_variant(variant_name)
     views_agree(multiview(), volpath(), smoky(batch(uneven())), whole=0.02, block=0.1, most=200)
+
+
+def test_coloured_extinction(rgb):
+    """Deep in one channel and thin in another: null interactions are drawn from the mean, also those that are added."""
+    scene = mi.load_dict({"type": "scene", "medium": container(coloured(3.0)), "sensor": batch(around()), "lamp": lamp(),
+                          "sky": {"type": "constant", "radiance": grey(0.4)}})
+    views_agree(multiview(max_depth=4), volpath(max_depth=4), scene, whole=0.01, block=0.04)
 
 
 def surfaces(sensor, **objects):
@@ -263,13 +270,17 @@ def test_films(rgb, rfilter, options):
     sensors = [s | {"film": film(12, rfilter, **options) | {"pixel_format": "rgba"}} for s in orbit(2)]
     scene = world(sensors[0], grid(even, scale=1.0), sky=None, floor=None, b=sensors[1])
     session = multiview(max_depth=3).views_session(scene)
-    images, oracle = [], []
+    images, oracle, weights = [], [], []
     for seed in range(24):
         session.restart(seed)
         for _ in range(4):
             session.iterate()
+        weights.append(arrived(session.accumulator))
         images.append([np.array(t) for t in session.view_tensors()])
         oracle.append([np.array(mi.render(scene, integrator=volpath(max_depth=3), sensor=i, seed=100 + seed, spp=64)) for i in range(2)])
+    # What is expected of the weights at each pixel, border pixels too: pictures forgive errors in it, being nearly ratios.
+    for weight in np.mean(weights, axis=0):
+        assert np.abs(weight.mean() - 1) < 0.01 and all(np.abs(edge.mean() - 1) < 0.04 for edge in (weight[0], weight[-1], weight[:, 0], weight[:, -1]))
     for mine, theirs in zip(zip(*images), zip(*oracle)):
         a, b = (Estimate.of([np.concatenate([image.mean(axis=(0, 1))[None], image[[0, -1]].mean(axis=1), image[:, [0, -1]].mean(axis=0)])
                              for image in side]) for side in (mine, theirs))
@@ -356,6 +367,18 @@ def test_cameras_are_mitsubas(rgb):
     points = mi.Point3f((np.array([1, 2, 3]) + depths[:, None] * d).T)
     density = Views([straight], 1, "test").connect(mi.UInt32(0), points, mi.Point2f(0.5), mi.Bool([True] * 8))[2]
     assert (np.array(density) > 0).tolist() == [False, False, False, True, True, True, False, False]
+
+
+def test_media_of_sensors(rgb):
+    """A view stands in the medium that its sensor names, else in its batch's, else in none."""
+    fog = {"type": "homogeneous", "sigma_t": grey(0.8), "albedo": 0.9}
+    first, second = orbit(2)
+    together = batch([first | {"medium": {"type": "ref", "id": "haze"}}, second]) | {"medium": {"type": "ref", "id": "fog"}}
+    scene = mi.load_dict({"type": "scene", "fog": fog, "haze": fog | {"sigma_t": grey(0.1)}, "views": together, "alone": view((0, 0, 4))})
+    media = [Views([sensor], 1, "test").medium(mi.UInt32([0, 1] if "Batch" in sensor.class_name() else [0])) for sensor in scene.sensors()]
+    extinctions = sorted(sorted(float(np.array(m.get_majorant(dr.zeros(mi.MediumInteraction3f), m != None)).max()) if m is not None else 0.0  # noqa: E711
+                                for m in pointers) for pointers in media)
+    assert extinctions == [[0.0], [pytest.approx(0.1), pytest.approx(0.8)]]
 
 
 @pytest.mark.parametrize("depth, lit", [(-1, False), (0, True), (1, True)])
