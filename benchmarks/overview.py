@@ -70,7 +70,8 @@ def run(options: argparse.Namespace) -> None:
 def write(page, pages, rows, failures, scenes, sweeps: str, options: argparse.Namespace) -> None:
     """The page as far as it has come."""
     much = f"at {options.spp} samples per pixel" if options.spp else f"after {options.time:.1f} s of rendering"
-    links = "".join(f'<a href="#{part}">{name}</a>' for part, name in (("views", "many views"), ("stability", "stability")) if f'id="{part}"' in sweeps)
+    parts = [(part, name) for part, name in (("views", "many views"), ("stability", "stability")) if f'id="{part}"' in sweeps]
+    links = "".join(f'<a href="#{part}">{name}</a>' for part, name in parts)
     page.sections = [pages.summary(rows, failures, f"{much}, {options.seeds} seeds"), f"<nav>{links}</nav>", *scenes, sweeps]
     page.write()
 

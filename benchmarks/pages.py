@@ -205,7 +205,8 @@ def view_counts(rows: Sequence[Row], races: Mapping[str, Race], folder: Path) ->
     return f"""<h2 id="views">Many views at once</h2>
 <p>The first 2, 4, 8, ... views of a scene, rendered together by <b>volpath_multiview</b>, and by <b>volpath</b> one by one.
 The charts show relative variance times seconds over that of volpath: below 1 is better. Variances are those between renders under
-different seeds. Pictures: some views of the largest number, after equal time, with relative errors |x - r| / (r + 0.1), r the mean of all other seeds of both.</p>
+different seeds. Pictures: some views of the largest number, after equal time, with relative errors |x - r| / (r + 0.1), r the mean of all
+other seeds of both.</p>
 {"".join(parts)}{table(rows)}
 <h3>Shifted null interactions</h3><figure class="chart"><img alt="densities" src="{densities}"><figcaption>A segment of 9 m whose null interactions
 move to one of 3 m: their densities there by each stretch, next to the target's own of tentative, null and real interactions.</figcaption></figure>"""
@@ -247,7 +248,8 @@ def stability(results, folder: Path, methods: Sequence[Method]) -> str:
             figures.append(f'<figure><img alt="{sweep.name}" src="{uri}"></figure>')
             rows += choice_rows(sweep, points)
     return f"""<h2 id="stability">Where methods break</h2>
-<p>Error in a small room, or in four views of smoke, against one parameter, the others fixed; the first iteration of each (pilots, compiling) is free. A method breaks, ringed and
+<p>Error in a small room, or in four views of smoke, against one parameter, the others fixed; the first iteration of each (pilots, compiling) is
+free. A method breaks, ringed and
 crossed, where its error exceeds three times its own median over the sweep, or its mean is off by more than 5 % and four standard errors.</p>
 <div class="charts">{"".join(figures)}</div>
 <h3>Which method where</h3>{table(rows)}"""

@@ -177,7 +177,8 @@ def _views(command: argparse.ArgumentParser, counts: tuple[int, ...], seconds: f
     command.add_argument("--view-counts", nargs="+", type=int, default=list(counts), metavar="N",
                          help=f"how many of their views (default: {' '.join(map(str, counts))})")
     command.add_argument("--view-weights", nargs="+", default=["mis"], metavar="WEIGHTS", help="weights of volpath_multiview (default: mis)")
-    command.add_argument("--view-time", type=float, default=seconds, metavar="SECONDS", help=f"rendering seconds of each for every view, for 16 at least (default: {seconds})")
+    command.add_argument("--view-time", type=float, default=seconds, metavar="SECONDS",
+                         help=f"rendering seconds of each for every view, for 16 at least (default: {seconds})")
     command.add_argument("--view-seeds", type=int, default=seeds, metavar="N", help=f"renders of each, at least two (default: {seeds})")
     command.add_argument("--view-scale", type=float, default=1, metavar="SCALE", help="film size, scene's own = 1 (default: 1)")
 

@@ -189,7 +189,8 @@ def test_page_of_one_small_scene(module, tmp_path):
         <shape type="sphere"/><emitter type="point"><point name="position" x="1" y="2" z="4"/></emitter></scene>""")
     views = tmp_path / "views.xml"
     views.write_text(VIEWS)
-    argv = ["page", "--scenes", str(scene), "--view-scenes", str(views), "--view-counts", "2", "3", "4", "--view-time", "0.05", "--view-seeds", "2", "--integrators", "path", "bdpm:bdd=0", "bdpm:bdd=0,bogus=1", "--varied", "bdpm:bdd=0", "--time", "0.3",
+    argv = ["page", "--scenes", str(scene), "--view-scenes", str(views), "--view-counts", "2", "3", "4", "--view-time", "0.01", "--view-seeds", "2",
+            "--integrators", "path", "bdpm:bdd=0", "bdpm:bdd=0,bogus=1", "--varied", "bdpm:bdd=0", "--time", "0.3",
             "--seeds", "2", "--reference-time", "0.2", "--references", str(tmp_path / "references"), "--iterations", "2", "--sweeps", "camera_paths",
             "--size", "16", "--point-time", "0.05", "--room-reference-time", "0.3", "--out", str(tmp_path / "out")]
     module("run").main(argv)

@@ -139,8 +139,8 @@ def by_share(curves: Mapping[str, Sequence[tuple[float, float]]]) -> Figure:
     """Variances of estimators, relative to that of the first, against the share of the weights that other views bring."""
     figure, axis = _axes(5.0, 3.4)
     for number, (label, points) in enumerate(curves.items()):
-        axis.plot(*zip(*points), DASHES[number % len(DASHES)], marker=MARKERS[number % len(MARKERS)], ms=5, lw=1.6, color=OTHERS[number % len(OTHERS)],
-                  label=label)
+        colour, marker, dashes = (kind[number % len(kind)] for kind in (OTHERS, MARKERS, DASHES))
+        axis.plot(*zip(*points), dashes, marker=marker, ms=5, lw=1.6, color=colour, label=label)
     axis.set(xlabel="share of other views in the pixel's weights", ylabel=f"variance, {next(iter(curves))} = 1", ylim=(0, None))
     _legend(axis, "estimator")
     return figure

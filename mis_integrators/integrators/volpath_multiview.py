@@ -15,7 +15,7 @@ from ..transport.recording import recorder
 from ..transport.traits import UnsupportedScene, check_variant
 from ..volume.films import OWN, SHARED, ViewAccumulator, own_values, splat, write_film
 from ..volume.lines import common_nulls, connect, follow_nulls, sight
-from ..volume.pivots import NOWHERE, ON_SURFACE, OWN as OWN_BRANCH, pivot_surface, trace_first_segments
+from ..volume.pivots import NOWHERE, ON_SURFACE, OWN as OWN_BRANCH, of_paths, pivot_surface, trace_first_segments
 from ..volume.shifts import SHIFTS
 from ..volume.suffixes import continue_paths, scattered_to
 from ..volume.traits import VolumeTraits, check_volume_scene
@@ -189,8 +189,9 @@ class MultiViewSession(IterativeSession):
     def _look(self, scene, tables, pivots, lines, numbers):
         """Every other view's line of sight to each pivot."""
         view, path = self._pairs()
-        pivot = _gather(pivots, path)
-        active = (dr.gather(mi.UInt32, numbers, path) < self.views.paths) & (view != pivot["view"]) & (dr.gather(mi.Float, lines["density"], path) > 0)
+        pivot = of_paths(pivots, path)
+        active = (dr.gather(mi.UInt32, numbers, path) < self.views.paths) & (dr.gather(mi.Float, lines["density"], path) > 0)
+        active &= view != pivot["view"]
         return sight(scene, self.views, self.traits, pivot, view, self.slots, self.integrator.hide_emitters, active)
 
     def _agree(self, scene, tables, pivots, lines, sights, numbers, seed):
@@ -205,7 +206,7 @@ class MultiViewSession(IterativeSession):
     def _connect(self, scene, tables, pivots, lines, sights, common, numbers, seed):
         _, path = self._pairs()
         number = dr.gather(mi.UInt32, numbers, path)
-        return connect(self.traits, SHIFTS[self.integrator.shift], _gather(pivots, path), _gather(lines, path), sights,
+        return connect(self.traits, SHIFTS[self.integrator.shift], of_paths(pivots, path), of_paths(lines, path), sights,
                        dr.gather(mi.Float, common, path), number, seed, self.slots, number < self.views.paths)
 
     def _continue(self, scene, tables, pivot, connections, number, seed):
@@ -221,7 +222,7 @@ class MultiViewSession(IterativeSession):
         if views.count == 1:
             return image[:, :, :SHARED], image[:, :, SHARED:]
         view, path = self._pairs()
-        pivot, suffix = _gather(pivots, path), _gather(suffixes, path)
+        pivot, suffix = of_paths(pivots, path), of_paths(suffixes, path)
         # The path's own view was served above.
         reached = (connections["ratio"] > 0) & ~suffix["alone"]
         surface = pivot_surface(pivot, reached & (pivot["kind"] == ON_SURFACE))
@@ -263,7 +264,8 @@ class MultiViewSession(IterativeSession):
                 dr.eval(sights, more)
                 common = dr.zeros(mi.Float, self.paths)
                 if self.traits.has_null_media:
-                    common, lines["log_density"], pivots["tint"] = self._agreement_pass(self.scene, self._tables, pivots, lines, sights, numbers, seed)
+                    agreed = self._agreement_pass(self.scene, self._tables, pivots, lines, sights, numbers, seed)
+                    common, lines["log_density"], pivots["tint"] = agreed
                 dr.eval(common, lines, pivots)
                 connections = self._connection_pass(self.scene, self._tables, pivots, lines, sights, common, numbers, seed)
                 dr.eval(connections)
@@ -322,12 +324,6 @@ class MultiViewSession(IterativeSession):
     def fill_film(self):
         """Hands what has been rendered so far to the sensor's film, side by side for a `batch`."""
         self._fill(self.sensor.film(), self.accumulator.pictures()[:self.views.members[0]])
-
-
-def _gather(record, index):
-    """The entries `index` of every array of a dictionary (and of lists in it)."""
-    return {name: [dr.gather(type(v), v, index) for v in value] if isinstance(value, list) else dr.gather(type(value), value, index)
-            for name, value in record.items()}
 
 
 def render_views(scene, integrator=None, spp=0, seed=0):

@@ -214,7 +214,8 @@ def follow_nulls(traits, shift, pivot, own, line, common, number, seed, slots: i
         lost |= shifting & ~valid
         evaluated = shifting & valid
         in_medium = evaluated & (medium != None)  # noqa: E711 (array comparison)
-        null, _, probability = collision(medium, pivot["p"] + line["d"] * (line["distance"] - t), majorant, pivot["time"], pivot["wavelengths"], in_medium)
+        p = pivot["p"] + line["d"] * (line["distance"] - t)
+        null, _, probability = collision(medium, p, majorant, pivot["time"], pivot["wavelengths"], in_medium)
         probability = dr.select(in_medium, probability, 0)
         total = probability + rate
         empty |= evaluated & (total <= 0)

@@ -151,3 +151,9 @@ def pivot_surface(pivot, active):
     ray = mi.Ray3f(pivot["ray_o"], pivot["ray_d"], pivot["time"], pivot["wavelengths"])
     hit = dr.select(active, pivot["hit"], dr.zeros(mi.PreliminaryIntersection3f))
     return hit.compute_surface_interaction(ray, mi.RayFlags.All, active)
+
+
+def of_paths(record, index):
+    """The entries `index` of every array of a dictionary (and of lists in it)."""
+    return {name: [dr.gather(type(v), v, index) for v in value] if isinstance(value, list) else dr.gather(type(value), value, index)
+            for name, value in record.items()}
