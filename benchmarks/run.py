@@ -63,7 +63,7 @@ def _parser() -> argparse.ArgumentParser:
     _variance(command, 16)
     _sweeps(command, 0.4)
     command.add_argument("--every-value", dest="coarse", action="store_false", help="all values of the sweeps instead of every other")
-    _views(command, (2, 8, 16, 64), 0.08, 2)
+    _views(command, (2, 8, 16, 64), 0.08, 2, 0.5)
 
     command = _measuring(commands, "compare", compare)
     _renders(command, 10)
@@ -118,7 +118,7 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument("--charts", action="store_true", help="draw the shifted densities (needs matplotlib)")
 
     command = _measuring(commands, "views", view_counts, scenes=False)
-    _views(command, view_counts.COUNTS, 0.25, 3)
+    _views(command, view_counts.COUNTS, 0.25, 3, 1)
 
     command = _measuring(commands, "view-weights", view_weights)
     command.set_defaults(scenes=[BUNDLED / "multiview" / "fly_through.xml"])
@@ -170,7 +170,7 @@ def _sweeps(command: argparse.ArgumentParser, seconds: float) -> None:
                          help="rendering seconds of each of the two references of the scene swept (default: 10)")
 
 
-def _views(command: argparse.ArgumentParser, counts: tuple[int, ...], seconds: float, seeds: int) -> None:
+def _views(command: argparse.ArgumentParser, counts: tuple[int, ...], seconds: float, seeds: int, scale: float) -> None:
     """Which numbers of views of which scenes are compared, and how carefully."""
     command.add_argument("--view-scenes", nargs="*", type=Path, default=view_counts.SCENES, metavar="FILE.xml",
                          help="scenes with several views (default: the bundled ones whose views overlap)")
@@ -180,7 +180,7 @@ def _views(command: argparse.ArgumentParser, counts: tuple[int, ...], seconds: f
     command.add_argument("--view-time", type=float, default=seconds, metavar="SECONDS",
                          help=f"rendering seconds of each for every view, for 16 at least (default: {seconds})")
     command.add_argument("--view-seeds", type=int, default=seeds, metavar="N", help=f"renders of each, at least two (default: {seeds})")
-    command.add_argument("--view-scale", type=float, default=1, metavar="SCALE", help="film size, scene's own = 1 (default: 1)")
+    command.add_argument("--view-scale", type=float, default=scale, metavar="SCALE", help=f"film size, scene's own = 1 (default: {scale:g})")
 
 
 def _renders(command: argparse.ArgumentParser, seconds: float | None) -> None:
