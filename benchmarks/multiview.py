@@ -1,5 +1,5 @@
-"""Several views at once: ``volpath_multiview`` against ``volpath`` of each view alone, in equal time; shares of invalid shifts; densities of the
-shifts.
+"""Several views at once: ``volpath_multiview`` against ``volpath`` of each view alone, in equal time, for all views of a scene and for the first few;
+shares of invalid shifts; densities of the shifts.
 
 Variances are those of whole renders under different seeds, so they need no reference; each is divided by the squared mean + 0.01 before it is
 averaged over pixels. With `--charts`, Figure 3 of the paper is drawn: shifted densities.
@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import argparse
 import time
+from dataclasses import dataclass
 from pathlib import Path
+from xml.etree import ElementTree
 
 import drjit as dr
 import mitsuba as mi
@@ -59,7 +61,7 @@ class Apart:
             self.iterate()          # compile
 
     def tune(self, seconds):
-        """Chooses the samples of a pass so that about two passes last `seconds`."""
+        """Chooses the samples of a pass so that one lasts about `seconds`: small passes mostly wait for their longest paths."""
         used = []
         for self.spp in (1, 9):
             self.iterate()          # compile
@@ -68,7 +70,7 @@ class Apart:
             used.append(time.perf_counter() - start)
         per_sample = max((used[1] - used[0]) / 8, 1e-4)
         width, height = self.scene.sensors()[0].film().crop_size()
-        self.spp = int(np.clip((seconds / 2 - used[0]) / per_sample, 1, PATHS_PER_PASS // (width * height)))
+        self.spp = int(np.clip((seconds - used[0]) / per_sample, 1, PATHS_PER_PASS // (width * height)))
 
     def restart(self, seed):
         self.seed, self.passes, self.sum, self.samples = seed, 0, 0.0, 0
@@ -101,25 +103,60 @@ def run(options: argparse.Namespace) -> None:
         draw_densities(options.out / "multiview_densities.png")
 
 
-def load(path: Path, options: argparse.Namespace):
-    """A scene with smaller films, and what its integrator hands on."""
+def load(path: Path, scale: float, count: int | None = None):
+    """A scene with films of `scale` times their size, and what its integrator hands on. `count`: only its first views (children of its batch, or
+    sensors)."""
     loaded = loading.load(path, {}, None, {})
-    if options.scale != 1:
-        sensor = loaded.scene.sensors()[0]
-        views, (width, height) = len(views_of(sensor)), sensor.film().crop_size()
-        size = [views * max(1, round(int(width) // views * options.scale)), max(1, round(int(height) * options.scale))]
-        loaded = loading.load(path, {"resx": str(size[0]), "resy": str(size[1])}, None, {})
-    return loaded.scene, {name: loaded.parameters[name] for name in loading.INHERITED if name in loaded.parameters}
+    parameters = {name: loaded.parameters[name] for name in loading.INHERITED if name in loaded.parameters}
+    sensor = loaded.scene.sensors()[0]
+    views, (width, height) = len(views_of(sensor)), (int(x) for x in sensor.film().crop_size())
+    kept = min(count or views, views)
+    size = {"resx": str(kept * max(1, round(width // views * scale))), "resy": str(max(1, round(height * scale)))}
+    root = ElementTree.parse(path).getroot()
+    group = next((s for s in root.findall("sensor") if s.get("type") == "batch"), root)
+    for extra in group.findall("sensor")[count:] if count else []:
+        group.remove(extra)
+    mi.file_resolver().prepend(str(path.parent))
+    return mi.load_string(ElementTree.tostring(root, encoding="unicode"), **size), parameters
 
 
-def compare(path: Path, options: argparse.Namespace) -> list[Row]:
-    """A row for each choice of weights: the ratio of variance times time to that of `volpath`, over all pixels and for single views."""
-    scene, parameters = load(path, options)
+@dataclass
+class Race:
+    """What came of renders of all views in equal time: per method and seed the views side by side (H, W, 3) and `(seconds, samples a pixel)`."""
+
+    views: int
+    images: dict[str, list[np.ndarray]]
+    used: dict[str, list[tuple[float, int]]]
+
+    @property
+    def mean(self) -> np.ndarray:
+        """Mean of the renders by `volpath`."""
+        return np.mean(self.images["volpath"], axis=0)
+
+    def noise(self, name: str) -> np.ndarray:
+        """Relative variance of one render (H, W, 3)."""
+        return np.var(self.images[name], axis=0, ddof=1) / (self.mean ** 2 + RELATIVE_OFFSET)
+
+    def seconds(self, name: str) -> float:
+        """Seconds that a render took: iterations overrun a little."""
+        return float(np.mean([s for s, _ in self.used[name]]))
+
+    def samples(self, name: str) -> int:
+        """Camera paths a pixel."""
+        return round(np.mean([n for _, n in self.used[name]]))
+
+    def cost(self, name: str) -> float:
+        """Relative variance x seconds."""
+        return self.seconds(name) * float(self.noise(name).mean())
+
+
+def race(scene, parameters: dict, methods: dict[str, dict], label: str, options: argparse.Namespace) -> Race:
+    """Renders by `volpath` and by `volpath_multiview` with the parameters of each of the `methods`, `options.seeds` of each."""
     apart = Apart(scene, parameters)
     apart.tune(options.time)
-    methods = {weights: Together(scene, {**parameters, "weights": weights}) for weights in options.weights}
-    contenders = {"volpath": apart, **methods}
-    for contender in methods.values():
+    together = {name: Together(scene, {**parameters, **more}) for name, more in methods.items()}
+    contenders = {"volpath": apart, **together}
+    for contender in together.values():
         for _ in range(3):
             contender.iterate()     # compile and record
     images, used = {name: [] for name in contenders}, {name: [] for name in contenders}
@@ -128,41 +165,45 @@ def compare(path: Path, options: argparse.Namespace) -> list[Row]:
         for name, contender in contenders.items():
             images[name].append(np.concatenate(contender.images(), axis=1))
             used[name].append((seconds[name], contender.samples))
-        tell(f"{path.stem}: {seed} of {options.seeds} seeds")
-    mean = np.mean(images["volpath"], axis=0)
-    divisor = mean ** 2 + RELATIVE_OFFSET
-    noise = {name: np.var(stack, axis=0, ddof=1) / divisor for name, stack in images.items()}
+        tell(f"{label}: {seed} of {options.seeds} seeds")
+    return Race(next(iter(together.values())).session.views.count, images, used)
+
+
+def compare(path: Path, options: argparse.Namespace) -> list[Row]:
+    """A row for each choice of weights: the ratio of variance times time to that of `volpath`, over all pixels and for single views."""
+    scene, parameters = load(path, options.scale)
+    run = race(scene, parameters, {weights: {"weights": weights} for weights in options.weights}, path.stem, options)
     rows = []
-    for name in methods:
-        views = methods[name].session.views.count
-        ratios = [a.mean() / b.mean() for a, b in zip(*(np.array_split(noise[n].mean(axis=-1), views, axis=1) for n in (name, "volpath")))]
-        times = float(np.mean([s for s, _ in used[name]]) / np.mean([s for s, _ in used["volpath"]]))       # iterations overrun a little
-        rows.append({"scene": path.stem, "views": views, "weights": name, "ratio": times * float(noise[name].mean() / noise["volpath"].mean()),
+    for name in options.weights:
+        ratios = [a.mean() / b.mean() for a, b in zip(*(np.array_split(run.noise(n).mean(axis=-1), run.views, axis=1) for n in (name, "volpath")))]
+        times = run.seconds(name) / run.seconds("volpath")
+        rows.append({"scene": path.stem, "views": run.views, "weights": name, "ratio": run.cost(name) / run.cost("volpath"),
                      "best view": times * float(min(ratios)), "worst view": times * float(max(ratios)),
-                     "mean ratio": float(np.mean(images[name]) / mean.mean()),
-                     "samples": round(np.mean([n for _, n in used[name]])), "volpath samples": round(np.mean([n for _, n in used["volpath"]])),
-                     "time ratio": times})
+                     "mean ratio": float(np.mean(run.images[name]) / run.mean.mean()), "samples": run.samples(name),
+                     "volpath samples": run.samples("volpath"), "time ratio": times})
     return rows
 
 
 def equal_time(contenders: dict, seed: int, seconds: float) -> dict[str, float]:
-    """Lets each contender render for so long, in turns; returns what each has used."""
-    used = dict.fromkeys(contenders, 0.0)
+    """Lets each contender render for about so long, in turns: another iteration is begun if that brings the time used closer to it. Returns what
+    each has used."""
+    used, last = dict.fromkeys(contenders, 0.0), dict.fromkeys(contenders, 0.0)
     for contender in contenders.values():
         contender.restart(seed)
-    while unfinished := [name for name in contenders if used[name] < seconds]:
+    while unfinished := [name for name in contenders if used[name] + 0.5 * last[name] < seconds]:
         for name in unfinished:
             end = used[name] + SLICE_SECONDS
-            while used[name] < min(end, seconds):
+            while used[name] < end and used[name] + 0.5 * last[name] < seconds:
                 start = time.perf_counter()
                 contenders[name].iterate()
-                used[name] += time.perf_counter() - start
+                last[name] = time.perf_counter() - start
+                used[name] += last[name]
     return used
 
 
 def invalid_shifts(path: Path, options: argparse.Namespace) -> list[Row]:
     """What becomes of connections between views, for each shift."""
-    scene, parameters = load(path, options)
+    scene, parameters = load(path, options.scale)
     rows = []
     for shift in SHIFTS:
         session = Together(scene, {**parameters, "shift": shift, "max_depth": 2}).session

@@ -1,4 +1,5 @@
-"""Everything on one page: pictures and errors after equal time, convergence, variance maps, stability; within a given time."""
+"""Everything on one page: pictures and errors after equal time, convergence, variance maps, many views, stability; within a given
+time."""
 
 from __future__ import annotations
 
@@ -9,6 +10,7 @@ import compare
 import converge
 import stability
 import variance
+import view_counts
 from reports import Row, console, save, show
 from scene_files import open_scene, scaled_size
 from sweeps import SWEEPS
@@ -58,6 +60,8 @@ def run(options: argparse.Namespace) -> None:
         write(page, pages, rows, failures, scenes, "", options)
     show("Variance of one iteration, best single strategy = 1", varied, variance.COLUMNS)
     sweeps = pages.stability(stability.sweep_all(options), options.out, options.integrators) if options.sweeps else ""
+    if options.view_scenes:
+        sweeps = view_counts.section(options, options.out) + sweeps
     write(page, pages, rows, failures, scenes, pages.choices(compare.winners(rows)) + sweeps, options)
     (options.out / "which_scene.md").write_text(stability.as_markdown(compare.winners(rows)))
     console.print(f"page: {page.path} after {(time.perf_counter() - start) / 60:.1f} minutes")
@@ -66,8 +70,9 @@ def run(options: argparse.Namespace) -> None:
 def write(page, pages, rows, failures, scenes, sweeps: str, options: argparse.Namespace) -> None:
     """The page as far as it has come."""
     much = f"at {options.spp} samples per pixel" if options.spp else f"after {options.time:.1f} s of rendering"
-    links = '<nav><a href="#stability">stability</a></nav>' if sweeps else ""
-    page.sections = [pages.summary(rows, failures, f"{much}, {options.seeds} seeds"), links, *scenes, sweeps]
+    parts = [(part, name) for part, name in (("views", "many views"), ("stability", "stability")) if f'id="{part}"' in sweeps]
+    links = "".join(f'<a href="#{part}">{name}</a>' for part, name in parts)
+    page.sections = [pages.summary(rows, failures, f"{much}, {options.seeds} seeds"), f"<nav>{links}</nav>", *scenes, sweeps]
     page.write()
 
 
@@ -78,12 +83,13 @@ def rendering(options: argparse.Namespace, seconds: float) -> float:
 
 def overhead(options: argparse.Namespace) -> float:
     """Seconds of everything else: compiling, variance maps, sweeps."""
-    methods = len(options.integrators)
-    scenes = len(options.scenes) * (methods * COMPILING_SECONDS + VARIANCE_SECONDS)
-    values = [(sweep, len(sweep.values[::2] if options.coarse else sweep.values)) for sweep in SWEEPS if sweep.name in options.sweeps]
-    points = sum(count for _, count in values) * methods * options.point_time
-    compiling = sum((0.3 if sweep.of_method else 1.0) * count for sweep, count in values) * methods * 0.5 * COMPILING_SECONDS
-    return scenes + points + compiling
+    scenes = len(options.scenes) * (len(options.integrators) * COMPILING_SECONDS + VARIANCE_SECONDS)
+    values = [(sweep, len(sweep.methods(options.integrators)) * len(sweep.scenes(options.coarse)))
+              for sweep in SWEEPS if sweep.name in options.sweeps]
+    points = sum(count for _, count in values) * options.point_time
+    compiling = sum((0.3 if sweep.of_method else 1.0) * count for sweep, count in values) * 0.5 * COMPILING_SECONDS
+    views = sum(options.view_seeds * options.view_time * max(count, view_counts.FEW) + COMPILING_SECONDS for count in options.view_counts)
+    return scenes + points + compiling + len(options.view_scenes) * (1 + len(options.view_weights)) * views
 
 
 def planned_time(options: argparse.Namespace) -> float:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import html
 from pathlib import Path
 from string import Template
-from typing import Sequence
+from typing import Mapping, Sequence
 
 import mitsuba as mi
 import numpy as np
@@ -16,6 +16,7 @@ from methods import Method
 from mis_integrators.analysis import charts
 from mis_integrators.analysis.zooms import telling_windows
 from mis_integrators.output import write_png
+from multiview import Race
 from reports import Row, machine
 
 TEMPLATE = Path(__file__).with_name("page.html")
@@ -186,6 +187,47 @@ def variance(name: str, picture: Path) -> str:
             "best single strategy.</figcaption></figure>")
 
 
+# --- Several views --------------------------------------------------------------------------------------
+
+
+def view_counts(rows: Sequence[Row], races: Mapping[str, Race], folder: Path) -> str:
+    """Cost against the number of views, scene by scene; pictures of the first, the middle and the last view of the largest number; the table."""
+    labels = ["volpath", *dict.fromkeys(row["method"] for row in rows)]
+    style = styles_of(labels)
+    parts = []
+    for scene, race in races.items():
+        mine = [row for row in rows if row["scene"] == scene]
+        curves = {label: [(row["views"], row["ratio"]) for row in mine if row["method"] == label] for label in labels[1:]}
+        chart = charts.save(charts.cost_by_count(curves, style, "volpath"), folder / f"views_{scene}.png")
+        parts.append(f'<h3>{scene}</h3><div class="charts"><figure><img alt="cost by number of views" src="{chart}"></figure></div>'
+                     f'<div class="pictures">{_view_cards(scene, race, labels, style, folder)}</div>')
+    densities = charts.data_uri((folder / "multiview_densities.png").read_bytes(), "image/png")
+    return f"""<h2 id="views">Many views at once</h2>
+<p>The first 2, 4, 8, ... views of a scene, rendered together by <b>volpath_multiview</b>, and by <b>volpath</b> one by one.
+The charts show relative variance times seconds over that of volpath: below 1 is better. Variances are those between renders under
+different seeds. Pictures: some views of the largest number, after equal time, with relative errors |x - r| / (r + 0.1), r the mean of all
+other seeds of both.</p>
+{"".join(parts)}{table(rows)}
+<h3>Shifted null interactions</h3><figure class="chart"><img alt="densities" src="{densities}"><figcaption>A segment of 9 m whose null interactions
+move to one of 3 m: their densities there by each stretch, next to the target's own of tentative, null and real interactions.</figcaption></figure>"""
+
+
+def _view_cards(scene: str, race: Race, labels: Sequence[str], style, folder: Path) -> str:
+    """Each chosen view by each method, under the first seed."""
+    reference = np.mean([image for label in labels for image in race.images[label][1:]], axis=0)
+    white = max(float(np.quantile(reference, 0.97)), 1e-9)
+    cards = []
+    for view in sorted({0, race.views // 2, race.views - 1}):
+        truth = np.array_split(reference, race.views, axis=1)[view]
+        for label in labels:
+            image = np.array_split(race.images[label][0], race.views, axis=1)[view]
+            error = (np.abs(image - truth) / (truth + 0.1)).mean(axis=-1)
+            caption = f"view {view + 1} of {race.views}, {race.samples(label)} spp in {race.seconds(label):.1f} s, mean error {error.mean():.3f}"
+            cards.append(_card(chip(label, style[label]), "", image / white, error, image, [], folder / f"views_{scene}_{view}_{_file_name(label)}",
+                               caption))
+    return "".join(cards)
+
+
 # --- Stability ------------------------------------------------------------------------------------------
 
 
@@ -198,7 +240,7 @@ def stability(results, folder: Path, methods: Sequence[Method]) -> str:
     """The sweeps' charts, and the table of choices that follows from them."""
     from stability import choice_rows
 
-    style = styles_of([method.label for method in methods])
+    style = styles_of([*(method.label for method in methods), *(label for _, points in results for label in points)])
     figures, rows = [], []
     for sweep, points in results:
         if points:
@@ -206,7 +248,8 @@ def stability(results, folder: Path, methods: Sequence[Method]) -> str:
             figures.append(f'<figure><img alt="{sweep.name}" src="{uri}"></figure>')
             rows += choice_rows(sweep, points)
     return f"""<h2 id="stability">Where methods break</h2>
-<p>Error in a small room against one parameter, the others fixed; the first iteration of each (pilots, compiling) is free. A method breaks, ringed and
+<p>Error in a small room, or in four views of smoke, against one parameter, the others fixed; the first iteration of each (pilots, compiling) is
+free. A method breaks, ringed and
 crossed, where its error exceeds three times its own median over the sweep, or its mean is off by more than 5 % and four standard errors.</p>
 <div class="charts">{"".join(figures)}</div>
 <h3>Which method where</h3>{table(rows)}"""

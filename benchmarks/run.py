@@ -23,8 +23,10 @@ import references  # noqa: E402
 import stability  # noqa: E402
 import throughput  # noqa: E402
 import variance  # noqa: E402
+import view_counts  # noqa: E402
+import view_weights  # noqa: E402
 from methods import COMPARED, VARIED, parse_method, registered  # noqa: E402
-from scene_files import bundled  # noqa: E402
+from scene_files import BUNDLED, bundled  # noqa: E402
 from sweeps import SWEEPS  # noqa: E402
 
 
@@ -62,6 +64,7 @@ def _parser() -> argparse.ArgumentParser:
     _variance(command, 16)
     _sweeps(command, 0.4)
     command.add_argument("--every-value", dest="coarse", action="store_false", help="all values of the sweeps instead of every other")
+    _views(command, (2, 8, 16, 64), 0.08, 2, 0.5)
 
     command = _measuring(commands, "compare", compare)
     _renders(command, 10)
@@ -118,6 +121,16 @@ def _parser() -> argparse.ArgumentParser:
     command = _measuring(commands, "costs", costs)
     command.add_argument("--scale", type=float, default=1, help="film size, scene's own = 1 (default: 1)")
 
+    command = _measuring(commands, "views", view_counts, scenes=False)
+    _views(command, view_counts.COUNTS, 0.25, 3, 1)
+
+    command = _measuring(commands, "view-weights", view_weights)
+    command.set_defaults(scenes=[BUNDLED / "multiview" / "fly_through.xml"])
+    command.add_argument("--seeds", type=int, default=24, help="renders, at least two (default: 24)")
+    command.add_argument("--iterations", type=int, default=8, help="of each, one sample a pixel (default: 8)")
+    command.add_argument("--groups", type=int, default=8, help="groups of pixels, equally large (default: 8)")
+    command.add_argument("--scale", type=float, default=1, help="film size, scene's own = 1 (default: 1)")
+
     for name, function in (("freeze-scenes", freezing.freeze), ("check-scenes", freezing.check)):
         command = commands.add_parser(name, help=function.__doc__, description=function.__doc__)
         command.set_defaults(run=function)
@@ -159,6 +172,19 @@ def _sweeps(command: argparse.ArgumentParser, seconds: float) -> None:
                          help=f"rendering seconds of each point (default: {seconds})")
     command.add_argument("--room-reference-time", type=float, default=10, metavar="SECONDS",
                          help="rendering seconds of each of the two references of the scene swept (default: 10)")
+
+
+def _views(command: argparse.ArgumentParser, counts: tuple[int, ...], seconds: float, seeds: int, scale: float) -> None:
+    """Which numbers of views of which scenes are compared, and how carefully."""
+    command.add_argument("--view-scenes", nargs="*", type=Path, default=view_counts.SCENES, metavar="FILE.xml",
+                         help="scenes with several views (default: the bundled ones whose views overlap)")
+    command.add_argument("--view-counts", nargs="+", type=int, default=list(counts), metavar="N",
+                         help=f"how many of their views (default: {' '.join(map(str, counts))})")
+    command.add_argument("--view-weights", nargs="+", default=["mis"], metavar="WEIGHTS", help="weights of volpath_multiview (default: mis)")
+    command.add_argument("--view-time", type=float, default=seconds, metavar="SECONDS",
+                         help=f"rendering seconds of each for every view, for 16 at least (default: {seconds})")
+    command.add_argument("--view-seeds", type=int, default=seeds, metavar="N", help=f"renders of each, at least two (default: {seeds})")
+    command.add_argument("--view-scale", type=float, default=scale, metavar="SCALE", help=f"film size, scene's own = 1 (default: {scale:g})")
 
 
 def _renders(command: argparse.ArgumentParser, seconds: float | None) -> None:

@@ -7,14 +7,14 @@ from typing import Sequence
 
 import mitsuba as mi
 
-from methods import Method, SessionMaker
+from methods import Method, SessionMaker, parse_method
 from mis_integrators import loading
 from mis_integrators.analysis.metrics import References
 from mis_integrators.analysis.stability import Point, breaks, choose, judge
 from references import colours, find_references
 from reports import Row, console, save, show, tell
 from scene_files import OpenScene
-from sweeps import SWEEPS, Sweep, room, rooms
+from sweeps import SWEEPS, Sweep
 from turns import Contender, take_turns
 
 Points = dict[str, list[Point]]
@@ -39,7 +39,7 @@ def sweep_all(options: argparse.Namespace) -> list[tuple[Sweep, Points]]:
     results = []
     for sweep in SWEEPS:
         if sweep.name in options.sweeps:
-            points = measure_sweep(sweep, options.integrators, options)
+            points = measure_sweep(sweep, sweep.methods(options.integrators), options)
             results.append((sweep, points))
             rows += point_rows(sweep, points)
             choices += choice_rows(sweep, points)
@@ -55,13 +55,13 @@ def measure_sweep(sweep: Sweep, methods: Sequence[Method], options: argparse.Nam
     """Errors of all methods that the sweep concerns, `point_time` seconds of rendering each after a first iteration that is free (pilots,
     recording: this is about what a method can do, not about how soon it starts)."""
     seconds = options.point_time
-    values = rooms(sweep, options.coarse)
+    values = sweep.scenes(options.coarse)
     points: Points = {}
     opened = None
     for value, change in values:
         if opened is None or change:
-            opened = room(options.size, **change)
-            references = room_references(opened, options)
+            opened = sweep.scene(options.size, **change)
+            references = sweep_references(sweep, opened, options)
         contenders = []
         for method in methods:
             tried = _with_value(method, sweep, value)
@@ -99,9 +99,10 @@ def knows(plugin: str, parameter: str, value: float) -> bool:
     return True
 
 
-def room_references(opened: OpenScene, options: argparse.Namespace) -> References:
-    """Two halves by `path`, kept like those of scenes."""
-    how = argparse.Namespace(references=options.references, reference_time=options.room_reference_time, reference_method=None)
+def sweep_references(sweep: Sweep, opened: OpenScene, options: argparse.Namespace) -> References:
+    """Two halves by the sweep's reference method, kept like those of scenes."""
+    how = argparse.Namespace(references=options.references, reference_time=options.room_reference_time,
+                             reference_method=parse_method(sweep.reference))
     return find_references(opened, how, tell)
 
 
@@ -109,8 +110,8 @@ def prepare(options: argparse.Namespace) -> None:
     """Make the references of all sweeps that the options name, where they are missing."""
     for sweep in SWEEPS:
         if sweep.name in options.sweeps:
-            for _, change in rooms(sweep, options.coarse):
-                room_references(room(options.size, **change), options)
+            for _, change in sweep.scenes(options.coarse):
+                sweep_references(sweep, sweep.scene(options.size, **change), options)
 
 
 def point_rows(sweep: Sweep, points: Points) -> list[Row]:

@@ -1,4 +1,4 @@
-"""The small scene whose parameters are swept, and which sweeps there are.
+"""Which sweeps there are, and the small scene most of them vary (see `smoke` for the other one).
 
 A room of diffuse walls, 2 units wide, open towards the camera: a glossy floor of metal, a diffuse sphere on it, a plastic block that leans, and
 a square lamp. What a sweep does not vary keeps the values of `room`.
@@ -8,38 +8,13 @@ from __future__ import annotations
 
 import inspect
 from dataclasses import dataclass
+from typing import Callable, Sequence
 
 import mitsuba as mi
 
+from methods import Method, registered
 from scene_files import OpenScene
-
-
-@dataclass(frozen=True)
-class Sweep:
-    """A parameter and its values. `of_method`: a parameter of those methods that know it; else one of the scene (see `room`)."""
-
-    name: str
-    parameter: str
-    values: tuple[float, ...]
-    of_method: bool
-    what: str
-
-
-SWEEPS = (
-    Sweep("radius", "initial_radius", (0.005, 0.015, 0.05, 0.15, 0.5), True, "merge radius (the room is 2 wide)"),
-    Sweep("photons", "photon_count", (100, 1000, 4096, 30000, 200000), True, "light sub-paths an iteration, N_F"),
-    Sweep("camera_paths", "camera_paths", (1, 2, 4, 8, 16), True, "camera paths per pixel and iteration, N_B"),
-    Sweep("roughness", "roughness", (0.01, 0.03, 0.1, 0.3, 0.7), False, "roughness of the floor"),
-    Sweep("light_size", "light_size", (0.003, 0.01, 0.04, 0.2, 0.9), False, "half the edge of the lamp"),
-    Sweep("light_distance", "light_distance", (0.01, 0.03, 0.1, 0.3, 0.9), False, "distance of the lamp from the ceiling that it faces"),
-    Sweep("depth", "max_depth", (3, 4, 6, 10, 20), False, "longest path (max_depth)"),
-    Sweep("scale", "scale", (1e-3, 3e-2, 1, 30, 1e3), False, "size of the whole scene"),
-)
-
-
-def rooms(sweep: Sweep, coarse: bool) -> list[tuple[float, dict[str, float]]]:
-    """The sweep's values, and what each changes in the scene: every other value if `coarse`."""
-    return [(value, {} if sweep.of_method else {sweep.parameter: value}) for value in (sweep.values[::2] if coarse else sweep.values)]
+from smoke import smoke_views
 
 
 def room(size: int, roughness: float = 0.15, light_size: float = 0.15, light_distance: float | None = None, max_depth: int = 8,
@@ -90,3 +65,48 @@ def _rgb(*values):
 
 def _diffuse(*values):
     return {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": _rgb(*values)}}
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """A parameter and its values. `of_method`: a parameter of those methods that know it; else one of the scene."""
+
+    name: str
+    parameter: str
+    values: tuple[float, ...]
+    of_method: bool
+    what: str
+    scene: Callable[..., OpenScene] = room
+    """Makes the scene: of the film's size, and of parameters."""
+    labels: tuple[str, ...] = ()
+    """Methods that are compared, if not those asked for."""
+    reference: str = "path"
+    """What renders the references."""
+
+    def methods(self, asked: Sequence[Method]) -> Sequence[Method]:
+        """Methods that are compared where these are `asked` for."""
+        return registered(self.labels) if self.labels else asked
+
+    def scenes(self, coarse: bool) -> list[tuple[float, dict[str, float]]]:
+        """The sweep's values, and what each changes in the scene: every other value if `coarse`."""
+        return [(value, {} if self.of_method else {self.parameter: value}) for value in (self.values[::2] if coarse else self.values)]
+
+
+OF_VIEWS = {"scene": smoke_views, "reference": "volpath", "labels": (
+    "volpath", "volpath_multiview", "volpath_multiview:weights=power", "volpath_multiview:weights=mwis", "volpath_multiview:weights=none",
+    "volpath_multiview:shift=majorant_optical_depth_copy")}
+"""Sweeps of several views: what is compared is how they share paths."""
+
+SWEEPS = (
+    Sweep("radius", "initial_radius", (0.005, 0.015, 0.05, 0.15, 0.5), True, "merge radius (the room is 2 wide)"),
+    Sweep("photons", "photon_count", (100, 1000, 4096, 30000, 200000), True, "light sub-paths an iteration, N_F"),
+    Sweep("camera_paths", "camera_paths", (1, 2, 4, 8, 16), True, "camera paths per pixel and iteration, N_B"),
+    Sweep("roughness", "roughness", (0.01, 0.03, 0.1, 0.3, 0.7), False, "roughness of the floor"),
+    Sweep("light_size", "light_size", (0.003, 0.01, 0.04, 0.2, 0.9), False, "half the edge of the lamp"),
+    Sweep("light_distance", "light_distance", (0.01, 0.03, 0.1, 0.3, 0.9), False, "distance of the lamp from the ceiling that it faces"),
+    Sweep("depth", "max_depth", (3, 4, 6, 10, 20), False, "longest path (max_depth)"),
+    Sweep("scale", "scale", (1e-3, 3e-2, 1, 30, 1e3), False, "size of the whole scene"),
+    Sweep("density", "density", (0.1, 0.5, 2, 8, 32), False, "four views: majorant of the smoke (2 wide)", **OF_VIEWS),
+    Sweep("spacing", "spacing", (0.02, 0.06, 0.2, 0.6, 1.5), False, "four views: angle between neighbours [rad]", **OF_VIEWS),
+    Sweep("anisotropy", "sideways", (0.03, 0.1, 0.25, 0.5, 1), False, "four views: 1 - g of the phase function", **OF_VIEWS),
+)

@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 from types import SimpleNamespace
 
+import mitsuba as mi
 import numpy as np
 import pytest
 
@@ -135,10 +136,47 @@ def test_winner_and_those_that_cannot_be_told_apart(module):
 # --- The commands ---------------------------------------------------------------------------------------
 
 
+def test_sweeps_of_views(module):
+    """The views' sweeps name plugins that there are, and vary what they say."""
+    sweeps = [sweep for sweep in module("sweeps").SWEEPS if sweep.labels]
+    assert {sweep.parameter for sweep in sweeps} == {"density", "spacing", "sideways"}
+    for sweep in sweeps:
+        assert [method.label for method in sweep.methods([])] == list(sweep.labels)
+        (_, low), *_, (_, high) = sweep.scenes(coarse=True)
+        scenes = [sweep.scene(16, **change) for change in (low, high)]
+        assert scenes[0].size == (32, 8) and scenes[0].name != scenes[1].name and scenes[0].made != scenes[1].made
+        parameters = [{name: str(value) for name, value in mi.traverse(opened.scene)} for opened in scenes]
+        assert parameters[0].keys() == parameters[1].keys() and parameters[0] != parameters[1]
+
+
+def test_first_views_of_a_scene(module):
+    """Those of a batch, and sensors of their own."""
+    load, folder = module("multiview").load, BENCHMARKS.parent / "scenes" / "multiview"
+    orbit, parameters = load(folder / "smoke_orbit.xml", 0.25, 3)
+    assert tuple(orbit.sensors()[0].film().size()) == (48, 16) and parameters["max_depth"] == 64
+    whole, _ = load(folder / "smoke_orbit.xml", 0.25)
+    assert tuple(whole.sensors()[0].film().size()) == (256, 16)
+    flight, _ = load(folder / "fly_through.xml", 0.5, 2)
+    assert [tuple(sensor.film().size()) for sensor in flight.sensors()] == [(32, 32)] * 2
+
+
 def test_defaults_name_registered_plugins_only(module):
     methods = module("methods")
     assert [m.label for m in methods.registered(("path", "nonsense", "bdpm:bdd=0"))] == ["path", "bdpm:bdd=0"]
     assert methods.registered(methods.COMPARED)[0].label == methods.BASE
+
+
+VIEWS = """<scene version="3.0.0">
+  <default name="resx" value="48"/><default name="resy" value="16"/>
+  <integrator type="volpath_multiview"><integer name="max_depth" value="2"/></integrator>
+  <emitter type="constant"/>
+  <shape type="sphere"><bsdf type="diffuse"/></shape>
+  <sensor type="batch"><film type="hdrfilm"><integer name="width" value="$resx"/><integer name="height" value="$resy"/><rfilter type="box"/></film>
+    <sensor type="perspective"><transform name="to_world"><lookat origin="0,0,5" target="0,0,0" up="0,1,0"/></transform></sensor>
+    <sensor type="perspective"><transform name="to_world"><lookat origin="1,0,5" target="0,0,0" up="0,1,0"/></transform></sensor>
+    <sensor type="perspective"><transform name="to_world"><lookat origin="0,1,5" target="0,0,0" up="0,1,0"/></transform></sensor>
+  </sensor>
+</scene>"""
 
 
 def test_page_of_one_small_scene(module, tmp_path):
@@ -149,13 +187,16 @@ def test_page_of_one_small_scene(module, tmp_path):
         <sensor type="perspective"><transform name="to_world"><lookat origin="0,0,4" target="0,0,0" up="0,1,0"/></transform>
         <film type="hdrfilm"><integer name="width" value="48"/><integer name="height" value="40"/></film></sensor>
         <shape type="sphere"/><emitter type="point"><point name="position" x="1" y="2" z="4"/></emitter></scene>""")
-    argv = ["page", "--scenes", str(scene), "--integrators", "path", "bdpm:bdd=0", "bdpm:bdd=0,bogus=1", "--varied", "bdpm:bdd=0", "--time", "0.3",
+    views = tmp_path / "views.xml"
+    views.write_text(VIEWS)
+    argv = ["page", "--scenes", str(scene), "--view-scenes", str(views), "--view-counts", "2", "3", "4", "--view-time", "0.01", "--view-seeds", "2",
+            "--integrators", "path", "bdpm:bdd=0", "bdpm:bdd=0,bogus=1", "--varied", "bdpm:bdd=0", "--time", "0.3",
             "--seeds", "2", "--reference-time", "0.2", "--references", str(tmp_path / "references"), "--iterations", "2", "--sweeps", "camera_paths",
             "--size", "16", "--point-time", "0.05", "--room-reference-time", "0.3", "--out", str(tmp_path / "out")]
     module("run").main(argv)
     page = (tmp_path / "out" / "index.html").read_text()
     assert "src=\"http" not in page and page.count('src="data:') >= 12
-    for part in ("geometric mean", "error against time", "variance of one iteration", "Which method where", "bogus", "HDR-FLIP"):
+    for part in ("Many views at once", "view 3 of 3", "geometric mean", "error against time", "variance of one iteration", "Which method where", "bogus", "HDR-FLIP"):
         assert part in page or (part == "HDR-FLIP" and "relative error" in page), part
     references, opened = module("references"), module("scene_files").open_scene(scene)
     kept = {"references": tmp_path / "references", "reference_method": None}
@@ -164,6 +205,9 @@ def test_page_of_one_small_scene(module, tmp_path):
     rows = json.loads((tmp_path / "out" / "compare.json").read_text())["rows"]
     assert [r["method"] for r in rows] == ["path", "bdpm:bdd=0"]
     assert rows[0]["relMSE ratio"] == 1 and 0.9 < rows[1]["mean ratio"] < 1.1
-    for name in ("converge.csv", "variance.csv", "stability.csv", "which_method.md", "which_scene.md", "tiny_time.png",
+    counts = json.loads((tmp_path / "out" / "view_counts.json").read_text())["rows"]
+    assert [r["views"] for r in counts] == [2, 3]                      # there are no four
+    assert all(r["ratio"] == pytest.approx(r["variance x s"] / r["volpath variance x s"]) and r["samples"] > 0 for r in counts)
+    for name in ("converge.csv", "views_views.png", "views_views_2_volpath.png", "variance.csv", "stability.csv", "which_method.md", "which_scene.md", "tiny_time.png",
                  "tiny_path.png", "variance_tiny_1.png"):
         assert (tmp_path / "out" / name).stat().st_size > 0

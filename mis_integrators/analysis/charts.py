@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib import colormaps, rc_context
 from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
+from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullFormatter, NullLocator
 
 from .stability import Point, breaks
 
@@ -117,6 +117,32 @@ def sweep(title: str, sweeps: Mapping[str, Sequence[Point]], style: Mapping[str,
             axis.plot(*zip(*broken), "x", ms=7, color=look.colour, mew=2)
     _logarithmic(axis, title, "relMSE without the worst 0.1 %")
     _legend(axis, "ringed: breaks")
+    return figure
+
+
+def cost_by_count(curves: Mapping[str, Sequence[tuple[int, float]]], style: Mapping[str, Style], base: str) -> Figure:
+    """Each method's (number of views, variance x time over that of `base`); the base itself is the line at one."""
+    figure, axis = _axes(4.6, 3.4)
+    axis.axhline(1, color=style[base].colour, lw=2, alpha=0.6, label=base)
+    for label, points in curves.items():
+        look = style[label]
+        axis.plot(*zip(*points), look.dashes, color=look.colour, marker=look.marker, ms=5, lw=1.6, label=label)
+    _logarithmic(axis, "views", f"variance x time, {base} = 1")
+    counts = sorted({count for points in curves.values() for count, _ in points})
+    axis.xaxis.set_major_locator(FixedLocator(counts))
+    axis.set_ylim(min(axis.get_ylim()[0], 0.7), max(axis.get_ylim()[1], 1.4))
+    _legend(axis, "method")
+    return figure
+
+
+def by_share(curves: Mapping[str, Sequence[tuple[float, float]]]) -> Figure:
+    """Variances of estimators, relative to that of the first, against the share of the weights that other views bring."""
+    figure, axis = _axes(5.0, 3.4)
+    for number, (label, points) in enumerate(curves.items()):
+        colour, marker, dashes = (kind[number % len(kind)] for kind in (OTHERS, MARKERS, DASHES))
+        axis.plot(*zip(*points), dashes, marker=marker, ms=5, lw=1.6, color=colour, label=label)
+    axis.set(xlabel="share of other views in the pixel's weights", ylabel=f"variance, {next(iter(curves))} = 1", ylim=(0, None))
+    _legend(axis, "estimator")
     return figure
 
 

@@ -14,8 +14,8 @@ from ..transport.random import mix, streams
 from ..transport.recording import recorder
 from ..transport.traits import UnsupportedScene, check_variant
 from ..volume.films import OWN, SHARED, ViewAccumulator, own_values, splat, write_film
-from ..volume.lines import connect, own_line
-from ..volume.pivots import ON_SURFACE, OWN as OWN_BRANCH, pivot_surface, trace_first_segments
+from ..volume.lines import common_nulls, connect, follow_nulls, sight
+from ..volume.pivots import NOWHERE, ON_SURFACE, OWN as OWN_BRANCH, of_paths, pivot_surface, trace_first_segments
 from ..volume.shifts import SHIFTS
 from ..volume.suffixes import continue_paths, scattered_to
 from ..volume.traits import VolumeTraits, check_volume_scene
@@ -51,6 +51,10 @@ class VolpathMultiview(IterativeIntegrator):
        - ``mis`` (balance heuristic), ``power`` (power heuristic, exponent 2), ``mwis`` (``mis`` divided by the sum of the weights that arrived
          at each pixel: consistent, biased at few samples), or ``none`` (the same weight for every view that can make the path: unbiased and
          noisy, for comparison). (Default: ``mis``)
+     * - add_nulls
+       - |bool|
+       - Add null interactions to first segments until all views that see a pivot expect equally many: without them, views hardly agree where
+         majorants are far above the density. Of no effect on copying shifts. (Default: yes, i.e. |true|)
      * - camera_paths
        - |int|
        - Camera paths per pixel and iteration; 0 stands for as many as keep the processor busy, in eight iterations at least. (Default: 0)
@@ -97,9 +101,10 @@ class VolpathMultiview(IterativeIntegrator):
     def read_parameters(self, parameters):
         self.shift = parameters.choice("shift", "majorant_optical_depth", tuple(SHIFTS))
         self.weights = parameters.choice("weights", "mis", HEURISTICS)
+        self.add_nulls = parameters.boolean("add_nulls", True)
 
     def settings(self):
-        return {**super().settings(), "shift": self.shift, "weights": self.weights}
+        return {**super().settings(), "shift": self.shift, "weights": self.weights, "add_nulls": self.add_nulls}
 
     def session(self, scene, sensor=0, seed=0, spp=0):
         sensor = self._sensor(scene, sensor)
@@ -158,9 +163,9 @@ class MultiViewSession(IterativeSession):
 
     def _freeze(self):
         """Records the passes anew."""
-        self._tables = [self.views.table, *([] if self.lights.dark else self.lights.tables())]
-        self._first_pass, self._connection_pass, self._suffix_pass, self._splat_pass = map(
-            self.recorded, (self._trace_first, self._connect, self._continue, self._splat))
+        self._tables = [self.views.table, self.traits.shares, *([] if self.lights.dark else self.lights.tables())]
+        self._first_pass, self._sight_pass, self._agreement_pass, self._connection_pass, self._suffix_pass, self._splat_pass = map(
+            self.recorded, (self._trace_first, self._look, self._agree, self._connect, self._continue, self._splat))
 
     # ------------------------------------------------------------------ passes
 
@@ -171,19 +176,38 @@ class MultiViewSession(IterativeSession):
                                                     spectral["weight"], integrator.hide_emitters, active)
         line, found = {}, mi.UInt32(0)
         if self.views.count > 1:
-            shared = active & pivot["in_window"] & (pivot["branch"] != OWN_BRANCH)
-            line, found = own_line(scene, self.views, self.traits, pivot, self.slots, integrator.hide_emitters, shared)
+            shared = active & pivot["in_window"] & (pivot["kind"] != NOWHERE) & (pivot["branch"] != OWN_BRANCH)
+            line, found = sight(scene, self.views, self.traits, pivot, pivot["view"], self.slots, integrator.hide_emitters, shared)
+            line["log_density"] = mi.Float(line["log_survival"])
         return pivot, radiance, line, found
 
-    def _connect(self, scene, tables, pivots, lines, numbers, seed):
+    def _pairs(self):
+        """View and path of each connection."""
         q = dr.arange(mi.UInt32, self.paths * self.views.count)
-        view, path = q // self.paths, q % self.paths
-        pivot, line = (dr.gather(type(record), record, path) if not isinstance(record, dict) else _gather(record, path) for record in (pivots, lines))
+        return q // self.paths, q % self.paths
+
+    def _look(self, scene, tables, pivots, lines, numbers):
+        """Every other view's line of sight to each pivot."""
+        view, path = self._pairs()
+        pivot = of_paths(pivots, path)
+        active = (dr.gather(mi.UInt32, numbers, path) < self.views.paths) & (dr.gather(mi.Float, lines["density"], path) > 0)
+        active &= view != pivot["view"]
+        return sight(scene, self.views, self.traits, pivot, view, self.slots, self.integrator.hide_emitters, active)
+
+    def _agree(self, scene, tables, pivots, lines, sights, numbers, seed):
+        """What views are made to agree about, and the paths' own densities and tints under it."""
+        active = (numbers < self.views.paths) & (lines["density"] > 0)
+        common = dr.zeros(mi.Float, self.paths)
+        if self.integrator.add_nulls and not self.integrator.shift.endswith("copy"):
+            common = common_nulls(lines, sights, pivots["view"], self.views.count, active)
+        log_density, tint, _, _ = follow_nulls(self.traits, None, pivots, lines, lines, common, numbers, seed, self.slots, active)
+        return common, log_density, dr.select(active, tint, pivots["tint"])
+
+    def _connect(self, scene, tables, pivots, lines, sights, common, numbers, seed):
+        _, path = self._pairs()
         number = dr.gather(mi.UInt32, numbers, path)
-        active = (number < self.views.paths) & (view != pivot["view"])
-        connection, found = connect(scene, self.views, self.traits, SHIFTS[self.integrator.shift], pivot, line, view, number, seed, self.slots,
-                                    self.integrator.hide_emitters, active)
-        return connection, found
+        return connect(self.traits, SHIFTS[self.integrator.shift], of_paths(pivots, path), of_paths(lines, path), sights,
+                       dr.gather(mi.Float, common, path), number, seed, self.slots, number < self.views.paths)
 
     def _continue(self, scene, tables, pivot, connections, number, seed):
         integrator = self.integrator
@@ -197,9 +221,8 @@ class MultiViewSession(IterativeSession):
         image = splat(views, [(pivots["view"], pivots["position"], own)], SHARED + OWN, [active])
         if views.count == 1:
             return image[:, :, :SHARED], image[:, :, SHARED:]
-        q = dr.arange(mi.UInt32, self.paths * views.count)
-        view, path = q // self.paths, q % self.paths
-        pivot, suffix = _gather(pivots, path), _gather(suffixes, path)
+        view, path = self._pairs()
+        pivot, suffix = of_paths(pivots, path), of_paths(suffixes, path)
         # The path's own view was served above.
         reached = (connections["ratio"] > 0) & ~suffix["alone"]
         surface = pivot_surface(pivot, reached & (pivot["kind"] == ON_SURFACE))
@@ -237,8 +260,15 @@ class MultiViewSession(IterativeSession):
             connections, more = None, mi.UInt32(0)
             if self.views.count > 1:
                 dr.eval(pivots, radiance, lines, found)
-                connections, more = self._connection_pass(self.scene, self._tables, pivots, lines, numbers, seed)
-                dr.eval(connections, more)
+                sights, more = self._sight_pass(self.scene, self._tables, pivots, lines, numbers)
+                dr.eval(sights, more)
+                common = dr.zeros(mi.Float, self.paths)
+                if self.traits.has_null_media:
+                    agreed = self._agreement_pass(self.scene, self._tables, pivots, lines, sights, numbers, seed)
+                    common, lines["log_density"], pivots["tint"] = agreed
+                dr.eval(common, lines, pivots)
+                connections = self._connection_pass(self.scene, self._tables, pivots, lines, sights, common, numbers, seed)
+                dr.eval(connections)
             suffixes, value = self._suffix_pass(self.scene, self._tables, pivots, connections, numbers, seed)
             dr.eval(suffixes, value)
             layers = self._splat_pass(self.scene, self._tables, pivots, radiance, connections, suffixes, value, numbers, spectral)
@@ -294,12 +324,6 @@ class MultiViewSession(IterativeSession):
     def fill_film(self):
         """Hands what has been rendered so far to the sensor's film, side by side for a `batch`."""
         self._fill(self.sensor.film(), self.accumulator.pictures()[:self.views.members[0]])
-
-
-def _gather(record, index):
-    """The entries `index` of every array of a dictionary (and of lists in it)."""
-    return {name: [dr.gather(type(v), v, index) for v in value] if isinstance(value, list) else dr.gather(type(value), value, index)
-            for name, value in record.items()}
 
 
 def render_views(scene, integrator=None, spp=0, seed=0):

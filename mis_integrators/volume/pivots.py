@@ -13,13 +13,18 @@ NOWHERE, IN_MEDIUM, ON_SURFACE = range(3)
 SHARED, OWN = 0, 1
 """Whether other views may join at the pivot, or the path goes on by a delta function and is its own view's alone."""
 
-NULL_SALT = 0x6e756c6c
+NULL_SALT, ADDED_SALT = 0x6e756c6c, 0x61646465
 
 
 def null_stream(number, seed):
     """The random numbers that place a path's null interactions: optical depths between tentative collisions on the first segment. They can be drawn
     again wherever the interactions are needed, so none is stored."""
     return streams(number, seed ^ NULL_SALT)
+
+
+def added_stream(number, seed):
+    """The random numbers that place null interactions which are added to a path (see `lines.common_nulls`)."""
+    return streams(number, seed ^ ADDED_SALT)
 
 
 def next_gap(rng, active=True):
@@ -46,7 +51,7 @@ def trace_first_segments(scene, views, traits, number, seed, rng, wavelengths, s
     - `view`, `position`, `aperture`, `in_window`: of the camera ray (see `Views.sample`);
     - `weight`, `tint`: spectra whose product is what the path carries when it scatters, measured value over density; the former belongs to the
       pivot and is every view's, the latter to the path's own first segment;
-    - `log_passed`: logarithm of the probabilities with which it passed null interactions and null surfaces; `nulls`: how many null interactions;
+    - `nulls`: how many null interactions it passed;
     - `visible`: what the alpha channel shows.
     """
     view, ray, position, aperture, in_window = views.sample(number, wavelengths, rng, active)
@@ -56,7 +61,6 @@ def trace_first_segments(scene, views, traits, number, seed, rng, wavelengths, s
     gap = next_gap(gaps, active)
     tint = mi.Spectrum(1)
     weight = mi.Spectrum(1)
-    log_passed = mi.Float(0)
     nulls = mi.UInt32(0)
     kind = mi.UInt32(NOWHERE)
     branch = mi.UInt32(SHARED)
@@ -87,7 +91,6 @@ def trace_first_segments(scene, views, traits, number, seed, rng, wavelengths, s
         gap = dr.select(inside & ~collided, dr.maximum(gap - majorant * (far - near), 0), gap)
         gap[passes] = next_gap(gaps, passes)
         tint[passes] = tint * null
-        log_passed[passes] = log_passed + dr.log(dr.maximum(probability, 1e-30))
         nulls[passes] += 1
         weight[scatters] = real
         kind[scatters] = IN_MEDIUM
@@ -110,7 +113,6 @@ def trace_first_segments(scene, views, traits, number, seed, rng, wavelengths, s
         through, passing_probability = dr.select(hidden, mi.Spectrum(1), through), dr.select(hidden, 1, passing_probability)
         crosses = met & (rng.next_float32(met) < passing_probability)
         tint[crosses] = tint * through * dr.rcp(dr.maximum(passing_probability, 1e-30))
-        log_passed[crosses] = log_passed + dr.log(dr.maximum(passing_probability, 1e-30))
         stops = met & ~crosses
         smooth = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
         delta = mi.has_flag(bsdf.flags(), mi.BSDFFlags.DeltaReflection) | mi.has_flag(bsdf.flags(), mi.BSDFFlags.DeltaTransmission)
@@ -140,7 +142,7 @@ def trace_first_segments(scene, views, traits, number, seed, rng, wavelengths, s
     pivot = {"kind": dr.select(active, kind, NOWHERE), "branch": branch, "p": p, "medium": dr.select(reached, medium, dr.zeros(mi.MediumPtr)),
              "wi": -ray.d, "time": ray.time, "wavelengths": ray.wavelengths, "hit": hit, "ray_o": ray.o, "ray_d": ray.d, "view": view,
              "position": position, "aperture": aperture, "in_window": in_window, "tint": tint, "weight": weight * sensor_weight,
-             "log_passed": log_passed, "nulls": nulls, "visible": dr.select(active & visible, mi.Float(1), mi.Float(0))}
+             "nulls": nulls, "visible": dr.select(active & visible, mi.Float(1), mi.Float(0))}
     return pivot, dr.select(active, radiance * sensor_weight, 0), rng
 
 
@@ -149,3 +151,9 @@ def pivot_surface(pivot, active):
     ray = mi.Ray3f(pivot["ray_o"], pivot["ray_d"], pivot["time"], pivot["wavelengths"])
     hit = dr.select(active, pivot["hit"], dr.zeros(mi.PreliminaryIntersection3f))
     return hit.compute_surface_interaction(ray, mi.RayFlags.All, active)
+
+
+def of_paths(record, index):
+    """The entries `index` of every array of a dictionary (and of lists in it)."""
+    return {name: [dr.gather(type(v), v, index) for v in value] if isinstance(value, list) else dr.gather(type(value), value, index)
+            for name, value in record.items()}

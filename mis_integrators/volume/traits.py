@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from ..transport.guide import infinite_emitters
 from ..transport.traits import UnsupportedScene, check_emitters, check_variant, scene_objects, used_bsdfs
@@ -14,7 +15,8 @@ class VolumeTraits:
     """Attributes: `has_grids` (media that are not homogeneous), `has_null_media` (media in which collisions may be null: grids, and media whose
     extinction depends on the channel), `has_infinite_lights`, `has_delta` (specular reflection or refraction), `has_mixed` (smooth and specular
     parts in one BSDF), `has_null_vertices` (BSDFs that let part of the light pass straight on), `has_masks` (BSDFs that ignore the component
-    mask), `boundary_flags` (what must be known of surfaces that only let light pass)."""
+    mask), `boundary_flags` (what must be known of surfaces that only let light pass), `shares` (see `density_share`, by the media's registry
+    numbers)."""
 
     def __init__(self, scene, sensors):
         flag = mi.BSDFFlags
@@ -31,6 +33,23 @@ class VolumeTraits:
         media = [o for root in (scene, *sensors) for o in scene_objects(root) if isinstance(o, mi.Medium)]
         self.has_grids = any(not m.is_homogeneous() for m in media)
         self.has_null_media = self.has_grids or any(_is_coloured(m) for m in media)
+        numbers = [int(dr.reinterpret_array(mi.UInt32, mi.MediumPtr(m))[0]) for m in media]
+        shares = np.zeros(max(numbers, default=0) + 1, dtype=np.float32)
+        shares[numbers] = [_mean_over_majorant(m) for m in media]
+        self.shares = mi.Float(shares)
+        dr.make_opaque(self.shares)
+
+    def density_share(self, medium, active):
+        """Roughly, a medium's mean density over its majorant: how many tentative collisions are real."""
+        return dr.gather(mi.Float, self.shares, dr.reinterpret_array(mi.UInt32, medium), active)
+
+
+def _mean_over_majorant(medium):
+    """Mean extinction over its maximum: of the grid's values where there is a grid, of the channels elsewhere. What is unknown counts as thin."""
+    parameters = mi.traverse(medium)
+    name = next((name for name in ("sigma_t.data", "sigma_t.value.value", "sigma_t.value") if name in parameters), None)
+    values = np.abs(np.array(parameters[name], dtype=np.float64)) if name else np.zeros(1)
+    return float(values.mean() / values.max()) if values.max() > 0 else 0.0
 
 
 def _is_coloured(medium):
