@@ -177,7 +177,7 @@ def test_means(rgb):
 
 
 def test_media_are_handed_over(rgb):
-    scene = foggy_world(view((0, 1, 4)), smoke(even(np.random.default_rng(0), 4)))
+    scene = foggy_world(view((0, 1, 4)), smoke(even, 4))
     session = auto(max_depth=6).session(scene, spp=16)
     session.iterate()
     assert session.settings["integrator"] == "volpath_multiview" and session.settings["max_depth"] == 6
