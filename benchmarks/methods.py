@@ -16,7 +16,7 @@ PASS_SECONDS = 0.2
 """What one pass of one of Mitsuba's own integrators should take: short, but long beside its start."""
 
 # All defaults: what this package does not register is left out, so a plugin may be named here before it exists.
-COMPARED = ("path", "ptracer", "bdpm:bdd=0", "bdpm:bdd=1", "bdpm_balance", "bdpm_opt2", "bdpm_opt3", "bdpt", "vcm", "pcbpt", "bdpt_ris")
+COMPARED = ("path", "ptracer", "bdpm:bdd=0", "bdpm:bdd=1", "bdpm_balance", "bdpm_opt2", "bdpm_opt3", "bdpm_auto", "bdpt", "vcm", "pcbpt", "bdpt_ris")
 """What is compared unless said otherwise; ratios are to the first."""
 VARIED = ("bdpm:bdd=0", "bdpm:bdd=1", "bdpm:bdd=2", "bdpm_balance", "bdpm_opt3", "bdpm_opt2:mix_diffuse=true", "bdpm_opt3:mix_diffuse=true")
 """What variance maps are made of unless said otherwise: strategies that merge, alone and together."""
