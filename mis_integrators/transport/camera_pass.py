@@ -149,6 +149,7 @@ def trace_camera_paths(scene, sensor, integrator, lights, traits, seed, first, s
             radiance[shown] += throughput * share * ds.emitter.eval(si, shown)
 
         active &= si.is_valid() & (vertex <= bdd)
+        met = mi.Bool(active)                        # a surface, perhaps the last one
         if dr.hint(max_depth > 0, mode='scalar'):
             active &= depth < max_depth
         bsdf = si.bsdf(ray)
@@ -207,9 +208,9 @@ def trace_camera_paths(scene, sensor, integrator, lights, traits, seed, first, s
                 dr.scatter(store.vertices["share"], share_here, slot, wants)
 
         # ---- Go on
-        bs, weight = bsdf.sample(context, si, rng.next_float32(active), next_2d(rng, active), active)
+        bs, weight = bsdf.sample(context, si, rng.next_float32(met), next_2d(rng, met), met)
         delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-        visible |= active & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
+        visible |= met & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
         if dr.hint(not traits.has_light_surfaces, mode='scalar'):
             active &= delta | ~ends
         if dr.hint(weights is not None, mode='scalar'):
