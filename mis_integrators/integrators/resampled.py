@@ -20,7 +20,7 @@ from ..transport.lights import Lights
 from ..transport.packing import rounded_up
 from ..transport.proposals import Proposals, cumulative_sums
 from ..transport.random import mix, next_2d, vertex_streams
-from ..transport.recording import recorder
+from ..transport.recording import lanes, recorder
 from ..transport.subpaths import junction_of, read_vertices, trace_light_subpaths
 from ..transport.traits import SceneTraits
 from .common import IterativeIntegrator, IterativeSession
@@ -32,8 +32,6 @@ CACHE_SHARE, FEWEST_CACHE_POINTS = 1 / 300, 256
 """Cache points: this share of a part's camera vertices, but at least so many. More of them cost shadow rays."""
 MOST_PAIRS = 1 << 24
 """Pairs of a cache point and a light vertex at most, four bytes each (and some more while they are made); beyond that there are fewer cache points."""
-DOUBTFUL_RATIO = 10
-"""Light sub-paths over M beyond which images have been seen 1 % too dark (docs/bdpt_ris.md, known defect)."""
 PILOT_SETS = 8
 """Sets of M light sub-paths from which Q and Q_s are estimated before the first iteration, if as many are traced."""
 
@@ -72,9 +70,6 @@ class ResampledSession(IterativeSession):
         width, height = sensor.film().crop_size()
         self.pixel_paths = width * height * integrator.camera_paths
         self.ratio = self.light_chunk * self.chunks / self.pixel_paths
-        if self.light_chunk > DOUBTFUL_RATIO * integrator.light_paths:
-            mi.Log(mi.LogLevel.Warn, f"{integrator.plugin}: with {self.light_chunk} light sub-paths an iteration and light_paths = "
-                                     f"{integrator.light_paths} the image may be 1 % too dark (docs/bdpt_ris.md); use bdpt where that matters")
         self.capacity = {"light": rounded_up(4 * self.light_chunk), "camera": rounded_up(4 * self.chunk), "hits": rounded_up(self.chunk),
                          "ends": rounded_up(6 * integrator.light_paths)}
         depth = integrator.max_depth
@@ -135,7 +130,7 @@ class ResampledSession(IterativeSession):
         ends = self._ends(starts, light, places, found)
         width = M + room
         points = dr.width(cache["depth"])
-        index = dr.arange(mi.UInt32, points * width)
+        index = lanes(points * width)
         point, end = index // width, index % width
         active = end < dr.gather(mi.UInt32, ends.count, 0)
         z = {name: dr.gather(type(values), values, point, active) for name, values in cache.items()}
@@ -169,7 +164,7 @@ class ResampledSession(IterativeSession):
         integrator, weights = self.integrator, self.weights()
         ends = self._ends(starts, light, places, found)
         proposals = Proposals(self.grid, cumulative, ends.count, integrator.light_paths + self.capacity["ends"])
-        index = dr.arange(mi.UInt32, self.capacity["camera"] * integrator.resamples)
+        index = lanes(self.capacity["camera"] * integrator.resamples)
         vertex = index // integrator.resamples
         active = vertex < dr.gather(mi.UInt32, count, 0)
         z = read_vertices(camera, vertex, active, states=STEP)
@@ -204,7 +199,7 @@ class ResampledSession(IterativeSession):
 
     def _meet(self, tables, radiance, camera, hits, hit_count):
         """Radiance of camera paths with that of emission that they meet beyond the first vertex added."""
-        index = dr.arange(mi.UInt32, self.capacity["hits"])
+        index = lanes(self.capacity["hits"])
         active = index < dr.gather(mi.UInt32, hit_count, 0)
         hit = hit_layout().read(hits, index, active)
         nearer = sum_before(camera, hit, hit["parent"], hit["start"], hit["light_mean"], mi.Float(1), hit["across"], hit["depth"],
@@ -215,7 +210,7 @@ class ResampledSession(IterativeSession):
 
     def _join_sensor(self, scene, sensor, tables, light, count, seed, spectral):
         """Block of the light that meets the sensor."""
-        index = dr.arange(mi.UInt32, self.capacity["light"])
+        index = lanes(self.capacity["light"])
         active = index < dr.gather(mi.UInt32, count, 0)
         y = read_vertices(light, index, active, states=END)
         aperture = next_2d(vertex_streams(y["path"], y["number"], seed)) if sensor.needs_aperture_sample() else mi.Point2f(0.5)
