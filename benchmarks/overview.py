@@ -7,6 +7,7 @@ import time
 
 import compare
 import converge
+import resampling
 import stability
 import variance
 from reports import Row, console, save, show
@@ -58,6 +59,7 @@ def run(options: argparse.Namespace) -> None:
         write(page, pages, rows, failures, scenes, "", options)
     show("Variance of one iteration, best single strategy = 1", varied, variance.COLUMNS)
     sweeps = pages.stability(stability.sweep_all(options), options.out, options.integrators) if options.sweeps else ""
+    sweeps += resampling.section(options.resampled, options) if options.resampled else ""
     write(page, pages, rows, failures, scenes, pages.choices(compare.winners(rows)) + sweeps, options)
     (options.out / "which_scene.md").write_text(stability.as_markdown(compare.winners(rows)))
     console.print(f"page: {page.path} after {(time.perf_counter() - start) / 60:.1f} minutes")
@@ -66,7 +68,8 @@ def run(options: argparse.Namespace) -> None:
 def write(page, pages, rows, failures, scenes, sweeps: str, options: argparse.Namespace) -> None:
     """The page as far as it has come."""
     much = f"at {options.spp} samples per pixel" if options.spp else f"after {options.time:.1f} s of rendering"
-    links = '<nav><a href="#stability">stability</a></nav>' if sweeps else ""
+    links = "".join(f'<a href="#{name}">{name}</a> ' for name in ("stability", "resampling") if f'id="{name}"' in sweeps)
+    links = f"<nav>{links}</nav>" if links else ""
     page.sections = [pages.summary(rows, failures, f"{much}, {options.seeds} seeds"), links, *scenes, sweeps]
     page.write()
 
@@ -83,7 +86,9 @@ def overhead(options: argparse.Namespace) -> float:
     values = [(sweep, len(sweep.values[::2] if options.coarse else sweep.values)) for sweep in SWEEPS if sweep.name in options.sweeps]
     points = sum(count for _, count in values) * methods * options.point_time
     compiling = sum((0.3 if sweep.of_method else 1.0) * count for sweep, count in values) * methods * 0.5 * COMPILING_SECONDS
-    return scenes + points + compiling
+    drawn = sum(len(sweep.values[::2] if options.coarse else sweep.values) for sweep in resampling.SWEEPS if sweep.name in options.parameters)
+    resampled = len(options.resampled) * drawn * len(resampling.METHODS) * (options.draw_seeds * options.draw_time + COMPILING_SECONDS)
+    return scenes + points + compiling + resampled
 
 
 def planned_time(options: argparse.Namespace) -> float:

@@ -19,6 +19,7 @@ import opinions  # noqa: E402
 import overview  # noqa: E402
 import radius  # noqa: E402
 import references  # noqa: E402
+import resampling  # noqa: E402
 import stability  # noqa: E402
 import throughput  # noqa: E402
 import variance  # noqa: E402
@@ -61,6 +62,9 @@ def _parser() -> argparse.ArgumentParser:
     _variance(command, 16)
     _sweeps(command, 0.4)
     command.add_argument("--every-value", dest="coarse", action="store_false", help="all values of the sweeps instead of every other")
+    command.add_argument("--resampled", nargs="*", type=Path, default=[path for path in bundled() if path.stem == "door"], metavar="FILE.xml",
+                         help="scenes of the sweeps of resampling (default: door)")
+    _resampling(command, 1.5, 2)
 
     command = _measuring(commands, "compare", compare)
     _renders(command, 10)
@@ -85,6 +89,12 @@ def _parser() -> argparse.ArgumentParser:
     _sweeps(command, 0.6)
     command.add_argument("--coarse", action="store_true", help="only every other value of a sweep")
     references.add_folder(command)
+
+    command = _measuring(commands, "resampling", resampling)
+    command.set_defaults(scenes=[path for path in bundled() if path.stem == "door"])
+    _resampling(command, 3.0, 3)
+    command.add_argument("--coarse", action="store_true", help="only every other value of a sweep")
+    references.add_options(command)
 
     command = _measuring(commands, "radius", radius)
     command.add_argument("--bdd", type=int, nargs="+", default=[0, 1], help="(default: 0 1)")
@@ -155,6 +165,16 @@ def _sweeps(command: argparse.ArgumentParser, seconds: float) -> None:
                          help=f"rendering seconds of each point (default: {seconds})")
     command.add_argument("--room-reference-time", type=float, default=10, metavar="SECONDS",
                          help="rendering seconds of each of the two references of the scene swept (default: 10)")
+
+
+def _resampling(command: argparse.ArgumentParser, seconds: float, seeds: int) -> None:
+    """Which parameters of resampled connections are swept, and how carefully."""
+    names = [sweep.name for sweep in resampling.SWEEPS]
+    command.add_argument("--parameters", nargs="*", choices=names, default=names, metavar="NAME", help=f"of resampling (default: {' '.join(names)})")
+    command.add_argument("--draw-time", type=float, default=seconds, metavar="SECONDS",
+                         help=f"rendering seconds of each setting and seed of resampling (default: {seconds:g})")
+    command.add_argument("--draw-seeds", type=int, default=seeds, metavar="N", help=f"renders of each (default: {seeds})")
+    command.add_argument("--resampling-scale", type=float, default=0.35, metavar="SCALE", help="film size, scene's own = 1 (default: 0.35)")
 
 
 def _renders(command: argparse.ArgumentParser, seconds: float | None) -> None:
