@@ -301,6 +301,7 @@ def test_replays_are_what_was_recorded(monkeypatch):
     images = []
     for recorded in (True, False):
         session = plugin("pcbpt", camera_paths=1, light_paths=200).session(scene, 0, 3, 0)
+        session._prepare()
         session.capacity["ends"] = 320
         if not recorded:
             session.recorded = lambda function: function

@@ -55,6 +55,12 @@ class ResampledIntegrator(IterativeIntegrator):
         return ResampledSession(self, scene, sensor, seed, iterations)
 
 
+def ends_room(lengths, M):
+    """Room for the vertices of M light sub-paths, where some have had `lengths` (NumPy array): rarely too little, and not much more than they need,
+    for every place is a lane at each cache point."""
+    return rounded_up(int(np.ceil(M * lengths.mean() + 4 * np.sqrt(M) * lengths.std())) + 1)
+
+
 class ResampledSession(IterativeSession):
     """Iterations of both plugins: light sub-paths, pmfs of the cache points, camera sub-paths, connections, emission met, light that meets the sensor."""
 
@@ -228,9 +234,7 @@ class ResampledSession(IterativeSession):
         light = self._light(PILOT, 0, spectral)
         vertices, M = min(int(traced[4][0]), self.capacity["camera"]), self.integrator.light_paths
         wanted = min(max(FEWEST_CACHE_POINTS, int(vertices * CACHE_SHARE)), max(vertices, 1))
-        self.cache = self._cache_points(traced[3], vertices, min(wanted, FEWEST_CACHE_POINTS))
-        self._ends_fit(lambda: self._targets(self.scene, self.sensor, self._tables, self._seed(PILOT, START), *light, mi.UInt32(0), self.cache, spectral,
-                                             "f_y_rho_g_v"))
+        self.capacity["ends"] = ends_room(np.array(light[2]), M)
         self.cache = self._cache_points(traced[3], vertices, max(min(wanted, MOST_PAIRS // (M + self.capacity["ends"])), 1))
         normals = dr.mulsign(self.cache["n"], dr.dot(self.cache["n"], self.cache["towards"]))
         self.grid = CacheGrid(self.cache["p"], normals, self.integrator.cache_neighbors)
