@@ -159,17 +159,17 @@ class ResampledSession(IterativeSession):
         return self._targets(scene, sensor, tables, seed, light, count, lengths, mi.UInt32(0), cache, spectral, self.integrator.target)[:5]
 
     def _pmfs(self, r, seen, found):
-        """Cumulative sums of the cache points' pmfs."""
+        """The cache points' pmfs as of `cumulative_sums`."""
         M, room = self.integrator.light_paths, self.capacity["ends"]
-        cumulative = cumulative_sums(r, seen, dr.minimum(found, room) + M, M + room)
-        dr.eval(cumulative)                                        # a recording cannot make it
-        return cumulative
+        pmfs = cumulative_sums(r, seen, dr.minimum(found, room) + M, M + room)
+        dr.eval(pmfs)                                              # a recording cannot make it
+        return pmfs
 
-    def _connect(self, scene, sensor, tables, radiance, camera, count, light, starts, places, found, cumulative, seed, spectral):
+    def _connect(self, scene, sensor, tables, radiance, camera, count, light, starts, places, found, pmfs, seed, spectral):
         """Radiance of camera paths with that of connections to drawn light sub-paths added."""
         integrator, weights = self.integrator, self.weights()
         ends = self._ends(starts, light, places, found)
-        proposals = Proposals(self.grid, cumulative, ends.count, integrator.light_paths + self.capacity["ends"])
+        proposals = Proposals(self.grid, *pmfs, ends.count, integrator.light_paths + self.capacity["ends"])
         index = lanes(self.capacity["camera"] * integrator.resamples)
         vertex = index // integrator.resamples
         active = vertex < dr.gather(mi.UInt32, count, 0)

@@ -20,7 +20,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..transport.light_ends import END
-from ..transport.proposals import BLIND_SHARE, UNIFORM_SHARE
+from ..transport.proposals import BLIND_SHARE, uniform_share
 from ..weights import bidirectional as theory
 from ..weights import resampling
 
@@ -130,19 +130,18 @@ def tabulate(grid, Q_s, Q_blind, doubts, ends_s):
     (C); `ends_s` (LENGTHS): light vertices that a light sub-path has of each length on average.
     """
     near = np.array(grid.table).reshape(-1, grid.neighbors)
-    cached = 1 - UNIFORM_SHARE
 
     def inverse(Q):
         return np.where(Q > 0, 1 / np.where(Q > 0, Q, 1), 0)
 
     Q = Q_s.sum(axis=1)
+    own = uniform_share(np.minimum(Q * inverse(Q_blind), 1))
     blind = np.where(Q > 0, BLIND_SHARE, 1)
     ends = max(ends_s.sum(), 1e-9)
-    nothing = (~(Q_blind > 0))[near].mean(axis=1)
-    uniform = UNIFORM_SHARE + cached * nothing
+    uniform = np.where(Q_blind > 0, own, 1)[near].mean(axis=1)
     # What a darker neighbour has least of is what matters here: 1/Q of the mean, not the mean of 1/Q.
-    a = cached * (1 - blind)[near].mean(axis=1) * inverse(Q[near].mean(axis=1))
-    c = cached * blind[near].mean(axis=1) * inverse(Q_blind[near].mean(axis=1))
+    a = ((1 - own) * (1 - blind))[near].mean(axis=1) * inverse(Q[near].mean(axis=1))
+    c = ((1 - own) * blind)[near].mean(axis=1) * inverse(Q_blind[near].mean(axis=1))
     e = np.clip(doubts[near].mean(axis=1), LEAST_DOUBT, 1)
     shares = (Q_s * inverse(Q)[:, None])[near].mean(axis=1) + (~(Q > 0))[near].mean(axis=1)[:, None] * (ends_s / ends)
     records = np.stack([a, uniform / ends, c, e], axis=1)
