@@ -158,6 +158,26 @@ def test_weights_sum_to_one(rgb, name, bsdf, light, sensor, length, parameters):
     assert smooth == set(by_technique) - ({0} if light in ("point", "spot") else set())      # each of them counts somewhere
 
 
+def test_guessed_weight_is_the_weight_where_nothing_is_guessed(rgb):
+    """At the camera's first vertices on diffuse surfaces, under weights that ignore resampling."""
+    from mis_integrators.integrators.resampled_weights import guessed_weight
+    paths = ResampledPaths(room("diffuse", "area", "perspective"), 3, name="pcbpt")
+    share, seen = paths.session._share, []
+
+    def spy(weights, camera, z, sent, *rest):
+        result = share(weights, camera, z, sent, *rest)
+        seen.append([np.array(x) for x in (z["depth"], sent.vertices, guessed_weight(z, sent), result)])
+        return result
+    paths.session._share = spy
+    paths.weights()
+    valid = np.array(paths.valid)
+    depth, vertices, guess, exact = (x[:, valid] for x in np.stack(seen, axis=1))
+    first = depth == 1
+    assert first.any() and np.all((guess > 0) & (guess <= 1))
+    np.testing.assert_allclose(guess[first], exact[first], rtol=1e-3, atol=1e-5)
+    assert 0.01 < np.mean(exact[first]) < 0.99 and set(vertices[first]) == {3}
+
+
 # --- Images ------------------------------------------------------------------------------------------------
 
 

@@ -24,7 +24,7 @@ from ..transport.recording import lanes, recorder
 from ..transport.subpaths import junction_of, read_vertices, trace_light_subpaths
 from ..transport.traits import SceneTraits
 from .common import IterativeIntegrator, IterativeSession
-from .resampled_weights import LENGTHS, ResampledWeights, doubt, tabulate
+from .resampled_weights import LENGTHS, ResampledWeights, doubt, guessed_weight, tabulate
 
 CHUNK = 1 << 18
 """Camera paths, and as many light sub-paths, traced at once at most; larger films are traced in parts (bounds memory)."""
@@ -129,7 +129,7 @@ class ResampledSession(IterativeSession):
 
     def _targets(self, scene, sensor, tables, seed, light, count, lengths, first, cache, spectral, target):
         """q*/p of every light vertex of M sub-paths (from the number `first` on) at every cache point if nothing stood between, row by row; whether nothing
-        does; and what makes their `LightEnds`."""
+        does; what makes their `LightEnds`; how many vertices they have; `guessed_weight`."""
         room, M = self.capacity["ends"], self.integrator.light_paths
         places, found = list_ends(light, count, lengths, first, M, self.capacity["light"], room)
         starts = self._starts(sensor, seed, spectral)
@@ -152,11 +152,13 @@ class ResampledSession(IterativeSession):
             r = dr.mean(sent.light * junction_of(self.traits, z, spectral["wavelengths"], active).between(z["towards"], sent.d, active)[0])
         active &= (r > 0) & dr.isfinite(r)
         seen = ends.unblocked(scene, z["p"], z["n"], sent, active)
-        return dr.select(active, r, 0), seen, starts, places, found, sent.vertices
+        return dr.select(active, r, 0), seen, starts, places, found, sent.vertices, guessed_weight(z, sent)
 
     def _own_targets(self, scene, sensor, tables, seed, light, count, lengths, cache, spectral):
-        """The same of the first M sub-paths for the target at hand (the last array is not needed)."""
-        return self._targets(scene, sensor, tables, seed, light, count, lengths, mi.UInt32(0), cache, spectral, self.integrator.target)[:5]
+        """What pmfs are made of: q*/p of the first M sub-paths for the target at hand, times the guessed weight; then as of `_targets`."""
+        target = self.integrator.target
+        r, *others, _, guess = self._targets(scene, sensor, tables, seed, light, count, lengths, mi.UInt32(0), cache, spectral, target)
+        return dr.select(r > 0, r * guess, 0), *others
 
     def _pmfs(self, r, seen, found):
         """The cache points' pmfs as of `cumulative_sums`."""
@@ -249,7 +251,7 @@ class ResampledSession(IterativeSession):
         order = np.lexsort((np.array(order["number"]), np.array(order["path"])))        # places in the buffer are accidental
         chosen = np.random.default_rng(mix(self.seed, PILOT, CAMERA)).choice(order, count, replace=False)
         cache = read_vertices(camera, mi.UInt32(chosen.astype(np.uint32)), active, states=STEP)
-        cache = {name: cache[name] for name in ("p", "n", "ns", "towards", "value", "density", "depth", "hit") if name in cache}
+        cache = {name: cache[name] for name in ("p", "n", "ns", "towards", "value", "density", "depth", "hit", "near") if name in cache}
         cache["through"] = dr.full(mi.Bool, False, count)
         if "hit" in cache:
             flags = dr.select(active, cache["hit"].shape, dr.zeros(mi.ShapePtr)).bsdf().flags()
@@ -264,7 +266,7 @@ class ResampledSession(IterativeSession):
         place = np.array(cache["p"]).T, np.array(dr.mulsign(cache["n"], dr.dot(cache["n"], cache["towards"]))).T
         Q_s, Q_blind, doubts, ends_s = np.zeros((points, LENGTHS)), np.zeros(points), np.zeros(points), np.zeros(LENGTHS)
         for k in range(sets):
-            r, seen, _, _, found, vertices = self._ends_fit(lambda: self._targets(
+            r, seen, _, _, found, vertices, _ = self._ends_fit(lambda: self._targets(
                 self.scene, self.sensor, self._tables, self._seed(PILOT, START, k), *light, dr.opaque(mi.UInt32, k * M), cache, spectral, "f_y_rho_g_v"))
             used = M + int(found[0])
             r, seen = (np.array(x).reshape(points, M + self.capacity["ends"])[:, :used] for x in (r, seen))

@@ -9,8 +9,8 @@ where the parts are the cached pmfs' visible, blind and uniform ones (`proposals
 lengths' shares Q_s/Q are looked up by place and by the side from which the light comes (`CacheGrid.row`); they are averages over the N_c cache points
 there, made once before the first iteration. So the weights depend neither on an iteration's light sub-paths nor on its pmfs, and the sum of
 the techniques stays unbiased. h^2 is the mean squared distance of the cache points: the cached pmf, made for their places, does not know that G has
-a pole at z. Left out are visibility (the ends of a joint path see each other), the camera's BSDF of `f_y_f_yz`, and delta functions' weights;
-colours enter by channel means.
+a pole at z. Left out are visibility (the ends of a joint path see each other), the camera's BSDF of `f_y_f_yz`, the guess of the weight that the pmfs
+contain (`guessed_weight`), and delta functions' weights; colours enter by channel means.
 """
 
 from __future__ import annotations
@@ -106,6 +106,16 @@ class ResampledWeights:
         """Weight of a `LensConnection` of a light vertex (t = 1)."""
         a_light = light["near"] + connection.back * light["far"]
         return theory.connection(connection.density * (1 / self.ratio), a_light, 0, 0, 1)
+
+
+def guessed_weight(z, sent):
+    """Weight that joining the cache point `z` (a record of a camera vertex) to a light vertex that sends `sent` would have among itself, the
+    techniques nearer to the light, if the surface at `z` is diffuse, and the one next to the camera; all as if nothing was resampled.
+
+    What is drawn should be proportional to weight times contribution. By q* alone long light sub-paths matter as much as direct light, though
+    each of them is one of many ways to make its path."""
+    cosine = dr.abs(dr.dot(z["n"], sent.d))
+    return dr.rcp(1 + dr.minimum(cosine * (dr.inv_pi * sent.behind + sent.across * z["near"]), theory.LARGEST))
 
 
 def doubt(p, n, r, seen, neighbors, normal_cost):
