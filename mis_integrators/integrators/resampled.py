@@ -24,7 +24,7 @@ from ..transport.recording import lanes, recorder
 from ..transport.subpaths import junction_of, read_vertices, trace_light_subpaths
 from ..transport.traits import SceneTraits
 from .common import IterativeIntegrator, IterativeSession
-from .resampled_weights import LENGTHS, ResampledWeights, doubt, guessed_weight, tabulate
+from .resampled_weights import LENGTHS, ResampledWeights, around, doubt, guessed_weight, tabulate
 
 CHUNK = 1 << 18
 """Camera paths, and as many light sub-paths, traced at once at most; larger films are traced in parts (bounds memory)."""
@@ -95,7 +95,7 @@ class ResampledSession(IterativeSession):
         dr.eval(self.records, self.shares)
         self._tables = [self.traits.lambertian, self.traits.perturbed, self.records, self.shares, *self.grid.tables(), *self.lights.tables()]
         self._light_pass = self.recorded(self._trace_light)
-        self._target_pass = self.recorded(self._own_targets)
+        self._pilot_pass, self._target_pass = self.recorded(self._pilot_targets), self.recorded(self._own_targets)
         self._camera_pass = self.recorded(self._trace_camera)
         self._connection_pass = self.recorded(self._connect)
         self._hit_pass = self.recorded(self._meet)
@@ -159,6 +159,9 @@ class ResampledSession(IterativeSession):
         target = self.integrator.target
         r, *others, _, guess = self._targets(scene, sensor, tables, seed, light, count, lengths, mi.UInt32(0), cache, spectral, target)
         return dr.select(r > 0, r * guess, 0), *others
+
+    def _pilot_targets(self, scene, sensor, tables, seed, light, count, lengths, first, cache, spectral):
+        return self._targets(scene, sensor, tables, seed, light, count, lengths, first, cache, spectral, "f_y_rho_g_v")
 
     def _pmfs(self, r, seen, found):
         """The cache points' pmfs as of `cumulative_sums`."""
@@ -263,17 +266,18 @@ class ResampledSession(IterativeSession):
         """`Q_s`, `Q_blind`, `doubts` and `ends_s` as `tabulate` takes them."""
         M, points, cache = self.integrator.light_paths, dr.width(self.cache["depth"]), self.cache
         sets = max(min(PILOT_SETS, self.light_chunk // M), 1)
-        place = np.array(cache["p"]).T, np.array(dr.mulsign(cache["n"], dr.dot(cache["n"], cache["towards"]))).T
+        normals = np.array(dr.mulsign(cache["n"], dr.dot(cache["n"], cache["towards"]))).T
+        near = around(np.array(cache["p"]).T, normals, self.integrator.cache_neighbors, self.grid.normal_cost)
         Q_s, Q_blind, doubts, ends_s = np.zeros((points, LENGTHS)), np.zeros(points), np.zeros(points), np.zeros(LENGTHS)
         for k in range(sets):
-            r, seen, _, _, found, vertices, _ = self._ends_fit(lambda: self._targets(
-                self.scene, self.sensor, self._tables, self._seed(PILOT, START, k), *light, dr.opaque(mi.UInt32, k * M), cache, spectral, "f_y_rho_g_v"))
+            r, seen, _, _, found, vertices, _ = self._ends_fit(lambda: self._pilot_pass(
+                self.scene, self.sensor, self._tables, self._seed(PILOT, START, k), *light, dr.opaque(mi.UInt32, k * M), cache, spectral))
             used = M + int(found[0])
             r, seen = (np.array(x).reshape(points, M + self.capacity["ends"])[:, :used] for x in (r, seen))
             length = np.minimum(np.array(vertices)[:used], LENGTHS) - 1
             Q_s += np.where(seen, r, 0) @ np.eye(LENGTHS)[length]
             Q_blind += r.sum(axis=1)
-            doubts += doubt(*place, r, seen, self.integrator.cache_neighbors, self.grid.normal_cost)
+            doubts += doubt(near, r, seen)
             ends_s += np.bincount(length, minlength=LENGTHS)
         return Q_s / (sets * M), Q_blind / (sets * M), doubts / sets, ends_s / (sets * M)
 

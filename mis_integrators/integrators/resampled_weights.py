@@ -118,18 +118,23 @@ def guessed_weight(z, sent):
     return dr.rcp(1 + dr.minimum(cosine * (dr.inv_pi * sent.behind + sent.across * z["near"]), theory.LARGEST))
 
 
-def doubt(p, n, r, seen, neighbors, normal_cost):
-    """How much of a cache point's light comes from light vertices that the cache points around it do not expect: a number each (C).
-
-    NumPy arrays `p`, `n` (C x 3), `r`, `seen` (C x light vertices, as for `cumulative_sums`); `normal_cost` as of `CacheGrid` [length^2]."""
-    if len(p) < 2:
-        return np.ones(len(p))
+def around(p, n, neighbors, normal_cost):
+    """Places of the other cache points that each of C is nearest to (C x `neighbors`, or as many as there are): those that `CacheGrid` would mix
+    with it. NumPy arrays `p`, `n` (C x 3); `normal_cost` as of `CacheGrid` [length^2]."""
     cost = np.sum(p ** 2, axis=1)[:, None] + np.sum(p ** 2, axis=1) - 2 * p @ p.T + normal_cost * (1 - n @ n.T)
     np.fill_diagonal(cost, np.inf)
-    around = np.argsort(cost, axis=1)[:, :min(neighbors, len(p) - 1)]
+    return np.argsort(cost, axis=1)[:, :min(neighbors, len(p) - 1)]
+
+
+def doubt(near, r, seen):
+    """How much of a cache point's light comes from light vertices that the cache points around it, `near`, do not expect: a number each (C).
+
+    NumPy arrays `r`, `seen` (C x light vertices, as for `cumulative_sums`)."""
+    if not near.shape[1]:
+        return np.ones(len(r))
     pmf = np.where(seen, r, 0)
     pmf = pmf / np.maximum(pmf.sum(axis=1, keepdims=True), 1e-30)
-    expected = sum(pmf[column] for column in around.T) / around.shape[1]
+    expected = sum(pmf[column] for column in near.T) / near.shape[1]
     return np.sum(pmf * (expected < UNEXPECTED * pmf), axis=1)
 
 
