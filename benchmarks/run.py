@@ -64,7 +64,7 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument("--every-value", dest="coarse", action="store_false", help="all values of the sweeps instead of every other")
     command.add_argument("--resampled", nargs="*", type=Path, default=[path for path in bundled() if path.stem == "door"], metavar="FILE.xml",
                          help="scenes of the sweeps of resampling (default: door)")
-    _resampling(command, 1.5, 2)
+    _resampling(command, 1.0, 2)
 
     command = _measuring(commands, "compare", compare)
     _renders(command, 10)
@@ -92,7 +92,7 @@ def _parser() -> argparse.ArgumentParser:
 
     command = _measuring(commands, "resampling", resampling)
     command.set_defaults(scenes=[path for path in bundled() if path.stem == "door"])
-    _resampling(command, 3.0, 3)
+    _resampling(command, 2.0, 2)
     command.add_argument("--coarse", action="store_true", help="only every other value of a sweep")
     references.add_options(command)
 
