@@ -8,6 +8,7 @@ import time
 
 import compare
 import converge
+import resampling
 import stability
 import variance
 import view_counts
@@ -62,6 +63,7 @@ def run(options: argparse.Namespace) -> None:
     sweeps = pages.stability(stability.sweep_all(options), options.out, options.integrators) if options.sweeps else ""
     if options.view_scenes:
         sweeps = view_counts.section(options, options.out) + sweeps
+    sweeps += resampling.section(options.resampled, options) if options.resampled else ""
     write(page, pages, rows, failures, scenes, pages.choices(compare.winners(rows)) + sweeps, options)
     (options.out / "which_scene.md").write_text(stability.as_markdown(compare.winners(rows)))
     console.print(f"page: {page.path} after {(time.perf_counter() - start) / 60:.1f} minutes")
@@ -70,7 +72,8 @@ def run(options: argparse.Namespace) -> None:
 def write(page, pages, rows, failures, scenes, sweeps: str, options: argparse.Namespace) -> None:
     """The page as far as it has come."""
     much = f"at {options.spp} samples per pixel" if options.spp else f"after {options.time:.1f} s of rendering"
-    parts = [(part, name) for part, name in (("views", "many views"), ("stability", "stability")) if f'id="{part}"' in sweeps]
+    parts = [(part, name) for part, name in (("views", "many views"), ("stability", "stability"), ("resampling", "resampling"))
+             if f'id="{part}"' in sweeps]
     links = "".join(f'<a href="#{part}">{name}</a>' for part, name in parts)
     page.sections = [pages.summary(rows, failures, f"{much}, {options.seeds} seeds"), f"<nav>{links}</nav>", *scenes, sweeps]
     page.write()
@@ -89,7 +92,9 @@ def overhead(options: argparse.Namespace) -> float:
     points = sum(count for _, count in values) * options.point_time
     compiling = sum((0.3 if sweep.of_method else 1.0) * count for sweep, count in values) * 0.5 * COMPILING_SECONDS
     views = sum(options.view_seeds * options.view_time * max(count, view_counts.FEW) + COMPILING_SECONDS for count in options.view_counts)
-    return scenes + points + compiling + len(options.view_scenes) * (1 + len(options.view_weights)) * views
+    drawn = sum(len(sweep.values[::2] if options.coarse else sweep.values) for sweep in resampling.SWEEPS if sweep.name in options.parameters)
+    resampled = len(options.resampled) * drawn * len(resampling.METHODS) * (options.draw_seeds * options.draw_time + COMPILING_SECONDS)
+    return scenes + points + compiling + resampled + len(options.view_scenes) * (1 + len(options.view_weights)) * views
 
 
 def planned_time(options: argparse.Namespace) -> float:

@@ -255,6 +255,24 @@ crossed, where its error exceeds three times its own median over the sweep, or i
 <h3>Which method where</h3>{table(rows)}"""
 
 
+def resampling(rows: Sequence[Row], folder: Path) -> str:
+    """Charts of the sweeps of `resampling`, one a scene."""
+    from resampling import BASE, MEASURES, METHODS, SWEEPS, lines
+
+    style, figures = styles_of(METHODS), []
+    for scene in dict.fromkeys(row["scene"] for row in rows):
+        mine = [row for row in rows if row["scene"] == scene]
+        swept = [sweep for sweep in SWEEPS if any(row["sweep"] == sweep.name for row in mine)]
+        panels = [[lines(mine, sweep, measure) for sweep in swept] for measure in MEASURES]
+        figure = charts.ratios(list(MEASURES.values()), [sweep.what for sweep in swept], panels, style, BASE)
+        uri = charts.save(figure, folder / f"resampling_{scene}.png")
+        figures.append(f'<h3>{scene}</h3><figure class="chart"><img alt="resampling on {scene}" src="{uri}"></figure>')
+    return f"""<h2 id="resampling">Resampled connections</h2>
+<p>Ratios to {BASE}, below 1 is better: error after equal time; noise (relMSE without the worst pixels) of one iteration; seconds of one iteration, noise times cost
+being what equal time leaves. First iterations, with their pilots, are free. The other parameters keep their defaults. Shaded: 95 % over seeds.</p>
+{"".join(figures)}"""
+
+
 def table(rows: Sequence[Row]) -> str:
     """Rows as a table."""
     if not rows:

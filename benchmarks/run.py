@@ -20,6 +20,7 @@ import opinions  # noqa: E402
 import overview  # noqa: E402
 import radius  # noqa: E402
 import references  # noqa: E402
+import resampling  # noqa: E402
 import stability  # noqa: E402
 import throughput  # noqa: E402
 import variance  # noqa: E402
@@ -65,6 +66,9 @@ def _parser() -> argparse.ArgumentParser:
     _sweeps(command, 0.4)
     command.add_argument("--every-value", dest="coarse", action="store_false", help="all values of the sweeps instead of every other")
     _views(command, (2, 8, 16, 64), 0.08, 2, 0.5)
+    command.add_argument("--resampled", nargs="*", type=Path, default=[path for path in bundled() if path.stem == "door"], metavar="FILE.xml",
+                         help="scenes of the sweeps of resampling (default: door)")
+    _resampling(command, 1.0, 2)
 
     command = _measuring(commands, "compare", compare)
     _renders(command, 10)
@@ -89,6 +93,12 @@ def _parser() -> argparse.ArgumentParser:
     _sweeps(command, 0.6)
     command.add_argument("--coarse", action="store_true", help="only every other value of a sweep")
     references.add_folder(command)
+
+    command = _measuring(commands, "resampling", resampling)
+    command.set_defaults(scenes=[path for path in bundled() if path.stem == "door"])
+    _resampling(command, 2.0, 2)
+    command.add_argument("--coarse", action="store_true", help="only every other value of a sweep")
+    references.add_options(command)
 
     command = _measuring(commands, "radius", radius)
     command.add_argument("--bdd", type=int, nargs="+", default=[0, 1], help="(default: 0 1)")
@@ -185,6 +195,16 @@ def _views(command: argparse.ArgumentParser, counts: tuple[int, ...], seconds: f
                          help=f"rendering seconds of each for every view, for 16 at least (default: {seconds})")
     command.add_argument("--view-seeds", type=int, default=seeds, metavar="N", help=f"renders of each, at least two (default: {seeds})")
     command.add_argument("--view-scale", type=float, default=scale, metavar="SCALE", help=f"film size, scene's own = 1 (default: {scale:g})")
+
+
+def _resampling(command: argparse.ArgumentParser, seconds: float, seeds: int) -> None:
+    """Which parameters of resampled connections are swept, and how carefully."""
+    names = [sweep.name for sweep in resampling.SWEEPS]
+    command.add_argument("--parameters", nargs="*", choices=names, default=names, metavar="NAME", help=f"of resampling (default: {' '.join(names)})")
+    command.add_argument("--draw-time", type=float, default=seconds, metavar="SECONDS",
+                         help=f"rendering seconds of each setting and seed of resampling (default: {seconds:g})")
+    command.add_argument("--draw-seeds", type=int, default=seeds, metavar="N", help=f"renders of each (default: {seeds})")
+    command.add_argument("--resampling-scale", type=float, default=0.35, metavar="SCALE", help="film size, scene's own = 1 (default: 0.35)")
 
 
 def _renders(command: argparse.ArgumentParser, seconds: float | None) -> None:

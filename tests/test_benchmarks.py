@@ -178,21 +178,23 @@ VIEWS = """<scene version="3.0.0">
   </sensor>
 </scene>"""
 
+TINY = """<scene version="3.0.0"><integrator type="path"><integer name="max_depth" value="4"/></integrator>
+    <sensor type="perspective"><transform name="to_world"><lookat origin="0,0,4" target="0,0,0" up="0,1,0"/></transform>
+    <film type="hdrfilm"><integer name="width" value="48"/><integer name="height" value="40"/></film></sensor>
+    <shape type="sphere"/><emitter type="point"><point name="position" x="1" y="2" z="4"/></emitter></scene>"""
+
 
 def test_page_of_one_small_scene(module, tmp_path):
     """The whole way, small: every part of the page is there, everything it shows is embedded, and it names what cannot be rendered."""
     pytest.importorskip("matplotlib")
     scene = tmp_path / "tiny.xml"
-    scene.write_text("""<scene version="3.0.0"><integrator type="path"><integer name="max_depth" value="4"/></integrator>
-        <sensor type="perspective"><transform name="to_world"><lookat origin="0,0,4" target="0,0,0" up="0,1,0"/></transform>
-        <film type="hdrfilm"><integer name="width" value="48"/><integer name="height" value="40"/></film></sensor>
-        <shape type="sphere"/><emitter type="point"><point name="position" x="1" y="2" z="4"/></emitter></scene>""")
+    scene.write_text(TINY)
     views = tmp_path / "views.xml"
     views.write_text(VIEWS)
     argv = ["page", "--scenes", str(scene), "--view-scenes", str(views), "--view-counts", "2", "3", "4", "--view-time", "0.01", "--view-seeds", "2",
             "--integrators", "path", "bdpm:bdd=0", "bdpm:bdd=0,bogus=1", "--varied", "bdpm:bdd=0", "--time", "0.3",
             "--seeds", "2", "--reference-time", "0.2", "--references", str(tmp_path / "references"), "--iterations", "2", "--sweeps", "camera_paths",
-            "--size", "16", "--point-time", "0.05", "--room-reference-time", "0.3", "--out", str(tmp_path / "out")]
+            "--size", "16", "--point-time", "0.05", "--room-reference-time", "0.3", "--resampled", "--out", str(tmp_path / "out")]
     module("run").main(argv)
     page = (tmp_path / "out" / "index.html").read_text()
     assert "src=\"http" not in page and page.count('src="data:') >= 12
@@ -211,3 +213,33 @@ def test_page_of_one_small_scene(module, tmp_path):
     for name in ("converge.csv", "views_views.png", "views_views_2_volpath.png", "variance.csv", "stability.csv", "which_method.md", "which_scene.md", "tiny_time.png",
                  "tiny_path.png", "variance_tiny_1.png"):
         assert (tmp_path / "out" / name).stat().st_size > 0
+
+
+def test_resampling_is_swept(module, tmp_path):
+    """N_c of two values: each method beside `bdpt`, whose own ratios are one, and error, noise and cost agree with each other."""
+    pytest.importorskip("matplotlib")
+    scene = tmp_path / "tiny.xml"
+    scene.write_text(TINY)
+    resampling = module("resampling")
+    module("run").main(["resampling", "--scenes", str(scene), "--parameters", "cache_neighbors", "--coarse", "--draw-time", "0.2", "--draw-seeds", "2",
+                        "--resampling-scale", "1", "--reference-time", "0.3", "--references", str(tmp_path / "references"), "--out", str(tmp_path)])
+    rows = json.loads((tmp_path / "resampling.json").read_text())["rows"]
+    assert [(r["value"], r["method"]) for r in rows] == [(value, method) for value in (1, 5) for method in resampling.METHODS]
+    for r in rows:
+        assert (r["MAPE ratio"] == r["cost ratio"] == 1) == (r["method"] == "bdpt") and 0.05 < r["cost ratio"] < 20
+    page = (tmp_path / "resampling.html").read_text()
+    assert 'id="resampling"' in page and page.count('src="data:image/svg') == 1 and (tmp_path / "resampling_tiny.png").stat().st_size > 0
+
+
+def test_ratios_of_resampling(module):
+    """What a method needs is said as ratios to `bdpt`: half the error in a quarter of the iterations that each cost four times as much."""
+    resampling = module("resampling")
+    base = [{"MAPE": 0.2, "relMSE": 0.04, "noise": 4.0, "cost": 0.01, "iterations": 100}] * 2
+    mine = [{"MAPE": 0.1, "relMSE": 0.01, "noise": 0.25, "cost": 0.04, "iterations": 25}] * 2
+    found = resampling.row(SimpleNamespace(name="s"), resampling.SWEEPS[0], 50, "pcbpt", mine, base)
+    assert (found["MAPE ratio"], found["relMSE ratio"], found["noise ratio"], found["cost ratio"]) == pytest.approx((0.5, 0.25, 1 / 16, 4))
+    line = resampling.lines([found], resampling.SWEEPS[0], "noise ratio")["pcbpt"]
+    assert (line.values, line.ratios) == ([50], [found["noise ratio"]])
+    method = module("methods").parse_method("bdpt_ris:target=f_y_f_yz")
+    assert resampling.with_value(method, "resamples", 4).parameters == {"target": "f_y_f_yz", "resamples": 4}
+    assert resampling.with_value(module("methods").parse_method("bdpt"), "resamples", 4).parameters == {}

@@ -51,7 +51,7 @@ def test_neighbours_are_the_nearest(rgb, count, neighbors, stretch):
 
 def new_proposals(grid, r, seen, count, width):
     count = dr.opaque(mi.UInt32, count)
-    return Proposals(grid, cumulative_sums(r, seen, count, width), count, width)
+    return Proposals(grid, *cumulative_sums(r, seen, count, width), count, width)
 
 
 @pytest.mark.parametrize("width", [24, 37])
@@ -75,7 +75,8 @@ def test_draws_have_their_probability(rgb, width):
     pmf = np.where(some > 0, (1 - BLIND_SHARE) * open_ + BLIND_SHARE * blind, blind)[:, :count]
     pmf = np.where(every > 0, pmf, 1 / count)
     for row in (dark, dominated, grid.rows - 1):
-        expected = (1 - UNIFORM_SHARE) * pmf[table[row]].mean(axis=0)[:count] + UNIFORM_SHARE / count
+        share = np.interp((some / np.maximum(every, 1e-30))[table[row]], (0, 1), UNIFORM_SHARE[::-1])
+        expected = ((1 - share) * pmf[table[row]] + share / count).mean(axis=0)
         said = np.array(proposals.probability(mi.UInt32(row), dr.arange(mi.UInt32, count)))
         assert np.allclose(said, expected, atol=2e-7) and said.sum() == pytest.approx(1, abs=1e-6)
         drawn = proposals.draw(mi.UInt32(row), streams(dr.arange(mi.UInt32, 200000), mi.UInt32(row)))

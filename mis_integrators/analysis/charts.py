@@ -146,6 +146,36 @@ def by_share(curves: Mapping[str, Sequence[tuple[float, float]]]) -> Figure:
     return figure
 
 
+@dataclass(frozen=True)
+class Line:
+    """Ratios over a parameter's values, and the ends of their intervals (NaN: none)."""
+
+    values: Sequence[float]
+    ratios: Sequence[float]
+    low: Sequence[float]
+    high: Sequence[float]
+
+
+def ratios(rows: Sequence[str], columns: Sequence[str], panels: Sequence[Sequence[Mapping[str, Line]]], style: Mapping[str, Style], base: str) -> Figure:
+    """A panel for each measure (`rows`, titles) and parameter (`columns`), lines by method, on logarithmic axes; grey: 1, what ratios are to (`base`)."""
+    with rc_context(SETTINGS):
+        figure = Figure(figsize=(2.7 * len(columns) + 1.9, 1.9 * len(rows) + 0.4), layout="constrained")
+        axes = figure.subplots(len(rows), len(columns), squeeze=False, sharex="col", sharey="row")
+        for title, of_measure, across in zip(rows, panels, axes):
+            for name, drawn, axis in zip(columns, of_measure, across):
+                axis.axhline(1, color="#999999", lw=4, alpha=0.4, zorder=0)
+                for label, line in drawn.items():
+                    look = style[label]
+                    axis.plot(line.values, line.ratios, look.dashes, color=look.colour, marker=look.marker, ms=4, lw=1.6, label=label)
+                    if np.isfinite(line.low).any():
+                        y = np.asarray(line.ratios)
+                        axis.fill_between(line.values, np.maximum(line.low, y / 2), np.minimum(line.high, 2 * y), color=look.colour, alpha=0.1, lw=0)
+                _logarithmic(axis, name, title)
+                axis.label_outer()
+        _legend(axes[0, -1], f"grey: {base}")
+    return figure
+
+
 def variance_maps(labels: Sequence[str], images: Sequence[np.ndarray], maps: Sequence[np.ndarray], notes: Sequence[str]) -> Figure:
     """Pictures, (H, W, 3), above; maps of relative variance, (H, W), on one logarithmic scale below; a note under each label."""
     height, width = maps[0].shape

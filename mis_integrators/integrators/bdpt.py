@@ -14,7 +14,7 @@ from ..transport.lenses import Lens
 from ..transport.lights import Lights
 from ..transport.packing import rounded_up
 from ..transport.random import mix, next_2d, vertex_streams
-from ..transport.recording import recorder
+from ..transport.recording import lanes, recorder
 from ..transport.subpaths import read_vertices, trace_camera_subpaths, trace_light_subpaths
 from ..transport.traits import SceneTraits
 from .common import IterativeIntegrator, IterativeSession
@@ -184,7 +184,7 @@ class BDPTSession(IterativeSession):
     def _connect(self, scene, tables, radiance, camera, light, pairs, spectral, entries):
         """Radiance of camera paths with that of connections added."""
         camera_place, light_place, factor, count = pairs
-        index = dr.arange(mi.UInt32, self.capacity["pairs"])
+        index = lanes(self.capacity["pairs"])
         active = index < dr.gather(mi.UInt32, count, 0)
         z = read_vertices(camera, dr.gather(mi.UInt32, camera_place, index, active), active)
         y = read_vertices(light, dr.gather(mi.UInt32, light_place, index, active), active)
@@ -201,7 +201,7 @@ class BDPTSession(IterativeSession):
     def _join_sensor(self, scene, sensor, tables, light, seed, spectral):
         """Block of the light that meets the sensor."""
         vertices, count, _ = light
-        index = dr.arange(mi.UInt32, self.capacity["light"])
+        index = lanes(self.capacity["light"])
         active = index < dr.gather(mi.UInt32, count, 0)
         y = read_vertices(vertices, index, active)
         rng = vertex_streams(y["path"], y["number"], seed)

@@ -20,11 +20,11 @@ from ..transport.lights import Lights
 from ..transport.packing import rounded_up
 from ..transport.proposals import Proposals, cumulative_sums
 from ..transport.random import mix, next_2d, vertex_streams
-from ..transport.recording import recorder
+from ..transport.recording import lanes, recorder
 from ..transport.subpaths import junction_of, read_vertices, trace_light_subpaths
 from ..transport.traits import SceneTraits
 from .common import IterativeIntegrator, IterativeSession
-from .resampled_weights import LENGTHS, ResampledWeights, doubt, tabulate
+from .resampled_weights import LENGTHS, ResampledWeights, around, doubt, guessed_weight, tabulate
 
 CHUNK = 1 << 18
 """Camera paths, and as many light sub-paths, traced at once at most; larger films are traced in parts (bounds memory)."""
@@ -32,8 +32,6 @@ CACHE_SHARE, FEWEST_CACHE_POINTS = 1 / 300, 256
 """Cache points: this share of a part's camera vertices, but at least so many. More of them cost shadow rays."""
 MOST_PAIRS = 1 << 24
 """Pairs of a cache point and a light vertex at most, four bytes each (and some more while they are made); beyond that there are fewer cache points."""
-DOUBTFUL_RATIO = 10
-"""Light sub-paths over M beyond which images have been seen 1 % too dark (docs/bdpt_ris.md, known defect)."""
 PILOT_SETS = 8
 """Sets of M light sub-paths from which Q and Q_s are estimated before the first iteration, if as many are traced."""
 
@@ -57,6 +55,12 @@ class ResampledIntegrator(IterativeIntegrator):
         return ResampledSession(self, scene, sensor, seed, iterations)
 
 
+def ends_room(lengths, M):
+    """Room for the vertices of M light sub-paths, where some have had `lengths` (NumPy array): rarely too little, and not much more than they need,
+    for every place is a lane at each cache point."""
+    return rounded_up(int(np.ceil(M * lengths.mean() + 4 * np.sqrt(M) * lengths.std())) + 1)
+
+
 class ResampledSession(IterativeSession):
     """Iterations of both plugins: light sub-paths, pmfs of the cache points, camera sub-paths, connections, emission met, light that meets the sensor."""
 
@@ -72,9 +76,6 @@ class ResampledSession(IterativeSession):
         width, height = sensor.film().crop_size()
         self.pixel_paths = width * height * integrator.camera_paths
         self.ratio = self.light_chunk * self.chunks / self.pixel_paths
-        if self.light_chunk > DOUBTFUL_RATIO * integrator.light_paths:
-            mi.Log(mi.LogLevel.Warn, f"{integrator.plugin}: with {self.light_chunk} light sub-paths an iteration and light_paths = "
-                                     f"{integrator.light_paths} the image may be 1 % too dark (docs/bdpt_ris.md); use bdpt where that matters")
         self.capacity = {"light": rounded_up(4 * self.light_chunk), "camera": rounded_up(4 * self.chunk), "hits": rounded_up(self.chunk),
                          "ends": rounded_up(6 * integrator.light_paths)}
         depth = integrator.max_depth
@@ -94,7 +95,7 @@ class ResampledSession(IterativeSession):
         dr.eval(self.records, self.shares)
         self._tables = [self.traits.lambertian, self.traits.perturbed, self.records, self.shares, *self.grid.tables(), *self.lights.tables()]
         self._light_pass = self.recorded(self._trace_light)
-        self._target_pass = self.recorded(self._own_targets)
+        self._pilot_pass, self._target_pass = self.recorded(self._pilot_targets), self.recorded(self._own_targets)
         self._camera_pass = self.recorded(self._trace_camera)
         self._connection_pass = self.recorded(self._connect)
         self._hit_pass = self.recorded(self._meet)
@@ -128,14 +129,14 @@ class ResampledSession(IterativeSession):
 
     def _targets(self, scene, sensor, tables, seed, light, count, lengths, first, cache, spectral, target):
         """q*/p of every light vertex of M sub-paths (from the number `first` on) at every cache point if nothing stood between, row by row; whether nothing
-        does; and what makes their `LightEnds`."""
+        does; what makes their `LightEnds`; how many vertices they have; `guessed_weight`."""
         room, M = self.capacity["ends"], self.integrator.light_paths
         places, found = list_ends(light, count, lengths, first, M, self.capacity["light"], room)
         starts = self._starts(sensor, seed, spectral)
         ends = self._ends(starts, light, places, found)
         width = M + room
         points = dr.width(cache["depth"])
-        index = dr.arange(mi.UInt32, points * width)
+        index = lanes(points * width)
         point, end = index // width, index % width
         active = end < dr.gather(mi.UInt32, ends.count, 0)
         z = {name: dr.gather(type(values), values, point, active) for name, values in cache.items()}
@@ -151,25 +152,30 @@ class ResampledSession(IterativeSession):
             r = dr.mean(sent.light * junction_of(self.traits, z, spectral["wavelengths"], active).between(z["towards"], sent.d, active)[0])
         active &= (r > 0) & dr.isfinite(r)
         seen = ends.unblocked(scene, z["p"], z["n"], sent, active)
-        return dr.select(active, r, 0), seen, starts, places, found, sent.vertices
+        return dr.select(active, r, 0), seen, starts, places, found, sent.vertices, guessed_weight(z, sent)
 
     def _own_targets(self, scene, sensor, tables, seed, light, count, lengths, cache, spectral):
-        """The same of the first M sub-paths for the target at hand (the last array is not needed)."""
-        return self._targets(scene, sensor, tables, seed, light, count, lengths, mi.UInt32(0), cache, spectral, self.integrator.target)[:5]
+        """What pmfs are made of: q*/p of the first M sub-paths for the target at hand, times the guessed weight; then as of `_targets`."""
+        target = self.integrator.target
+        r, *others, _, guess = self._targets(scene, sensor, tables, seed, light, count, lengths, mi.UInt32(0), cache, spectral, target)
+        return dr.select(r > 0, r * guess, 0), *others
+
+    def _pilot_targets(self, scene, sensor, tables, seed, light, count, lengths, first, cache, spectral):
+        return self._targets(scene, sensor, tables, seed, light, count, lengths, first, cache, spectral, "f_y_rho_g_v")
 
     def _pmfs(self, r, seen, found):
-        """Cumulative sums of the cache points' pmfs."""
+        """The cache points' pmfs as of `cumulative_sums`."""
         M, room = self.integrator.light_paths, self.capacity["ends"]
-        cumulative = cumulative_sums(r, seen, dr.minimum(found, room) + M, M + room)
-        dr.eval(cumulative)                                        # a recording cannot make it
-        return cumulative
+        pmfs = cumulative_sums(r, seen, dr.minimum(found, room) + M, M + room)
+        dr.eval(pmfs)                                              # a recording cannot make it
+        return pmfs
 
-    def _connect(self, scene, sensor, tables, radiance, camera, count, light, starts, places, found, cumulative, seed, spectral):
+    def _connect(self, scene, sensor, tables, radiance, camera, count, light, starts, places, found, pmfs, seed, spectral):
         """Radiance of camera paths with that of connections to drawn light sub-paths added."""
         integrator, weights = self.integrator, self.weights()
         ends = self._ends(starts, light, places, found)
-        proposals = Proposals(self.grid, cumulative, ends.count, integrator.light_paths + self.capacity["ends"])
-        index = dr.arange(mi.UInt32, self.capacity["camera"] * integrator.resamples)
+        proposals = Proposals(self.grid, *pmfs, ends.count, integrator.light_paths + self.capacity["ends"])
+        index = lanes(self.capacity["camera"] * integrator.resamples)
         vertex = index // integrator.resamples
         active = vertex < dr.gather(mi.UInt32, count, 0)
         z = read_vertices(camera, vertex, active, states=STEP)
@@ -204,7 +210,7 @@ class ResampledSession(IterativeSession):
 
     def _meet(self, tables, radiance, camera, hits, hit_count):
         """Radiance of camera paths with that of emission that they meet beyond the first vertex added."""
-        index = dr.arange(mi.UInt32, self.capacity["hits"])
+        index = lanes(self.capacity["hits"])
         active = index < dr.gather(mi.UInt32, hit_count, 0)
         hit = hit_layout().read(hits, index, active)
         nearer = sum_before(camera, hit, hit["parent"], hit["start"], hit["light_mean"], mi.Float(1), hit["across"], hit["depth"],
@@ -215,7 +221,7 @@ class ResampledSession(IterativeSession):
 
     def _join_sensor(self, scene, sensor, tables, light, count, seed, spectral):
         """Block of the light that meets the sensor."""
-        index = dr.arange(mi.UInt32, self.capacity["light"])
+        index = lanes(self.capacity["light"])
         active = index < dr.gather(mi.UInt32, count, 0)
         y = read_vertices(light, index, active, states=END)
         aperture = next_2d(vertex_streams(y["path"], y["number"], seed)) if sensor.needs_aperture_sample() else mi.Point2f(0.5)
@@ -233,9 +239,7 @@ class ResampledSession(IterativeSession):
         light = self._light(PILOT, 0, spectral)
         vertices, M = min(int(traced[4][0]), self.capacity["camera"]), self.integrator.light_paths
         wanted = min(max(FEWEST_CACHE_POINTS, int(vertices * CACHE_SHARE)), max(vertices, 1))
-        self.cache = self._cache_points(traced[3], vertices, min(wanted, FEWEST_CACHE_POINTS))
-        self._ends_fit(lambda: self._targets(self.scene, self.sensor, self._tables, self._seed(PILOT, START), *light, mi.UInt32(0), self.cache, spectral,
-                                             "f_y_rho_g_v"))
+        self.capacity["ends"] = ends_room(np.array(light[2]), M)
         self.cache = self._cache_points(traced[3], vertices, max(min(wanted, MOST_PAIRS // (M + self.capacity["ends"])), 1))
         normals = dr.mulsign(self.cache["n"], dr.dot(self.cache["n"], self.cache["towards"]))
         self.grid = CacheGrid(self.cache["p"], normals, self.integrator.cache_neighbors)
@@ -250,7 +254,7 @@ class ResampledSession(IterativeSession):
         order = np.lexsort((np.array(order["number"]), np.array(order["path"])))        # places in the buffer are accidental
         chosen = np.random.default_rng(mix(self.seed, PILOT, CAMERA)).choice(order, count, replace=False)
         cache = read_vertices(camera, mi.UInt32(chosen.astype(np.uint32)), active, states=STEP)
-        cache = {name: cache[name] for name in ("p", "n", "ns", "towards", "value", "density", "depth", "hit") if name in cache}
+        cache = {name: cache[name] for name in ("p", "n", "ns", "towards", "value", "density", "depth", "hit", "near") if name in cache}
         cache["through"] = dr.full(mi.Bool, False, count)
         if "hit" in cache:
             flags = dr.select(active, cache["hit"].shape, dr.zeros(mi.ShapePtr)).bsdf().flags()
@@ -262,17 +266,18 @@ class ResampledSession(IterativeSession):
         """`Q_s`, `Q_blind`, `doubts` and `ends_s` as `tabulate` takes them."""
         M, points, cache = self.integrator.light_paths, dr.width(self.cache["depth"]), self.cache
         sets = max(min(PILOT_SETS, self.light_chunk // M), 1)
-        place = np.array(cache["p"]).T, np.array(dr.mulsign(cache["n"], dr.dot(cache["n"], cache["towards"]))).T
+        normals = np.array(dr.mulsign(cache["n"], dr.dot(cache["n"], cache["towards"]))).T
+        near = around(np.array(cache["p"]).T, normals, self.integrator.cache_neighbors, self.grid.normal_cost)
         Q_s, Q_blind, doubts, ends_s = np.zeros((points, LENGTHS)), np.zeros(points), np.zeros(points), np.zeros(LENGTHS)
         for k in range(sets):
-            r, seen, _, _, found, vertices = self._ends_fit(lambda: self._targets(
-                self.scene, self.sensor, self._tables, self._seed(PILOT, START, k), *light, dr.opaque(mi.UInt32, k * M), cache, spectral, "f_y_rho_g_v"))
+            r, seen, _, _, found, vertices, _ = self._ends_fit(lambda: self._pilot_pass(
+                self.scene, self.sensor, self._tables, self._seed(PILOT, START, k), *light, dr.opaque(mi.UInt32, k * M), cache, spectral))
             used = M + int(found[0])
             r, seen = (np.array(x).reshape(points, M + self.capacity["ends"])[:, :used] for x in (r, seen))
             length = np.minimum(np.array(vertices)[:used], LENGTHS) - 1
             Q_s += np.where(seen, r, 0) @ np.eye(LENGTHS)[length]
             Q_blind += r.sum(axis=1)
-            doubts += doubt(*place, r, seen, self.integrator.cache_neighbors, self.grid.normal_cost)
+            doubts += doubt(near, r, seen)
             ends_s += np.bincount(length, minlength=LENGTHS)
         return Q_s / (sets * M), Q_blind / (sets * M), doubts / sets, ends_s / (sets * M)
 

@@ -9,8 +9,8 @@ where the parts are the cached pmfs' visible, blind and uniform ones (`proposals
 lengths' shares Q_s/Q are looked up by place and by the side from which the light comes (`CacheGrid.row`); they are averages over the N_c cache points
 there, made once before the first iteration. So the weights depend neither on an iteration's light sub-paths nor on its pmfs, and the sum of
 the techniques stays unbiased. h^2 is the mean squared distance of the cache points: the cached pmf, made for their places, does not know that G has
-a pole at z. Left out are visibility (the ends of a joint path see each other), the camera's BSDF of `f_y_f_yz`, and delta functions' weights;
-colours enter by channel means.
+a pole at z. Left out are visibility (the ends of a joint path see each other), the camera's BSDF of `f_y_f_yz`, the guess of the weight that the pmfs
+contain (`guessed_weight`), and delta functions' weights; colours enter by channel means.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..transport.light_ends import END
-from ..transport.proposals import BLIND_SHARE, UNIFORM_SHARE
+from ..transport.proposals import BLIND_SHARE, uniform_share
 from ..weights import bidirectional as theory
 from ..weights import resampling
 
@@ -108,18 +108,33 @@ class ResampledWeights:
         return theory.connection(connection.density * (1 / self.ratio), a_light, 0, 0, 1)
 
 
-def doubt(p, n, r, seen, neighbors, normal_cost):
-    """How much of a cache point's light comes from light vertices that the cache points around it do not expect: a number each (C).
+def guessed_weight(z, sent):
+    """Weight that joining the cache point `z` (a record of a camera vertex) to a light vertex that sends `sent` would have among itself, the
+    techniques nearer to the light, if the surface at `z` is diffuse, and the one next to the camera; all as if nothing was resampled.
 
-    NumPy arrays `p`, `n` (C x 3), `r`, `seen` (C x light vertices, as for `cumulative_sums`); `normal_cost` as of `CacheGrid` [length^2]."""
-    if len(p) < 2:
-        return np.ones(len(p))
+    What is drawn should be proportional to weight times contribution. By q* alone long light sub-paths matter as much as direct light, though
+    each of them is one of many ways to make its path."""
+    cosine = dr.abs(dr.dot(z["n"], sent.d))
+    return dr.rcp(1 + dr.minimum(cosine * (dr.inv_pi * sent.behind + sent.across * z["near"]), theory.LARGEST))
+
+
+def around(p, n, neighbors, normal_cost):
+    """Places of the other cache points that each of C is nearest to (C x `neighbors`, or as many as there are): those that `CacheGrid` would mix
+    with it. NumPy arrays `p`, `n` (C x 3); `normal_cost` as of `CacheGrid` [length^2]."""
     cost = np.sum(p ** 2, axis=1)[:, None] + np.sum(p ** 2, axis=1) - 2 * p @ p.T + normal_cost * (1 - n @ n.T)
     np.fill_diagonal(cost, np.inf)
-    around = np.argsort(cost, axis=1)[:, :min(neighbors, len(p) - 1)]
+    return np.argsort(cost, axis=1)[:, :min(neighbors, len(p) - 1)]
+
+
+def doubt(near, r, seen):
+    """How much of a cache point's light comes from light vertices that the cache points around it, `near`, do not expect: a number each (C).
+
+    NumPy arrays `r`, `seen` (C x light vertices, as for `cumulative_sums`)."""
+    if not near.shape[1]:
+        return np.ones(len(r))
     pmf = np.where(seen, r, 0)
     pmf = pmf / np.maximum(pmf.sum(axis=1, keepdims=True), 1e-30)
-    expected = sum(pmf[column] for column in around.T) / around.shape[1]
+    expected = sum(pmf[column] for column in near.T) / near.shape[1]
     return np.sum(pmf * (expected < UNEXPECTED * pmf), axis=1)
 
 
@@ -130,19 +145,18 @@ def tabulate(grid, Q_s, Q_blind, doubts, ends_s):
     (C); `ends_s` (LENGTHS): light vertices that a light sub-path has of each length on average.
     """
     near = np.array(grid.table).reshape(-1, grid.neighbors)
-    cached = 1 - UNIFORM_SHARE
 
     def inverse(Q):
         return np.where(Q > 0, 1 / np.where(Q > 0, Q, 1), 0)
 
     Q = Q_s.sum(axis=1)
+    own = uniform_share(np.minimum(Q * inverse(Q_blind), 1))
     blind = np.where(Q > 0, BLIND_SHARE, 1)
     ends = max(ends_s.sum(), 1e-9)
-    nothing = (~(Q_blind > 0))[near].mean(axis=1)
-    uniform = UNIFORM_SHARE + cached * nothing
+    uniform = np.where(Q_blind > 0, own, 1)[near].mean(axis=1)
     # What a darker neighbour has least of is what matters here: 1/Q of the mean, not the mean of 1/Q.
-    a = cached * (1 - blind)[near].mean(axis=1) * inverse(Q[near].mean(axis=1))
-    c = cached * blind[near].mean(axis=1) * inverse(Q_blind[near].mean(axis=1))
+    a = ((1 - own) * (1 - blind))[near].mean(axis=1) * inverse(Q[near].mean(axis=1))
+    c = ((1 - own) * blind)[near].mean(axis=1) * inverse(Q_blind[near].mean(axis=1))
     e = np.clip(doubts[near].mean(axis=1), LEAST_DOUBT, 1)
     shares = (Q_s * inverse(Q)[:, None])[near].mean(axis=1) + (~(Q > 0))[near].mean(axis=1)[:, None] * (ends_s / ends)
     records = np.stack([a, uniform / ends, c, e], axis=1)

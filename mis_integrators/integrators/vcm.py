@@ -8,6 +8,7 @@ import numpy as np
 
 from ..transport.merging import merge, vertex_map
 from ..transport.photon_map import smallest_cell
+from ..transport.recording import lanes
 from ..transport.subpaths import read_vertices
 from .bdpt import BDPT, BDPTSession
 from .connection_weights import ConnectionWeights
@@ -139,7 +140,7 @@ class VCMSession(BDPTSession):
         vertices, light_count, _ = light
         cell = dr.maximum(spectral["radius"], smallest_cell(self.traits.bounds, self.capacity["light"]))
         photon_map = vertex_map(vertices, light_count, self.capacity["light"], self.traits.bounds, cell)
-        index = dr.arange(mi.UInt32, self.capacity["camera"])
+        index = lanes(self.capacity["camera"])
         active = index < dr.gather(mi.UInt32, count, 0)
         z = read_vertices(camera, index, active)
         weights = self.weights(spectral)

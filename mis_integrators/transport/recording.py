@@ -26,14 +26,42 @@ def recorder():
     return (lambda function: function) if mi.is_spectral else frozen
 
 
+_anchor = None
+"""Inside a frozen pass, a zero that its kernels read."""
+
+
+def lanes(count):
+    """0, 1, ..., count - 1 (uint32), one a lane: what passes are to start from, instead of `dr.arange`.
+
+    Dr.Jit 1.5 does not replay the sizes of a recording's kernels: it guesses them from the widths of what they read. A number of width one makes it
+    right. Where a kernel does nothing but gather, the guess may take the data of virtual function calls for such an array, whose size in bytes it forgets
+    to round up as the recording did: with an unlucky `count` all replays then lack some per cent of their lanes."""
+    index = dr.arange(mi.UInt32, count)
+    return index if _anchor is None else index + _anchor
+
+
+def _anchored(function):
+    """`function` with one more argument, the anchor."""
+    def call(anchor, *args):
+        global _anchor
+        before, _anchor = _anchor, anchor
+        try:
+            return function(*args)
+        finally:
+            _anchor = before
+
+    return call
+
+
 def frozen(function):
-    """`dr.freeze(function)`, safe against garbage collection while it records.
+    """`dr.freeze(function)`, safe against garbage collection while it records. It numbers its lanes by `lanes`.
 
     Evaluated arrays that `function` reads must be among its arguments, and numbers that change from call to call must be
     opaque arrays. Nothing inside may read an array's value. Where Dr.Jit refuses to record, the function runs as it is, with the same
     result and some more Python.
     """
-    recorded = dr.freeze(function)
+    recorded = dr.freeze(_anchored(function))
+    anchor = dr.opaque(mi.UInt32, 0)
     fresh, plain = True, False
 
     def call(*args):
@@ -45,7 +73,7 @@ def frozen(function):
             fresh = False
         try:
             with _no_garbage_collection():
-                return recorded(*args)
+                return recorded(anchor, *args)
         except RuntimeError as error:
             mi.Log(mi.LogLevel.Debug, f"not recorded: {error.__cause__ or error}")
             plain = True
