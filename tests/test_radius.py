@@ -124,6 +124,7 @@ def test_noise_of_small_disks_is_what_large_ones_saw():
     seen = np.array([0.0, 0.0, 1.0])
     radii = np.array([1.0, 2.0, 4.0])
     assert radius.noise_of_photons(radii, seen, 0.0) == pytest.approx([16.0, 4.0, 1.0])
+    assert radius.noise_of_photons(radii, seen, 0.0, alike=True) == pytest.approx([0.0, 4.0, 1.0])
 
 
 def test_ladder_needs_vertices():

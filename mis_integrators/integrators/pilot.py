@@ -211,7 +211,8 @@ class Pilot:
         samples = {key: np.array(values) for key, values in self.samples.items()}
         choices = {kind: best_radius(
             self.ladder, samples[kind, False], samples.get((kind, True)), self.mean(),
-            lambda radius, corrected, kind=kind: np.maximum(count / self._cost(kind, corrected, radius), 1), self.at_first_vertex)
+            lambda radius, corrected, kind=kind: np.maximum(count / self._cost(kind, corrected, radius), 1), self.at_first_vertex,
+            kind == "caustic")
             for kind in self.ways}
         session.radii = {kind: choice.radius for kind, choice in choices.items()}
         session.corrected.update({kind: choice.correct for kind, choice in choices.items()})

@@ -51,11 +51,16 @@ def relative_weights(mean):
     return 1 / (mean ** 2 + 0.1 * usual ** 2 + 1e-30)
 
 
-def noise_of_photons(radii, variance, floor):
-    """V(R), no smaller than what the larger radii say: the noise of photons falls with the area of the disk, above a `floor` that is not theirs.
-    Small disks seldom meet the rare bright photons that large ones have seen."""
+def noise_of_photons(radii, variance, floor, alike=False):
+    """V(R), no smaller than what larger radii say: the noise of photons falls with the area of the disk, above a `floor` that is not theirs.
+    Small disks seldom meet the rare bright photons that large ones have seen.
+
+    Where photons are `alike`, as those of a caustic, only the next larger radius has a say: what larger disks spill from the caustic onto its dark
+    surroundings is far noisier, relative to them, than anything that small disks do.
+    """
     photons = np.maximum(variance - floor, 0) * radii ** 2
-    return floor + np.maximum.accumulate(photons[::-1])[::-1] / radii ** 2
+    seen = np.maximum(photons, np.append(photons[1:], photons[-1])) if alike else np.maximum.accumulate(photons[::-1])[::-1]
+    return floor + seen / radii ** 2
 
 
 def expected_products(a, b, weights):
@@ -73,14 +78,14 @@ def with_error(a, b, weights):
     return value, np.sqrt((m - 1) / m * ((left_out - left_out.mean(axis=0)) ** 2).sum(axis=0))
 
 
-def noise_and_difference(radii, samples, weights, at_first_vertex=True):
+def noise_and_difference(radii, samples, weights, at_first_vertex=True, alike=False):
     """V and Q of the module's docstring, one a radius, with Q's standard error.
 
     `samples`: (iterations, radii, pixels) gathered values of independent iterations; `weights`: (pixels,); `at_first_vertex`: whether all
-    noise is the photons', because the vertices that gather are those which the camera sees.
+    noise is the photons', because the vertices that gather are those which the camera sees; `alike`: see `noise_of_photons`.
     """
     variance = np.mean(weights * samples.var(axis=0, ddof=1), axis=1)
-    variance = noise_of_photons(radii, variance, 0.0 if at_first_vertex else variance.min())
+    variance = noise_of_photons(radii, variance, 0.0 if at_first_vertex else variance.min(), alike)
     steps = np.diff(samples, axis=1)                                      # (iterations, radii - 1, pixels)
     difference, error = with_error(steps, steps, weights)
     return variance, np.concatenate([[0.0], difference]), np.concatenate([[0.0], error])
@@ -150,10 +155,10 @@ class Choice(NamedTuple):
     """Of one iteration."""
 
 
-def best_radius(radii, plain, corrected, mean, iterations, at_first_vertex=True):
+def best_radius(radii, plain, corrected, mean, iterations, at_first_vertex=True, alike=False):
     """The `Choice` that minimises the predicted relative error.
 
-    `radii`: the ladder; `plain`, `at_first_vertex`: see `noise_and_difference`; `corrected`: the same samples corrected at edges, or `None`;
+    `radii`: the ladder; `plain`, `at_first_vertex`, `alike`: see `noise_and_difference`; `corrected`: the same samples corrected at edges, or `None`;
     `mean`: (pixels,) mean radiance; `iterations(R, corrected)`: how many iterations there will be, so that larger gathers and the correction are
     charged for.
     """
@@ -169,7 +174,7 @@ def best_radius(radii, plain, corrected, mean, iterations, at_first_vertex=True)
     blur = expected_squared_bias(radii, difference, error, fine)
     choices = []
     for way, (samples, edges) in ways.items():
-        variance = between(fine, radii, noise_and_difference(radii, samples, weights, at_first_vertex)[0])
+        variance = between(fine, radii, noise_and_difference(radii, samples, weights, at_first_vertex, alike)[0])
         bias = blur + edges
         predicted = bias + variance / iterations(fine, way)
         at = int(np.argmin(predicted))
