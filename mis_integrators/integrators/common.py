@@ -122,20 +122,45 @@ class IterativeSession:
         self.accumulator = Accumulator(integrator.variance)
 
     @property
+    def sums(self):
+        """What has been rendered so far (`mis_integrators.sums.Sums`)."""
+        return self.accumulator.sums
+
+    @property
     def iterations(self):
         """Iterations done."""
         return self.accumulator.iterations
+
+    def keep_variance(self):
+        """From the first iteration on, keeps what `estimate` needs."""
+        self.accumulator.with_variance = True
+
+    def estimate(self):
+        """Mean colour so far and its estimated variance: float64, (height, width, 3) each. Needs two iterations at least, and `keep_variance`."""
+        return self.accumulator.estimate(self.sensor.film())
+
+    def start(self):
+        """Finds out what must be known before the first iteration, unless it is known: pilots, caches."""
+
+    @property
+    def learned(self):
+        """What `start` has found out and the seed alone would not tell again, in JSON's types: the radii that a pilot has chosen."""
+        return {}
+
+    def recall(self, learned):
+        """Takes over what another session of the same render has `learned`; before the first iteration."""
 
     @property
     def settings(self):
         """Names and values that reproduce the image, together with the scene."""
         return {"integrator": self.integrator.plugin, **self.integrator.settings(), "seed": self.seed}
 
-    def iterate(self):
-        """Runs one iteration to its end."""
+    def iterate(self, iteration=None):
+        """Runs one iteration to its end: that of the given number, or the first that is missing."""
+        iteration = self.sums.done.first_missing if iteration is None else iteration
         with dr.suspend_grad():
-            self.accumulator.add(self._iteration(self.iterations))
-            dr.eval(self.accumulator.total)
+            self.accumulator.add(self._iteration(iteration), iteration)
+            dr.eval(self.sums.tensors)
             dr.sync_thread()
 
     def _seed(self, iteration, *purpose):
@@ -156,7 +181,7 @@ class IterativeSession:
         film = self.sensor.film()
         film.clear()
         film.prepare(self.integrator.aov_names())
-        self.accumulator.put(film)
+        self.accumulator.put(film, self.integrator.variance)
 
     def image(self):
         """The image so far: float32, (height, width, channels)."""

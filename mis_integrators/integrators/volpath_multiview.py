@@ -219,14 +219,18 @@ class MultiViewSession(IterativeSession):
         dr.make_opaque(spectral)
         return spectral
 
-    def iterate(self):
-        """Runs one iteration to its end."""
+    def iterate(self, iteration=None):
+        iteration = self.sums.done.first_missing if iteration is None else iteration
         with dr.suspend_grad():
-            seed, spectral = self._seed(self.iterations, PATHS), self._spectral(self.iterations)
+            seed, spectral = self._seed(iteration, PATHS), self._spectral(iteration)
             layers = [self._part(first, seed, spectral) for first in range(0, self.views.paths, self.paths)]
-            self.accumulator.add(*(sum(layer[1:], layer[0]) for layer in zip(*layers)))
-            dr.eval(self.accumulator.shared, self.accumulator.own)
+            self.accumulator.add(*(sum(layer[1:], layer[0]) for layer in zip(*layers)), iteration)
+            dr.eval(self.sums.tensors)
             dr.sync_thread()
+
+    def estimate(self):
+        """As of other sessions, with all pixels of all views in one row: (1, pixels, 3)."""
+        return self.accumulator.estimate()
 
     def _part(self, first, seed, spectral):
         """One part of an iteration: its layers."""
@@ -275,7 +279,7 @@ class MultiViewSession(IterativeSession):
     def view_tensors(self):
         """The images so far, one tensor a view, as films develop them."""
         images, first = [], 0
-        pictures = self.accumulator.pictures()
+        pictures = self.accumulator.pictures(self.integrator.variance)
         for sensor, members in zip(self.views.groups, self.views.members):
             image = self._fill(sensor.film(), pictures[first:first + members]).develop()
             width = self.views.sizes[first][0]
@@ -293,7 +297,7 @@ class MultiViewSession(IterativeSession):
 
     def fill_film(self):
         """Hands what has been rendered so far to the sensor's film, side by side for a `batch`."""
-        self._fill(self.sensor.film(), self.accumulator.pictures()[:self.views.members[0]])
+        self._fill(self.sensor.film(), self.accumulator.pictures(self.integrator.variance)[:self.views.members[0]])
 
 
 def _gather(record, index):
