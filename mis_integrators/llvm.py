@@ -24,6 +24,9 @@ VARIABLE = "DRJIT_LIBLLVM_PATH"
 _IN_NAME = re.compile(r"libLLVM(?:-|\.so\.|\.)(\d+(?:\.\d+)*)")
 _IN_PATH = re.compile(r"llvm(?:@|-|/)(\d+(?:\.\d+)*)/")
 
+chosen: Path | None = None
+"""The library that ``make_known`` has chosen in this process; ``None`` if it was not asked to, or found none."""
+
 _INSTALL = (
     f"install LLVM {OLDEST_WORKING} or newer: `apt-get install libllvm19` (Debian, Ubuntu), "
     "`conda install -c conda-forge libllvm19`, or `brew install llvm`"
@@ -122,6 +125,8 @@ def make_known() -> None:
     library = choose(os.environ)
     if library:
         os.environ[VARIABLE] = str(library)
+        global chosen
+        chosen = library
 
 
 def problem() -> str | None:
