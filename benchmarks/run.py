@@ -19,6 +19,7 @@ import opinions  # noqa: E402
 import overview  # noqa: E402
 import radius  # noqa: E402
 import references  # noqa: E402
+import scaling  # noqa: E402
 import stability  # noqa: E402
 import throughput  # noqa: E402
 import variance  # noqa: E402
@@ -113,6 +114,12 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument("--seeds", type=int, default=8, help="renders of each, at least two (default: 8)")
     command.add_argument("--scale", type=float, default=1, help="film size, scene's own = 1 (default: 1)")
     command.add_argument("--charts", action="store_true", help="draw the shifted densities (needs matplotlib)")
+
+    command = _measuring(commands, "scaling", scaling)
+    _chooses(command, ("bdpm",), "each by itself")
+    command.add_argument("--workers", type=int, nargs="+", default=[1, 2], metavar="N", help="local processes of one thread (default: 1 2)")
+    command.add_argument("--time", type=float, default=20, metavar="SECONDS", help="for which each is measured (default: 20)")
+    command.add_argument("--scale", type=float, default=1, help="film size, scene's own = 1 (default: 1)")
 
     for name, function in (("freeze-scenes", freezing.freeze), ("check-scenes", freezing.check)):
         command = commands.add_parser(name, help=function.__doc__, description=function.__doc__)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import math
 import sys
 from pathlib import Path
@@ -11,12 +12,13 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from . import checkpoint, fingerprint, llvm, loading, output
+from . import checkpoint, cluster, loading, output
 from .checkpoint import Checkpoint, CheckpointError
+from .opening import Request
 from .options import parse, versions
 from .progress import Progress
 from .rendering import Chore, Clock, Interrupt, iterate
-from .session import Session, make_session
+from .session import Session
 from .stopping import TargetError
 
 EXIT_OK, EXIT_SCENE, EXIT_USAGE, EXIT_OUTPUT, EXIT_CHECKPOINT, EXIT_CLUSTER, EXIT_INTERRUPTED = 0, 1, 2, 3, 4, 5, 130
@@ -47,25 +49,25 @@ def main(arguments: list[str] | None = None) -> int:
 def _run(options: argparse.Namespace, interrupt: Interrupt) -> int:
     _check_output(options.output)
     try:
-        _set_variant(options.variant)
-        loaded = loading.load(
-            options.scene,
-            dict(options.variables),
-            options.plugin,
-            {name: loading.parse_value(text) for name, text in options.parameters},
-        )
-        sensor = _sensor(loaded.scene, options.sensor)
-        bounded = options.time or (options.target_error and not options.spp)
-        spp = 0 if bounded else options.spp or sensor.sampler().sample_count()
-        session = _session(loaded, sensor, options, spp)
-        identity = _identity(options, loaded, session) if options.checkpoint else {}
-        if options.checkpoint or options.target_error:
+        needs_views = "--all-views" if options.all_views else "--frames" if options.frames else None
+        opened = _request(options).open(needs_views)
+        session, loaded = opened.session, opened.loaded
+        identity = opened.identity() if options.checkpoint else {}
+        keep_variance = bool(options.checkpoint or options.target_error)
+        if keep_variance:
             session.keep_variance()
         clock = _resume(options, identity, session) if options.checkpoint else Clock()
         target = TargetError(options.target_error) if options.target_error else None
-        kept = _render(session, sensor, options, identity, clock, target, interrupt)
+        with contextlib.ExitStack() as stack:
+            if options.workers or options.scheduler:
+                client = stack.enter_context(cluster.connected(options.workers, options.scheduler))
+                threads = max(1, dr.thread_count() // options.workers) if options.workers else None
+                session = cluster.DistributedSession(client, opened, keep_variance, threads)
+            kept = _render(session, opened.sensor, options, identity, clock, target, interrupt)
     except loading.SCENE_ERRORS as error:
         raise Failure(EXIT_SCENE, loading.one_line(error)) from error
+    except cluster.ClusterError as error:
+        raise Failure(EXIT_CLUSTER, str(error)) from error
 
     metadata = _metadata(options, loaded, session, clock)
     if target:
@@ -84,6 +86,22 @@ def _run(options: argparse.Namespace, interrupt: Interrupt) -> int:
     if not options.quiet:
         print(report, file=sys.stderr)
     return EXIT_OK
+
+
+def _request(options: argparse.Namespace) -> Request:
+    unbounded = options.time or (options.target_error and not options.spp)
+    return Request(
+        scene=str(options.scene),
+        variables=dict(options.variables),
+        plugin=options.plugin,
+        parameters={name: loading.parse_value(text) for name, text in options.parameters},
+        variant=options.variant,
+        sensor=options.sensor,
+        all_views=options.all_views,
+        seed=options.seed,
+        spp=0 if unbounded else options.spp,
+        fine=bool(options.target_error or options.workers or options.scheduler),
+    )
 
 
 def _about_error(target: TargetError | None) -> str:
@@ -146,20 +164,6 @@ def _render(
         return None if keep.failure else path
 
 
-def _identity(options: argparse.Namespace, loaded: loading.LoadedScene, session: Session) -> dict[str, Any]:
-    """What a render is of: see ``checkpoint.difference``."""
-    return {
-        "plugin": loaded.plugin,
-        "variant": options.variant,
-        "sensor": "all" if options.all_views else options.sensor,
-        "seed": options.seed,
-        "versions": versions(),
-        "files": fingerprint.scene_digests(options.scene, dict(options.variables)),
-        "variables": dict(options.variables),
-        "settings": {**loaded.parameters, **session.settings},
-    }
-
-
 def _keep(path: Path, identity: dict[str, Any], session: Session, clock: Clock) -> None:
     sums = session.sums
     checkpoint.write(
@@ -185,17 +189,6 @@ def _resume(options: argparse.Namespace, identity: dict[str, Any], session: Sess
     for written in (path, options.output, options.output.with_suffix(".png")):
         output.remove_leftovers(written)
     return Clock(found.seconds, found.compiling)
-
-
-def _session(loaded: loading.LoadedScene, sensor: mi.Sensor, options: argparse.Namespace, spp: int) -> Session:
-    """The session that the options ask for; only some integrators render several views."""
-    if not hasattr(loaded.integrator, "views_session") and (options.all_views or options.frames):
-        option = "--all-views" if options.all_views else "--frames"
-        raise Failure(EXIT_SCENE, f'{option}: "{loaded.plugin}" renders one view at a time; use -i volpath_multiview')
-    if options.all_views:
-        return loaded.integrator.views_session(loaded.scene, seed=options.seed, spp=spp)
-    fine = bool(options.target_error or options.workers or options.scheduler)
-    return make_session(loaded.integrator, loaded.scene, sensor, options.seed, spp, fine)
 
 
 def _preview(session: Session, options: argparse.Namespace, path: Path) -> None:
@@ -231,24 +224,6 @@ def _check_output(path: Path) -> None:
         output.make_writable(path.parent)
     except OSError as error:
         raise Failure(EXIT_OUTPUT, f"cannot write {path}: {error.strerror or error}") from error
-
-
-def _set_variant(variant: str) -> None:
-    if variant.startswith("llvm_"):
-        llvm.require()
-    mi.set_variant(variant)
-
-
-def _sensor(scene: mi.Scene, index: int) -> mi.Sensor:
-    sensors = scene.sensors()
-    if not 0 <= index < len(sensors):
-        raise Failure(
-            EXIT_SCENE,
-            f"--sensor {index}: the scene's sensors are numbered 0 to {len(sensors) - 1}"
-            if sensors
-            else "the scene has no sensor",
-        )
-    return sensors[index]
 
 
 if __name__ == "__main__":
