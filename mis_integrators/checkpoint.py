@@ -60,7 +60,7 @@ def write(path: Path, checkpoint: Checkpoint) -> None:
             "arrays": {name: array.shape for name, array in arrays.items()},
         }
     ).encode()
-    body = [len(header).to_bytes(_LENGTH_BYTES, "little"), header, *(array.data for array in arrays.values() if array.size)]
+    body: list[Any] = [len(header).to_bytes(_LENGTH_BYTES, "little"), header, *(array.data for array in arrays.values() if array.size)]
     digest = hashlib.sha256()
     for part in body:
         digest.update(part)

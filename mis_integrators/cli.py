@@ -51,7 +51,8 @@ def _run(options: argparse.Namespace, interrupt: Interrupt) -> int:
     try:
         needs_views = "--all-views" if options.all_views else "--frames" if options.frames else None
         opened = _request(options).open(needs_views)
-        session, loaded = opened.session, opened.loaded
+        session: Any = opened.session
+        loaded = opened.loaded
         identity = opened.identity() if options.checkpoint else {}
         keep_variance = bool(options.checkpoint or options.target_error)
         if keep_variance:
@@ -191,7 +192,7 @@ def _resume(options: argparse.Namespace, identity: dict[str, Any], session: Sess
     return Clock(found.seconds, found.compiling)
 
 
-def _preview(session: Session, options: argparse.Namespace, path: Path) -> None:
+def _preview(session: Any, options: argparse.Namespace, path: Path) -> None:
     """Write the image so far."""
     image = output.contact_sheet(session.view_images()) if options.all_views else session.image()
     output.write_exr(path, image, session.channels, {"iterations": session.iterations})
@@ -199,7 +200,7 @@ def _preview(session: Session, options: argparse.Namespace, path: Path) -> None:
 
 
 def _write(
-    options: argparse.Namespace, session: Session, metadata: dict[str, str | int | float], path: Path, kept: Path | None
+    options: argparse.Namespace, session: Any, metadata: dict[str, str | int | float], path: Path, kept: Path | None
 ) -> str:
     png, channels = path.with_suffix(".png"), session.channels
     views = session.view_images() if options.all_views or options.frames else []

@@ -71,7 +71,7 @@ def versions() -> list[Finding]:
     """Python, the package, and what it depends on, against the versions that it asks for."""
     findings = [Finding("python", f"{platform.python_version()} ({sys.executable}) on {platform.platform()}")]
     for requirement in _requirements():
-        name, ranges = re.fullmatch(r"([\w.-]+)\s*(.*)", requirement.split(";")[0].strip()).groups()
+        name, ranges = re.findall(r"^([\w.-]+)\s*(.*)$", requirement.split(";")[0].strip())[0]
         try:
             version = importlib.metadata.version(name)
         except importlib.metadata.PackageNotFoundError:
@@ -164,13 +164,13 @@ def _requirements() -> list[str]:
         return [r for r in importlib.metadata.requires("mis-integrators") or [] if "extra" not in r]
     except importlib.metadata.PackageNotFoundError:
         text = (Path(__file__).parents[1] / "pyproject.toml").read_text()
-        return re.findall(r'"([^"]+)"', re.search(r"^dependencies = \[(.*?)\]", text, re.MULTILINE | re.DOTALL)[1])
+        return re.findall(r'"([^"]+)"', re.findall(r"^dependencies = \[(.*?)\]", text, re.MULTILINE | re.DOTALL)[0])
 
 
 def _satisfies(version: str, ranges: str) -> bool:
     """Whether a version is in ranges such as ``>=1.5.0,<1.6``."""
     def key(text: str) -> tuple[int, ...]:
-        numbers = [int(part) for part in re.match(r"[\d.]*\d", text)[0].split(".")]
+        numbers = [int(part) for part in re.findall(r"^[\d.]*\d", text)[0].split(".")]
         return tuple(numbers + [0] * (4 - len(numbers)))
 
     tests = {">=": lambda a, b: a >= b, "<": lambda a, b: a < b, "<=": lambda a, b: a <= b, ">": lambda a, b: a > b, "==": lambda a, b: a == b}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import re
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 from typing import Mapping
@@ -50,7 +49,7 @@ def _name(file: Path, scene: Path) -> str:
 def _substituted(text: str, values: Mapping[str, str]) -> str:
     for name in sorted(values, key=len, reverse=True):
         if name:
-            text = re.sub(rf"\${re.escape(name)}", lambda _, name=name: values[name], text)
+            text = text.replace(f"${name}", values[name])
     return text
 
 

@@ -24,7 +24,7 @@ def make_writable(directory: Path) -> None:
 
 def write_exr(
     path: Path, image: np.ndarray, channels: Sequence[str], metadata: Mapping[str, str | int | float]
-):
+) -> None:
     """Write an image of shape (H, W, C) with named channels as float32, and the metadata as attributes.
 
     Raises ``OSError`` if it cannot be written; a file that was there before is then still whole.

@@ -32,7 +32,7 @@ class Progress:
         self._task = self._bar.add_task("first iteration, compiling", total=1.0)
         return self
 
-    def __exit__(self, *_) -> None:
+    def __exit__(self, *_: object) -> None:
         self._bar.stop()
 
     def say(self, text: str) -> None:

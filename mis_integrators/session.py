@@ -29,8 +29,9 @@ class Session(Protocol):
     iterations_planned: int | None
     """Iterations that make up the planned samples per pixel; ``None`` if no number was planned."""
 
-    iterations: int
-    """Iterations done."""
+    @property
+    def iterations(self) -> int:
+        """Iterations done."""
 
     samples_per_iteration: int
     """Camera paths per pixel of one iteration."""
@@ -44,8 +45,9 @@ class Session(Protocol):
     sums: Sums
     """All that has been rendered so far: a session of the same scene and settings with the same sums has the same image."""
 
-    learned: dict[str, Any]
-    """What ``start`` has found out and the seed alone would not tell again, in JSON's types."""
+    @property
+    def learned(self) -> dict[str, Any]:
+        """What ``start`` has found out and the seed alone would not tell again, in JSON's types."""
 
     def iterate(self, iteration: int | None = None) -> None:
         """Run one iteration and wait until it is done: that of the given number, or the first that is missing.
