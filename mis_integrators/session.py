@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from .sums import Sums
+from .turns import by_turns
 
 # Camera paths that one pass of a Mitsuba integrator traces: bounds its memory, and the wait after a Ctrl-C.
 PATHS_PER_PASS = 1 << 20
@@ -132,6 +133,7 @@ class MitsubaSession:
     def start(self) -> None:
         pass
 
+    @by_turns
     def iterate(self, iteration: int | None = None) -> None:
         iteration = self.sums.done.first_missing if iteration is None else iteration
         seed = int(np.random.SeedSequence((self._seed, iteration)).generate_state(1)[0])

@@ -13,6 +13,7 @@ from ..transport.lights import Lights
 from ..transport.random import mix, streams
 from ..transport.recording import recorder
 from ..transport.traits import UnsupportedScene, check_variant
+from ..turns import by_turns
 from ..volume.films import OWN, SHARED, ViewAccumulator, own_values, splat, write_film
 from ..volume.lines import connect, own_line
 from ..volume.pivots import ON_SURFACE, OWN as OWN_BRANCH, pivot_surface, trace_first_segments
@@ -116,6 +117,7 @@ class VolpathMultiview(IterativeIntegrator):
         check_volume_scene(scene, self.plugin)
         for sensor in sensors:
             Views.check_sensor(sensor, self.plugin)
+        self.check_path_number(sensors)
         camera_paths = self.camera_paths or self._automatic(sensors, spp)
         iterations = self.planned_iterations(spp, camera_paths)
         return MultiViewSession(self, scene, sensors, scalar_seed(seed), iterations, camera_paths)
@@ -219,14 +221,10 @@ class MultiViewSession(IterativeSession):
         dr.make_opaque(spectral)
         return spectral
 
-    def iterate(self, iteration=None):
-        iteration = self.sums.done.first_missing if iteration is None else iteration
-        with dr.suspend_grad():
-            seed, spectral = self._seed(iteration, PATHS), self._spectral(iteration)
-            layers = [self._part(first, seed, spectral) for first in range(0, self.views.paths, self.paths)]
-            self.accumulator.add(*(sum(layer[1:], layer[0]) for layer in zip(*layers)), iteration)
-            dr.eval(self.sums.tensors)
-            dr.sync_thread()
+    def _run(self, iteration):
+        seed, spectral = self._seed(iteration, PATHS), self._spectral(iteration)
+        layers = [self._part(first, seed, spectral) for first in range(0, self.views.paths, self.paths)]
+        self.accumulator.add(*(sum(layer[1:], layer[0]) for layer in zip(*layers)), iteration)
 
     def estimate(self):
         """As of other sessions, with all pixels of all views in one row: (1, pixels, 3)."""
@@ -276,6 +274,7 @@ class MultiViewSession(IterativeSession):
         images = [np.array(tensor, dtype=np.float32) for tensor in self.view_tensors()]
         return [image if image.ndim == 3 else image[:, :, None] for image in images]
 
+    @by_turns
     def view_tensors(self):
         """The images so far, one tensor a view, as films develop them."""
         images, first = [], 0
