@@ -100,6 +100,7 @@ def test_resumed_session_goes_on_as_if_nothing_had_been(scene, plugin):
     first.iterate()
     first.iterate()
     half = first.image()
+    assert all(np.array(tensor).dtype == np.float64 for tensor in first.sums.tensors.values())
     checkpoint.write(file, Checkpoint({}, first.learned, first.sums.done, 1.5, 0.5, first.sums.arrays()))
     found = checkpoint.read(file)
     assert (found.seconds, found.compiling, found.done.below) == (1.5, 0.5, 2)
