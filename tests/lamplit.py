@@ -1,4 +1,4 @@
-"""A small scene of three files, and the command that renders it."""
+"""A small scene of four files, and the command that renders it."""
 
 import subprocess
 import sys
@@ -29,6 +29,7 @@ SCENE = """<scene version="3.0.0">
 </scene>"""
 LAMP = """<scene version="3.0.0">
   <shape type="rectangle"><transform name="to_world"><scale value="0.5"/><rotate x="1" angle="90"/><translate y="2"/></transform>
+    <bsdf type="diffuse"><spectrum name="reflectance" filename="lamp.spd"/></bsdf>
     <emitter type="area"><rgb name="radiance" value="5, 4, 3"/></emitter></shape>
 </scene>"""
 
@@ -38,6 +39,7 @@ def write_scene(folder: Path) -> Path:
     file = folder / "scene.xml"
     file.write_text(SCENE)
     (folder / "lamp.xml").write_text(LAMP)
+    (folder / "lamp.spd").write_text("400 0.5\n700 0.6\n")
     for name, seed in (("wall.png", 1), ("other.png", 2)):
         pixels = np.random.default_rng(seed).integers(100, 255, (4, 4, 3)).astype(np.uint8)
         mi.Bitmap(pixels).write(str(folder / name))

@@ -78,6 +78,18 @@ def test_worker_that_sees_another_scene_is_an_error(scene, client, tmp_path):
         session.iterate()
 
 
+def test_workers_are_told_what_a_pilot_found(scene, client):
+    """With a time limit it hangs on the clock: a worker that had a pilot of its own would merge within another radius."""
+    request = request_for(scene, "bdpm", 8, bdd=0)
+    opened = request.open()
+    told = {"radii": {kind: 0.31 for kind in opened.session.kinds()}, "corrected": {kind: False for kind in opened.session.kinds()}}
+    identity = opened.identity()
+    opened.session.recall(told)
+    opened.session.iterate(2)
+    arrays, done, _ = client.submit(cluster.run, cluster.Job("told", request, told, identity, False, 1), [2], pure=False).result()
+    assert done == Iterations(0, (2,)) and same(opened.session.sums.arrays()["total"], arrays["total"])
+
+
 def test_error_of_a_worker_leaves_nothing_half_summed(scene, client, monkeypatch):
     """The worker forgets the session in which an iteration failed; the next batch opens it anew."""
     request = request_for(scene, "path", 8)

@@ -221,7 +221,7 @@ def test_other_renders_are_refused(scene, kept, tmp_path, capsys):
     assert "llvm_ad_mono" in refused("--variant", "llvm_ad_mono")
     assert "other.png is new" in refused("-D", "picture=other.png")
     assert "-D size = (default), not 12" in refused("-D", "size=12")
-    for name, change in (("scene.xml", SCENE.replace("0.6", "0.61")), ("lamp.xml", LAMP.replace("5, 4", "5, 5"))):
+    for name, change in (("scene.xml", SCENE.replace("0.6", "0.61")), ("lamp.xml", LAMP.replace("5, 4", "5, 5")), ("lamp.spd", "400 0.5\n700 0.7\n")):
         before = (tmp_path / name).read_text()
         (tmp_path / name).write_text(change)
         assert f"{name} has changed" in refused()
