@@ -1,8 +1,8 @@
 """How iterations a second grow with the number of local worker processes, one thread each, and what bounds them.
 
 With t the seconds of an iteration on one worker, g those that the gatherer needs to fetch and add a batch, and b the iterations of a batch, N workers
-make min(N / t, b / g) iterations a second: the gatherer adds one batch at a time. Batches grow with g, so that it is idle most of the time. On one machine
-the workers share caches and memory besides, which shows as an efficiency below one.
+make min(N / t, b / g) iterations a second: the gatherer adds one batch at a time. Batches grow with g, so that it is idle most of the time.
+On one machine the workers share caches and memory besides, which shows as an efficiency below one.
 """
 
 from __future__ import annotations

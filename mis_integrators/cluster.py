@@ -1,7 +1,7 @@
 """Iterations spread over the processes of a Dask cluster, here or on other machines.
 
-Iterations depend on the seed and their number alone, so any worker may run any of them: a worker opens the scene by itself, runs the iterations that it is
-told, and hands back their sums. Whoever gathers them adds each iteration once. What a worker that dies had in hand Dask gives to another.
+Iterations depend on the seed and their number alone, so any worker may run any of them: a worker opens the scene by itself, runs the iterations that
+it is told, and hands back their sums. Whoever gathers them adds each iteration once. What a worker that dies had in hand Dask gives to another.
 """
 
 from __future__ import annotations

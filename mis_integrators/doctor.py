@@ -112,7 +112,9 @@ def machine() -> list[Finding]:
     cache = Path.home() / ".drjit"
     room = shutil.disk_usage(cache if cache.exists() else Path.home()).free / 2**30
     writable = os.access(cache if cache.exists() else Path.home(), os.W_OK)
-    advice = None if writable and room >= LEAST_CACHE else f"make {cache} writable, with {LEAST_CACHE} GiB of room; else all kernels are compiled anew"
+    advice = None
+    if not writable or room < LEAST_CACHE:
+        advice = f"make {cache} writable, with {LEAST_CACHE} GiB of room; else all kernels are compiled anew"
     findings.append(Finding("cache", f"{cache}, {room:.1f} GiB free{'' if writable else ', not writable'}", advice, fatal=False))
     return findings
 

@@ -57,7 +57,8 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     add("--preview", type=_positive_number, metavar="SECONDS",
         help="write the image so far to FILE.preview.exr and .png every so many seconds, until the image is there")
     where = parser.add_mutually_exclusive_group()
-    where.add_argument("--workers", type=_positive_int, metavar="N", help="spread the iterations over so many processes of this machine; --time then includes their compiling")
+    where.add_argument("--workers", type=_positive_int, metavar="N",
+                       help="spread the iterations over so many processes of this machine; --time then includes their compiling")
     where.add_argument("--scheduler", metavar="ADDRESS",
                        help="spread the iterations over the workers of a Dask cluster, such as tcp://host:8786, which must find the scene under "
                        "the same path")

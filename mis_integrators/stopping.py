@@ -5,8 +5,8 @@ With m_p the mean of pixel p over the iterations, v_p the estimated variance of 
     E^2 = mean over pixels and channels of  v_p / (m_p^2 + (0.1 m)^2)
 
 without the worst 0.1 % of the pixels. So E is about the noise of a pixel over its brightness; pixels much darker than the picture count less.
-The scale of the scene's light cancels. What E does not see is what all iterations have in common: the blur of a merge radius, and light so rare that no
-iteration has found it yet. The pixels left out are for single bright dots, whose variance a few iterations do not tell.
+The scale of the scene's light cancels. What E does not see is what all iterations have in common: the blur of a merge radius, and light so rare that
+no iteration has found it yet. The pixels left out are for single bright dots, whose variance a few iterations do not tell.
 """
 
 from __future__ import annotations

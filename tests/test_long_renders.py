@@ -77,7 +77,8 @@ PLUGINS = {
     "volpath_multiview": {},
     "path": {},
 }
-REST = {"bdpm": {"bdd": 0}, "bdpm_opt2": {"initial_radius": 0.1}, "bdpm_opt": {"weights": "full"}, "bdpm_balance": {}, "pcbpt": {"light_paths": 20}, "ptracer": {}}
+REST = {"bdpm": {"bdd": 0}, "bdpm_opt2": {"initial_radius": 0.1}, "bdpm_opt": {"weights": "full"}, "bdpm_balance": {},
+        "pcbpt": {"light_paths": 20}, "ptracer": {}}
 
 
 @pytest.mark.parametrize(

@@ -75,8 +75,8 @@ class IterativeIntegrator(mi.AdjointIntegrator):
         """Raises `ValueError` where an iteration would have more camera paths than can be numbered."""
         pixels = sum(math.prod(sensor.film().size()) for sensor in sensors)
         if self.camera_paths * pixels > MOST_PATHS:
-            raise ValueError(f'{self.plugin}: parameter "camera_paths" = {self.camera_paths} makes more than {MOST_PATHS} paths an iteration on films '
-                             f"of {pixels} pixels; ask for more samples per pixel (spp), and so more iterations, instead")
+            raise ValueError(f'{self.plugin}: parameter "camera_paths" = {self.camera_paths} makes more than {MOST_PATHS} paths an iteration on '
+                             f"films of {pixels} pixels; ask for more samples per pixel (spp), and so more iterations, instead")
 
     def planned_iterations(self, spp, camera_paths):
         """Iterations of `camera_paths` that make `spp` camera paths a pixel; None (no planned end) if `spp` is 0."""
