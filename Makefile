@@ -1,13 +1,14 @@
 # make render   set everything up, then render a bundled scene into out/
 # make test     set everything up, then run the tests
 # make bench    set everything up, then compare all methods on all bundled scenes: out/bench/index.html (half an hour)
+# make lint     set everything up, then check the type hints
 # make gallery  set everything up, then render the pictures of docs/ (minutes)
 
 PYTHON ?= python3
 VENV := .venv
 SETUP := tools/setup.sh
 
-.PHONY: render test bench gallery clean
+.PHONY: render test lint bench gallery clean
 .DELETE_ON_ERROR:
 
 render: $(VENV)/installed
@@ -17,10 +18,14 @@ render: $(VENV)/installed
 test: $(VENV)/installed-test
 	$(VENV)/bin/python -m pytest -n 2
 
+lint: $(VENV)/installed-test
+	$(VENV)/bin/python -m mypy
+
 gallery: $(VENV)/installed
 	@mkdir -p docs/images out
 	@for scene in scenes/*.xml; do name=$$(basename $$scene .xml); \
 	    $(VENV)/bin/mis-render $$scene -i bdpm -P bdd=0 --time 60 -o out/$$name.exr && cp out/$$name.png docs/images/ || exit 1; done
+	PYTHON=$(VENV)/bin/python tools/plugin_pictures.sh
 
 bench: $(VENV)/installed
 	$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check --editable '.[bench]'

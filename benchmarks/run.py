@@ -21,6 +21,7 @@ import overview  # noqa: E402
 import radius  # noqa: E402
 import references  # noqa: E402
 import resampling  # noqa: E402
+import scaling  # noqa: E402
 import stability  # noqa: E402
 import throughput  # noqa: E402
 import variance  # noqa: E402
@@ -139,6 +140,12 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument("--seeds", type=int, default=24, help="renders, at least two (default: 24)")
     command.add_argument("--iterations", type=int, default=8, help="of each, one sample a pixel (default: 8)")
     command.add_argument("--groups", type=int, default=8, help="groups of pixels, equally large (default: 8)")
+    command.add_argument("--scale", type=float, default=1, help="film size, scene's own = 1 (default: 1)")
+
+    command = _measuring(commands, "scaling", scaling)
+    _chooses(command, ("bdpm",), "each by itself")
+    command.add_argument("--workers", type=int, nargs="+", default=[1, 2], metavar="N", help="local processes of one thread (default: 1 2)")
+    command.add_argument("--time", type=float, default=20, metavar="SECONDS", help="for which each is measured (default: 20)")
     command.add_argument("--scale", type=float, default=1, help="film size, scene's own = 1 (default: 1)")
 
     for name, function in (("freeze-scenes", freezing.freeze), ("check-scenes", freezing.check)):

@@ -4,6 +4,8 @@ Importing this package makes a usable LLVM known to Dr.Jit and registers every p
 variant and for each variant set later; it does nothing else. `render_views` renders several views of a scene together.
 """
 
+from typing import Any
+
 from . import llvm
 
 llvm.make_known()  # before anything imports Dr.Jit, which loads its LLVM once and for all
@@ -15,7 +17,7 @@ __version__ = "0.1.0"
 _plugins.follow_variants()
 
 
-def render_views(scene, integrator=None, spp=0, seed=0):
+def render_views(scene: Any, integrator: Any = None, spp: int = 0, seed: int = 0) -> list[Any]:
     """Renders all views of a scene together; see `mis_integrators.integrators.volpath_multiview.render_views`."""
     from .integrators import volpath_multiview
 

@@ -6,6 +6,8 @@ loaded anew each time a variant is set.
 
 import importlib
 import sys
+from types import ModuleType
+from typing import Callable, NoReturn
 
 import mitsuba as mi
 
@@ -63,13 +65,13 @@ def _variant_changed(old: str | None, new: str) -> None:
     register()
 
 
-def _load_anew(name: str):
+def _load_anew(name: str) -> ModuleType:
     loaded = sys.modules.get(name)
     return importlib.reload(loaded) if loaded else importlib.import_module(name)
 
 
-def _refusal(plugin: str, variant: str):
-    def refuse(props):
+def _refusal(plugin: str, variant: str) -> Callable[[mi.Properties], NoReturn]:
+    def refuse(props: mi.Properties) -> NoReturn:
         raise RuntimeError(
             f'"{plugin}" needs a variant that runs on Dr.Jit (llvm_ad_* or cuda_ad_*), '
             f'but the active one is "{variant}"'

@@ -24,6 +24,9 @@ VARIABLE = "DRJIT_LIBLLVM_PATH"
 _IN_NAME = re.compile(r"libLLVM(?:-|\.so\.|\.)(\d+(?:\.\d+)*)")
 _IN_PATH = re.compile(r"llvm(?:@|-|/)(\d+(?:\.\d+)*)/")
 
+chosen: Path | None = None
+"""The library that ``make_known`` has chosen in this process; ``None`` if it was not asked to, or found none."""
+
 _INSTALL = (
     f"install LLVM {OLDEST_WORKING} or newer: `apt-get install libllvm19` (Debian, Ubuntu), "
     "`conda install -c conda-forge libllvm19`, or `brew install llvm`"
@@ -43,7 +46,8 @@ def version_of(library: Path) -> tuple[int, ...] | None:
 
 def newest_working(libraries: Iterable[Path]) -> Path | None:
     """The library of the highest version that is at least ``OLDEST_WORKING``; the first one among equals."""
-    best, best_version = None, (OLDEST_WORKING - 1, sys.maxsize)
+    best: Path | None = None
+    best_version: tuple[int, ...] = (OLDEST_WORKING - 1, sys.maxsize)
     for library in libraries:
         version = version_of(library)
         if version and version > best_version:
@@ -122,6 +126,8 @@ def make_known() -> None:
     library = choose(os.environ)
     if library:
         os.environ[VARIABLE] = str(library)
+        global chosen
+        chosen = library
 
 
 def problem() -> str | None:
@@ -161,7 +167,8 @@ def _linker_cache() -> str:
 
 def _main() -> int:
     if os.environ.get(VARIABLE):
-        library, message = os.environ[VARIABLE], problem_with_variable(os.environ)
+        library: Path | None = Path(os.environ[VARIABLE])
+        message = problem_with_variable(os.environ)
     else:
         library = choose(os.environ)
         message = None if library else f"no working LLVM found; {_INSTALL}"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Mapping
+from typing import Any, Mapping
 
 import mitsuba as mi
 
@@ -87,7 +87,7 @@ def one_line(error: BaseException) -> str:
     return " ".join(text.split()) or type(error).__name__
 
 
-def _integrator_node(state):
+def _integrator_node(state: Any) -> Any:
     """The node of the scene's integrator, which is no part of another integrator; ``None`` if it has none."""
     nodes = [node for node in state.nodes if node.type == mi.ObjectType.Integrator]
     inner = {index for node in nodes for index in _children(node)}
@@ -101,7 +101,7 @@ def _integrator_node(state):
     return outer[0] if outer else None
 
 
-def _add_integrator(state):
+def _add_integrator(state: Any) -> Any:
     """Add the integrator that Mitsuba would use for a scene without one."""
     node = mi.parser.SceneNode()
     node.type, node.props = mi.ObjectType.Integrator, mi.Properties("path")
@@ -110,7 +110,7 @@ def _add_integrator(state):
     return state.nodes[-1]
 
 
-def _nested_integrators(state, node):
+def _nested_integrators(state: Any, node: Any) -> list[Any]:
     """Properties of the integrators inside an integrator (``aov``, ``moment``)."""
     return [
         state.nodes[index].props
@@ -119,19 +119,19 @@ def _nested_integrators(state, node):
     ]
 
 
-def _children(node):
+def _children(node: Any) -> list[int]:
     """Indices of the nodes that a node contains."""
     return [
         value.index() for _, value in _items(node.props) if isinstance(value, mi.Properties.ResolvedReference)
     ]
 
 
-def _plain(props) -> dict[str, Value]:
+def _plain(props: Any) -> dict[str, Value]:
     """The properties that are numbers or texts, by name."""
     return {name: value for name, value in _items(props) if isinstance(value, (bool, int, float, str))}
 
 
-def _items(props):
+def _items(props: Any) -> list[tuple[str, Any]]:
     """Names and values of properties, from a copy: reading one marks it as known to the plugin."""
     return list(mi.Properties(props).items())
 

@@ -1,7 +1,8 @@
 """Write a render as an EXR file, with a PNG beside it to look at: whole files or none."""
 
+import contextlib
+import glob
 import os
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Iterator, Mapping, Sequence
 
@@ -23,14 +24,14 @@ def make_writable(directory: Path) -> None:
 
 def write_exr(
     path: Path, image: np.ndarray, channels: Sequence[str], metadata: Mapping[str, str | int | float]
-):
+) -> None:
     """Write an image of shape (H, W, C) with named channels as float32, and the metadata as attributes.
 
     Raises ``OSError`` if it cannot be written; a file that was there before is then still whole.
     """
     header = {**metadata, "compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     planes = {name: np.ascontiguousarray(image[..., i], dtype=np.float32) for i, name in enumerate(channels)}
-    with _replacing(path) as temporary:
+    with replacing(path) as temporary:
         try:
             OpenEXR.File(header, planes).write(str(temporary))
         except RuntimeError as error:
@@ -53,7 +54,7 @@ def write_png(path: Path, image: np.ndarray, channels: Sequence[str]) -> bool:
     bitmap = mi.Bitmap(picture, getattr(formats, pixel_format)).convert(
         formats.Y if pixel_format == "Y" else formats.RGB, mi.Struct.Type.UInt8, srgb_gamma=True
     )
-    with _replacing(path) as temporary:
+    with replacing(path) as temporary:
         try:
             bitmap.write(str(temporary), mi.Bitmap.FileFormat.PNG)
         except RuntimeError as error:
@@ -78,17 +79,38 @@ def frame_path(path: Path, number: int) -> Path:
     return path.with_suffix(f".{number:03d}.png")
 
 
-@contextmanager
-def _replacing(path: Path) -> Iterator[Path]:
-    """A temporary path beside ``path`` that replaces it at once when the block ends without an error."""
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """A temporary path beside ``path`` that replaces it at once when the block ends without an error, and is on the disk by then.
+
+    Raises ``OSError`` if it cannot be written; what was there before is then still there.
+    """
     temporary = _temporary(path)
     try:
         yield temporary
         with open(temporary, "rb") as file:
             os.fsync(file.fileno())
         os.replace(temporary, path)
+        _sync_directory(path.parent)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def remove_leftovers(path: Path) -> None:
+    """Remove what writers of ``path`` have left that were killed while they wrote."""
+    for temporary in path.parent.glob(f".{glob.escape(path.name)}.*.part"):
+        temporary.unlink(missing_ok=True)
+
+
+def _sync_directory(directory: Path) -> None:
+    """Let a rename in the directory reach the disk, where the system can."""
+    if os.name == "posix":
+        descriptor = os.open(directory, os.O_RDONLY)
+        try:
+            with contextlib.suppress(OSError):  # not every file system can
+                os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
 
 
 def _temporary(path: Path) -> Path:

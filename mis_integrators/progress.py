@@ -13,7 +13,7 @@ class Progress:
     """Progress on standard error as a context: iterations, camera paths a second, time left.
 
     ``paths`` are the camera paths of one iteration. ``planned`` iterations or ``seconds`` of rendering,
-    whichever is given, are the whole. Nothing is shown if ``quiet``.
+    whichever is given, are the whole; with neither, only what ``update`` is told. Nothing is shown if ``quiet``.
     """
 
     def __init__(self, paths: int, planned: int | None, seconds: float | None, quiet: bool):
@@ -32,20 +32,27 @@ class Progress:
         self._task = self._bar.add_task("first iteration, compiling", total=1.0)
         return self
 
-    def __exit__(self, *_) -> None:
+    def __exit__(self, *_: object) -> None:
         self._bar.stop()
 
     def say(self, text: str) -> None:
         """Print one line."""
-        self._console.print(text, soft_wrap=True)
+        self._console.print(text, soft_wrap=True, markup=False)
 
-    def update(self, iterations: int, rendering: float) -> None:
-        """Show that so many iterations are done, after so many seconds of rendering."""
-        done = rendering / self._seconds if self._seconds else iterations / self._planned
-        left = max(0.0, rendering / done - rendering) if done else 0.0
+    def warn(self, text: str) -> None:
+        """Print one line, even if all else is to be quiet."""
+        rich.console.Console(file=sys.stderr, highlight=False).print(f"mis-render: {text}", soft_wrap=True, markup=False)
+
+    def update(self, iterations: int, rendering: float, share: float | None = None) -> None:
+        """Show that so many iterations are done, after so many seconds of rendering; ``share`` of the work, if that is known better than by
+        those, is done."""
+        done = max(
+            rendering / self._seconds if self._seconds else 0.0, iterations / self._planned if self._planned else 0.0, share or 0.0
+        )
+        left = f"{_duration(max(0.0, rendering / done - rendering))} left" if done else "time left unknown"
         speed = iterations * self._paths / max(rendering, 1e-9) / 1e6
-        of = "" if self._seconds else f"/{self._planned}"
-        text = f"iteration {iterations}{of}, {speed:.2f} M samples/s, {_duration(left)} left"
+        of = "" if self._seconds or not self._planned else f"/{self._planned}"
+        text = f"iteration {iterations}{of}, {speed:.2f} M samples/s, {left}"
         self._bar.update(self._task, completed=min(done, 1.0), description=text)
         now = time.monotonic()
         if self._bar.disable and not self._quiet and now - self._last_line >= SECONDS_BETWEEN_LINES:

@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 import math
-from typing import Protocol
+from typing import Any, Protocol
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .sums import Sums
+from .turns import by_turns
+
 # Camera paths that one pass of a Mitsuba integrator traces: bounds its memory, and the wait after a Ctrl-C.
 PATHS_PER_PASS = 1 << 20
+# Passes of a render that estimates its error or is spread over workers, at least.
+FEWEST_PASSES = 32
+
+Setting = str | int | float
 
 
 class Session(Protocol):
@@ -23,8 +30,9 @@ class Session(Protocol):
     iterations_planned: int | None
     """Iterations that make up the planned samples per pixel; ``None`` if no number was planned."""
 
-    iterations: int
-    """Iterations done."""
+    @property
+    def iterations(self) -> int:
+        """Iterations done."""
 
     samples_per_iteration: int
     """Camera paths per pixel of one iteration."""
@@ -32,58 +40,131 @@ class Session(Protocol):
     channels: list[str]
     """Names of the image's C channels: ``R``, ``G``, ``B``, perhaps ``A`` (or ``Y``), then the AOVs."""
 
-    settings: dict[str, str | int | float]
+    settings: dict[str, Setting]
     """What a reader of the image should know about how it was made, by name."""
 
-    def iterate(self) -> None:
-        """Run one iteration and wait until it is done."""
+    sums: Sums
+    """All that has been rendered so far: a session of the same scene and settings with the same sums has the same image."""
+
+    @property
+    def learned(self) -> dict[str, Any]:
+        """What ``start`` has found out and the seed alone would not tell again, in JSON's types."""
+
+    def iterate(self, iteration: int | None = None) -> None:
+        """Run one iteration and wait until it is done: that of the given number, or the first that is missing.
+
+        Iterations depend on the seed and their number alone.
+        """
 
     def image(self) -> np.ndarray:
         """Mean over the iterations done: float32 of shape (H, W, C), radiance in the scene's units."""
 
+    def keep_variance(self) -> None:
+        """From the first iteration on, keep what ``estimate`` needs."""
+
+    def estimate(self) -> tuple[np.ndarray, np.ndarray]:
+        """Mean colour and its estimated variance: float64 of the same shape (H, W, 3), or other colour channels.
+
+        Needs two iterations, and ``keep_variance``.
+        """
+
+    def start(self) -> None:
+        """Find out what must be known before the first iteration, unless it is known: pilots, caches."""
+
+    def recall(self, learned: dict[str, Any]) -> None:
+        """Take over what another session of the same render has ``learned``; before the first iteration."""
+
 
 def make_session(
-    integrator: mi.Integrator, scene: mi.Scene, sensor: mi.Sensor, seed: int, spp: int
+    integrator: mi.Integrator, scene: mi.Scene, sensor: mi.Sensor, seed: int, spp: int, fine: bool = False
 ) -> Session:
-    """A session that renders ``spp`` samples per pixel, or without a planned end if ``spp`` is 0."""
+    """A session that renders ``spp`` samples per pixel, or without a planned end if ``spp`` is 0.
+
+    ``fine`` asks for many small iterations where their size is free.
+    """
     if hasattr(integrator, "session"):
         return integrator.session(scene, sensor, seed=seed, spp=spp)
-    return MitsubaSession(integrator, scene, sensor, seed=seed, spp=spp)
+    return MitsubaSession(integrator, scene, sensor, seed=seed, spp=spp, fine=fine)
 
 
 class MitsubaSession:
     """A ``Session`` of one of Mitsuba's own integrators: the mean of independent passes' developed images.
 
-    All passes have the same number of samples, so the total is ``spp`` rounded up to a multiple of it.
+    All passes have the same number of samples, so the total is ``spp`` rounded up to a multiple of it. If ``fine``, there are
+    ``FEWEST_PASSES`` passes at least (samples allowing), and without a planned end they have 16 samples at most.
     """
 
-    def __init__(self, integrator: mi.Integrator, scene: mi.Scene, sensor: mi.Sensor, seed: int, spp: int):
-        self._integrator, self._scene, self._sensor, self._seed = integrator, scene, sensor, seed
+    def __init__(
+        self, integrator: mi.Integrator, scene: mi.Scene, sensor: mi.Sensor, seed: int, spp: int, fine: bool = False
+    ):
+        self._integrator, self._scene, self._sensor, self._seed, self._spp = integrator, scene, sensor, seed, spp
         width, height = sensor.film().crop_size()
         largest = max(1, PATHS_PER_PASS // (width * height))
+        if fine:
+            largest = min(largest, max(1, spp // FEWEST_PASSES) if spp else 16)
         passes = math.ceil(spp / largest)
-        # The sampler has the last word: some of them only know squares or powers of two.
-        sampler = sensor.sampler().clone()
-        sampler.set_sample_count(math.ceil(spp / passes) if spp else largest)
-        self.samples_per_iteration = int(sampler.sample_count())
-        self.iterations_planned = math.ceil(spp / self.samples_per_iteration) if spp else None
-        self.iterations = 0
-        self.settings: dict[str, str | int | float] = {}
+        self._set_samples(math.ceil(spp / passes) if spp else largest)
+        self.settings: dict[str, Setting] = {}
         sensor.film().prepare(integrator.aov_names())
         self.channels = [field.name for field in sensor.film().bitmap().struct_()]
-        self._sum = np.zeros((height, width, len(self.channels)))
+        self._shape = height, width, len(self.channels)
+        self._colours = _colour_channels(self.channels)
+        self._keeps_variance = False
+        self.sums = Sums()
 
-    def iterate(self) -> None:
-        seed = int(np.random.SeedSequence((self._seed, self.iterations)).generate_state(1)[0])
+    def _set_samples(self, samples: int) -> None:
+        # The sampler has the last word: some of them only know squares or powers of two.
+        sampler = self._sensor.sampler().clone()
+        sampler.set_sample_count(samples)
+        self.samples_per_iteration = int(sampler.sample_count())
+        self.iterations_planned = math.ceil(self._spp / self.samples_per_iteration) if self._spp else None
+
+    @property
+    def iterations(self) -> int:
+        return len(self.sums.done)
+
+    @property
+    def learned(self) -> dict[str, Any]:
+        return {"samples_per_iteration": self.samples_per_iteration}
+
+    def recall(self, learned: dict[str, Any]) -> None:
+        self._set_samples(learned["samples_per_iteration"])
+
+    def start(self) -> None:
+        pass
+
+    @by_turns
+    def iterate(self, iteration: int | None = None) -> None:
+        iteration = self.sums.done.first_missing if iteration is None else iteration
+        seed = int(np.random.SeedSequence((self._seed, iteration)).generate_state(1)[0])
         with dr.suspend_grad():
             self._integrator.render(
                 self._scene, self._sensor, seed=seed, spp=self.samples_per_iteration, develop=False
             )
         # The film has all channels; the tensor that render() could return lacks some under `aov`.
-        self._sum += np.array(self._sensor.film().bitmap()).reshape(self._sum.shape)
+        image = np.array(self._sensor.film().bitmap(), np.float64).reshape(self._shape)
         # Else the sampler's unused final state waits, and the next recorded pass would trace these paths again to evaluate it.
         self._sensor.sampler().seed(0, 1)
-        self.iterations += 1
+        self.sums.add("total", image)
+        if self._keeps_variance:
+            self.sums.add("square", np.square(image[..., self._colours]))
+        self.sums.done.add(iteration)
 
     def image(self) -> np.ndarray:
-        return (self._sum / self.iterations).astype(np.float32)
+        return (self.sums["total"] / self.iterations).astype(np.float32)
+
+    def keep_variance(self) -> None:
+        self._keeps_variance = True
+
+    def estimate(self) -> tuple[np.ndarray, np.ndarray]:
+        n = self.iterations
+        mean = self.sums["total"][..., self._colours] / n
+        return mean, np.maximum(self.sums["square"] / n - np.square(mean), 0) / (n - 1)
+
+
+def _colour_channels(channels: list[str]) -> list[int]:
+    """Indices of the channels that make a picture; of all, if the film has bands of its own."""
+    for names in (("R", "G", "B"), ("X", "Y", "Z"), ("Y",)):
+        if set(names) <= set(channels):
+            return [channels.index(name) for name in names]
+    return list(range(len(channels)))

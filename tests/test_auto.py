@@ -4,6 +4,8 @@ Comparisons of renders as in `test_against_path`: false-alarm rate 1e-6 each, an
 with a probability of 0.95.
 """
 
+import json
+
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -170,6 +172,18 @@ def test_image_is_that_of_the_integrator_chosen(variant_name):
     assert settings["radius.indirect"] == alone.settings["radius.indirect"]
     assert np.allclose(session.image(), alone.image(), rtol=1e-3, atol=1e-5)
     assert session.channels == alone.channels
+
+
+def test_what_was_decided_can_be_recalled(rgb):
+    """Another session of the same render (after a kill, on another machine) goes on with the same integrator, without a pilot."""
+    scene = glossy_box()
+    first, second = (auto().session(scene, seed=3, spp=6) for _ in range(2))
+    first.iterate()
+    assert second.learned == {}
+    second.recall(json.loads(json.dumps(first.learned)))
+    assert second.settings == first.settings and second.decision.trials == []
+    second.iterate()
+    assert np.allclose(first.image(), second.image(), rtol=1e-3, atol=1e-5)
 
 
 def test_means(rgb):

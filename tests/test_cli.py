@@ -78,7 +78,7 @@ def use(monkeypatch):
     """Makes the command use a session of the test's own."""
 
     def use(session):
-        monkeypatch.setattr(cli, "make_session", lambda *_: session)
+        monkeypatch.setattr("mis_integrators.opening.make_session", lambda *_: session)
         return session
 
     return use

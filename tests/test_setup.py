@@ -205,6 +205,13 @@ def test_modules_that_define_plugin_classes_are_loaded_anew(rgb):
             assert file.stem in _plugins.MODULES
 
 
+def test_type_hints_are_right(tmp_path):
+    """Those of the modules that pyproject.toml lists."""
+    pytest.importorskip("mypy", reason="mypy is not installed: pip install 'mis-integrators[lint]'")
+    result = subprocess.run([sys.executable, "-m", "mypy", "--cache-dir", tmp_path], cwd=ROOT, capture_output=True, text=True, timeout=300)
+    assert result.returncode == 0, result.stdout
+
+
 def test_wheel_holds_every_module(tmp_path):
     """Built without isolation: it needs no network, but a recent setuptools, which extra `test` brings."""
     setuptools = pytest.importorskip("setuptools")

@@ -83,7 +83,7 @@ class JointPaths:
 def test_weights_of_a_path_sum_to_one(variant_name, family, emitter, mix, kind, strategies):
     mi.set_variant(variant_name)
     session = weighted(strategies=strategies, weights=kind, mix_diffuse=mix).session(tray(family, emitter), seed=1)
-    session._start()
+    session.start()
     weights = session.weights(session._spectral(0)["merging"])
     paths = JointPaths(session, strategies + 1)
     stored, shares = paths.camera(weights, strategies - 1)
@@ -113,7 +113,7 @@ def test_weights_of_a_path_sum_to_one(variant_name, family, emitter, mix, kind, 
 def test_a_direction_that_the_camera_never_takes_is_left_to_the_photons(rgb):
     """Where the camera path's density is zero, deeper strategies have no weight, whatever the cache says."""
     session = weighted(strategies=3, mix_diffuse=True).session(tray("lambertian", "point"), seed=1)
-    session._start()
+    session.start()
     weights = session.weights(session._spectral(0)["merging"])
     paths = JointPaths(session, 3)
     stored, _ = paths.camera(weights, 0)

@@ -6,7 +6,7 @@ import base64
 import io
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Mapping, Sequence
+from typing import Any, Mapping, Sequence
 
 import numpy as np
 from matplotlib import colormaps, rc_context
@@ -219,7 +219,7 @@ def data_uri(content: bytes, kind: str) -> str:
     return f"data:{kind};base64,{base64.b64encode(content).decode()}"
 
 
-def _axes(width: float, height: float):
+def _axes(width: float, height: float) -> tuple[Figure, Any]:
     with rc_context(SETTINGS):
         figure = Figure(figsize=(width + 1.9, height), layout="constrained")
         axis = figure.subplots()
@@ -227,7 +227,7 @@ def _axes(width: float, height: float):
     return figure, axis
 
 
-def _logarithmic(axis, x: str, y: str) -> None:
+def _logarithmic(axis: Any, x: str, y: str) -> None:
     """Logarithmic axes with plain numbers at 1, 2 and 5 times powers of ten, at powers alone where these are many."""
     axis.set(xscale="log", yscale="log", xlabel=f"{x} (log)", ylabel=f"{y} (log)")
     for one, (low, high) in ((axis.xaxis, axis.get_xlim()), (axis.yaxis, axis.get_ylim())):
@@ -238,5 +238,5 @@ def _logarithmic(axis, x: str, y: str) -> None:
         one.set_minor_formatter(NullFormatter())
 
 
-def _legend(axis, title: str) -> None:
+def _legend(axis: Any, title: str) -> None:
     axis.legend(title=title, loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False, fontsize=8, title_fontsize=8, alignment="left")

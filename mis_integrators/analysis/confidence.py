@@ -97,7 +97,7 @@ def t_quantile(tail: float, freedom: float) -> float:
     return high
 
 
-def _beta_fraction(a, b, x):
+def _beta_fraction(a: float, b: float, x: float) -> float:
     """Continued fraction of the incomplete beta function (Lentz)."""
     c, d = 1.0, 1 - (a + b) * x / (a + 1)
     d = 1 / (d or 1e-300)

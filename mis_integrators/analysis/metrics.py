@@ -182,4 +182,4 @@ def _smooth(image: np.ndarray) -> np.ndarray:
     """Mean over 3 x 3 pixels."""
     height, width = image.shape[:2]
     padded = np.pad(image, ((1, 1), (1, 1), (0, 0)), mode="edge")
-    return sum(padded[y : y + height, x : x + width] for y in range(3) for x in range(3)) / 9
+    return np.mean([padded[y : y + height, x : x + width] for y in range(3) for x in range(3)], axis=0)

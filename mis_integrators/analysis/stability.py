@@ -81,10 +81,10 @@ def choose(sweeps: dict[str, Sequence[Point]]) -> list[Choice]:
     sweeps = {method: list(points) for method, points in sweeps.items() if points}
     broken = {method: breaks(points) for method, points in sweeps.items()}
     values = [point.value for point in next(iter(sweeps.values()))]
-    best = []
+    best: list[str] = []
     for index in range(len(values)):
         sound = {m: points[index].error for m, points in sweeps.items() if not points[index].mean_is_off}
-        least = min(sound, key=sound.get) if sound else "none"
+        least = min(sound, key=lambda method: sound[method]) if sound else "none"
         stays = best and best[-1] in sound and sound[best[-1]] <= CLOSE * sound[least]
         best.append(best[-1] if stays else least)
     choices, start = [], 0

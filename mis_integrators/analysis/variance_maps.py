@@ -32,6 +32,6 @@ def best_single(maps: list[np.ndarray]) -> np.ndarray:
     return min(maps, key=trimmed_mean)
 
 
-def _blocks(values, size):
+def _blocks(values: np.ndarray, size: int) -> np.ndarray:
     height, width = (n // size * size for n in values.shape)
     return values[:height, :width].reshape(height // size, size, width // size, size).mean(axis=(1, 3))

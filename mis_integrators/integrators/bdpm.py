@@ -260,13 +260,24 @@ class BDPMSession(IterativeSession):
             self.photon_capacity = room
             self._freeze()
 
-    def _start(self):
-        """What must be known before the first iteration."""
+    def start(self):
         if self.radii is None:
             self.forecast = choose_radii(self)
 
+    @property
+    def learned(self):
+        if self.radii is None:
+            return {}
+        return {"radii": {kind: float(radius) for kind, radius in self.radii.items()},
+                "corrected": {kind: bool(flag) for kind, flag in self.corrected.items()}}
+
+    def recall(self, learned):
+        if learned:
+            self.radii, self.corrected = dict(learned["radii"]), dict(learned["corrected"])
+            self._freeze()
+
     def _iteration(self, iteration):
-        self._start()
+        self.start()
         radii = self.radii_at(iteration)
         spectral = self._spectral(iteration)
         maps = self._map_pass(self._photons(iteration, spectral), radii) if radii else None

@@ -6,7 +6,7 @@ import mitsuba as mi
 
 from ..transport.traits import check_scene, has_media
 from ..volume.traits import check_volume_scene
-from .choice import choose, handed_on
+from .choice import Decision, choose, handed_on, new_session
 from .common import IterativeIntegrator, IterativeSession
 
 
@@ -83,11 +83,29 @@ class AutoSession(IterativeSession):
         if self.decision is None:
             return super().settings
         chosen = self.decision.session.settings
-        return {**chosen, "integrator": self.integrator.plugin, "choice": chosen["integrator"],
+        return {**chosen, "integrator": self.integrator.plugin, "choice": self.decision.plugin,
                 **{f"choice.because.{number}": reason for number, reason in enumerate(self.decision.reasons, 1)},
                 **{f"choice.relmse.{name}": error for name, error in self.decision.errors.items()}}
 
-    def _iteration(self, iteration):
+    def start(self):
         if self.decision is None:
             self.decision = choose(self.integrator, self.scene, self.sensor, self.seed, self.iterations_planned, self.seconds)
+
+    @property
+    def learned(self):
+        if self.decision is None:
+            return {}
+        decision = self.decision
+        return {"plugin": decision.plugin, "parameters": decision.parameters, "reasons": decision.reasons, "errors": decision.errors,
+                "session": decision.session.learned}
+
+    def recall(self, learned):
+        if learned:
+            session = new_session(learned["plugin"], learned["parameters"], self.integrator, self.scene, self.sensor, self.seed,
+                                  self.iterations_planned)
+            session.recall(learned["session"])
+            self.decision = Decision(learned["plugin"], learned["parameters"], session, learned["reasons"], learned["errors"])
+
+    def _iteration(self, iteration):
+        self.start()
         return self.decision.session._iteration(iteration)

@@ -130,7 +130,6 @@ class BDPTSession(IterativeSession):
         depth = integrator.max_depth
         self.bidirectional = not self.lights.dark and (depth < 0 or depth >= 2)
         self.expected_weight = expected_weight(sensor.film(), integrator.camera_paths)
-        self.pyramid = None
         self.recorded = recorder()
         self._freeze()
 
@@ -270,15 +269,15 @@ class BDPTSession(IterativeSession):
             techniques = None if techniques is None else techniques + light[:, :, 3:]
         if techniques is not None:
             techniques = with_rest(techniques, block) if self.integrator.technique_weights else techniques
-            self.pyramid = techniques if self.pyramid is None else self.pyramid + techniques
-            dr.eval(self.pyramid)
+            self.sums.add("techniques", techniques)
+            dr.eval(self.sums.tensors)
         return block
 
     def fill_film(self):
         film = self.sensor.film()
         film.clear()
         film.prepare(self.integrator.aov_names())
-        self.accumulator.put(film, self.pyramid)
+        self.accumulator.put(film, self.integrator.variance, self.sums.tensors.get("techniques"))
 
 
 LIGHT, CAMERA, WAVELENGTH, APERTURE, THIN = range(5)

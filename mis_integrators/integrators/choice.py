@@ -32,31 +32,34 @@ RARE = 0.02
 
 @dataclass
 class Decision:
-    """The session that renders, why it does, and all that were tried."""
+    """What renders, why it does, and what was expected of all that were tried."""
 
+    plugin: str
+    parameters: dict
     session: object
     reasons: list[str]
+    errors: dict[str, float] = field(default_factory=dict)
+    """Relative mean squared errors predicted, by candidate."""
     trials: list[Trial] = field(default_factory=list)
     usual_cost: float = 0.0
     """Of an iteration of the first photon mapper, a pixel; the time planned for is counted in those."""
-    budget: float = 0.0
-    """The cost a pixel that errors are predicted for."""
-
-    @property
-    def errors(self):
-        return {trial.name: trial.error(self.budget) for trial in self.trials}
 
 
 @dataclass
 class Trial:
     """What the pilot tells of one candidate."""
 
-    name: str
+    plugin: str
+    parameters: dict
     session: object
     squared_bias: float
     variance: float
     cost: float
     """Of one iteration, a pixel."""
+
+    @property
+    def name(self):
+        return name_of(self.plugin, self.parameters)
 
     def error(self, budget):
         """Relative mean squared error when the cost a pixel is `budget`."""
@@ -77,14 +80,14 @@ def choose(integrator, scene, sensor, seed, iterations, seconds):
     """The `Decision` for a render of so many iterations, or of so many seconds (either may be `None`)."""
     path = PathSession(integrator, scene, sensor, seed, iterations)
     plugin, parameters = PHOTON_MAPPERS[0]
-    first = _session(plugin, parameters, integrator, scene, sensor, seed, iterations)
+    first = new_session(plugin, parameters, integrator, scene, sensor, seed, iterations)
     if not first.kinds():
-        return Decision(path, [_no_photons(integrator, first)])
+        return Decision("path", {}, path, [_no_photons(integrator, first)])
     first.seconds = seconds
-    first._start()
+    first.start()
     forecast = first.forecast
     if forecast is None:
-        return Decision(path, ["path: no camera path meets a surface that scatters smoothly"])
+        return Decision("path", {}, path, ["path: no camera path meets a surface that scatters smoothly"])
 
     stride, pixels = pilot_pixels(path)
     segments = mean_segments(scene, sensor, seed, stride * integrator.camera_paths, pixels, integrator.max_depth, integrator.rr_depth)
@@ -107,9 +110,9 @@ def choose(integrator, scene, sensor, seed, iterations, seconds):
         if spent + FEWEST_ITERATIONS * usual * 0.5 > PILOT_SHARE * budget:
             reasons.append(f"not {name}: trying it would take more than {PILOT_SHARE:.0%} of the time")
             continue
-        session = _session(plugin, parameters, integrator, scene, sensor, seed, max(int(budget / usual), 1))
+        session = new_session(plugin, parameters, integrator, scene, sensor, seed, max(int(budget / usual), 1))
         session.judged_by = forecast.mean
-        session._start()
+        session.start()
         if session.forecast is None:
             continue
         trials.append(_trial(plugin, parameters, session, segments))
@@ -118,10 +121,14 @@ def choose(integrator, scene, sensor, seed, iterations, seconds):
     reasons.insert(0, f"{best.name}: least predicted error in this time; bias {best.squared_bias:.2g}, noise "
                       f"{best.variance * best.cost / budget:.2g} (squared, relative)")
     best.session.iterations_planned = iterations
-    return Decision(best.session, reasons, trials, usual, budget)
+    errors = {trial.name: float(trial.error(budget)) for trial in trials}
+    return Decision(best.plugin, best.parameters, best.session, reasons, errors, trials, usual)
 
 
-def _session(plugin, parameters, integrator, scene, sensor, seed, iterations):
+def new_session(plugin, parameters, integrator, scene, sensor, seed, iterations):
+    """A session of a candidate, with the parameters of `integrator` that all share."""
+    if plugin == "path":
+        return PathSession(integrator, scene, sensor, seed, iterations)
     made = mi.load_dict({"type": plugin, **handed_on(integrator), **parameters})
     return made.new_session(scene, sensor, seed, iterations)
 
@@ -147,7 +154,7 @@ def _why_not_path(session, forecast):
 def _trial(plugin, parameters, session, segments):
     forecast = session.forecast
     counted = costs.events(session, segments, session.last_vertex, forecast.gathered)
-    return Trial(name_of(plugin, parameters), session, forecast.squared_bias, forecast.variance, costs.cost(plugin, counted))
+    return Trial(plugin, parameters, session, forecast.squared_bias, forecast.variance, costs.cost(plugin, counted))
 
 
 def _pilot_cost(session, segments):
@@ -166,7 +173,7 @@ def _try_path(path, segments, stride, pixels, mean):
         values.append(np.broadcast_to(np.array(dr.mean(radiance)), pixels))
     path.sampler.seed(0, 1)
     variance = usual_mean(relative_weights(mean) * np.var(values, axis=0, ddof=1))
-    return Trial("path", path, 0.0, variance, costs.cost("path", costs.events(path, segments, None, 0.0)))
+    return Trial("path", {}, path, 0.0, variance, costs.cost("path", costs.events(path, segments, None, 0.0)))
 
 
 def _worse(trials, budget):

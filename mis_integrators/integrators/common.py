@@ -12,7 +12,12 @@ from ..transport.film import Accumulator, variance_channels
 from ..transport.packing import rounded_up
 from ..transport.random import mix
 from ..transport.traits import UnsupportedScene, check_scene, check_variant
+from ..turns import TURN, by_turns
 from .parameters import Parameters
+
+
+MOST_PATHS = 2 ** 32 - 1
+"""Camera paths of an iteration at most: their numbers have 32 bits."""
 
 
 class IterativeIntegrator(mi.AdjointIntegrator):
@@ -63,7 +68,15 @@ class IterativeIntegrator(mi.AdjointIntegrator):
         """Prepares a rendering of `scene` with `spp` camera paths a pixel, or without a planned end if `spp` is 0."""
         sensor = self._sensor(scene, sensor)
         self.check(scene, sensor)
+        self.check_path_number([sensor])
         return self.new_session(scene, sensor, scalar_seed(seed), self.planned_iterations(spp, self.camera_paths))
+
+    def check_path_number(self, sensors):
+        """Raises `ValueError` where an iteration would have more camera paths than can be numbered."""
+        pixels = sum(math.prod(sensor.film().size()) for sensor in sensors)
+        if self.camera_paths * pixels > MOST_PATHS:
+            raise ValueError(f'{self.plugin}: parameter "camera_paths" = {self.camera_paths} makes more than {MOST_PATHS} paths an iteration on '
+                             f"films of {pixels} pixels; ask for more samples per pixel (spp), and so more iterations, instead")
 
     def planned_iterations(self, spp, camera_paths):
         """Iterations of `camera_paths` that make `spp` camera paths a pixel; None (no planned end) if `spp` is 0."""
@@ -93,13 +106,14 @@ class IterativeIntegrator(mi.AdjointIntegrator):
             session = self.session(scene, sensor, seed, spp or sensor.sampler().sample_count())
             for _ in range(session.iterations_planned):
                 session.iterate()
-            session.fill_film()
-            if not develop:
-                return mi.TensorXf()
-            image = session.sensor.film().develop()
-            if evaluate:
-                dr.eval(image)
-            return image
+            with TURN:
+                session.fill_film()
+                if not develop:
+                    return mi.TensorXf()
+                image = session.sensor.film().develop()
+                if evaluate:
+                    dr.eval(image)
+                return image
 
     def render_forward(self, scene, params, sensor=0, seed=0, spp=0):
         raise RuntimeError(f"{self.plugin}: gradients are not supported; use Mitsuba's prb")
@@ -120,23 +134,56 @@ class IterativeSession:
         self.iterations_planned = iterations
         self.samples_per_iteration = integrator.camera_paths
         self.accumulator = Accumulator(integrator.variance)
+        self.variant = mi.variant()
+
+    @property
+    def sums(self):
+        """What has been rendered so far (`mis_integrators.sums.Sums`)."""
+        return self.accumulator.sums
 
     @property
     def iterations(self):
         """Iterations done."""
         return self.accumulator.iterations
 
+    def keep_variance(self):
+        """From the first iteration on, keeps what `estimate` needs."""
+        self.accumulator.with_variance = True
+
+    def estimate(self):
+        """Mean colour so far and its estimated variance: float64, (height, width, 3) each. Needs two iterations at least, and `keep_variance`."""
+        return self.accumulator.estimate(self.sensor.film())
+
+    def start(self):
+        """Finds out what must be known before the first iteration, unless it is known: pilots, caches."""
+
+    @property
+    def learned(self):
+        """What `start` has found out and the seed alone would not tell again, in JSON's types: the radii that a pilot has chosen."""
+        return {}
+
+    def recall(self, learned):
+        """Takes over what another session of the same render has `learned`; before the first iteration."""
+
     @property
     def settings(self):
         """Names and values that reproduce the image, together with the scene."""
         return {"integrator": self.integrator.plugin, **self.integrator.settings(), "seed": self.seed}
 
-    def iterate(self):
-        """Runs one iteration to its end."""
+    @by_turns
+    def iterate(self, iteration=None):
+        """Runs one iteration to its end: that of the given number, or the first that is missing."""
+        if mi.variant() != self.variant:
+            raise RuntimeError(f"{self.integrator.plugin}: this render was begun under the variant {self.variant}, but the active one is now "
+                               f"{mi.variant()}")
         with dr.suspend_grad():
-            self.accumulator.add(self._iteration(self.iterations))
-            dr.eval(self.accumulator.total)
+            self._run(self.sums.done.first_missing if iteration is None else iteration)
+            dr.eval(self.sums.tensors)
             dr.sync_thread()
+
+    def _run(self, iteration):
+        """Adds an iteration to the sums."""
+        self.accumulator.add(self._iteration(iteration), iteration)
 
     def _seed(self, iteration, *purpose):
         return dr.opaque(mi.UInt32, mix(self.seed, iteration, *purpose))
@@ -156,8 +203,9 @@ class IterativeSession:
         film = self.sensor.film()
         film.clear()
         film.prepare(self.integrator.aov_names())
-        self.accumulator.put(film)
+        self.accumulator.put(film, self.integrator.variance)
 
+    @by_turns
     def image(self):
         """The image so far: float32, (height, width, channels)."""
         if self.integrator.variance and self.iterations < 2:
@@ -166,6 +214,7 @@ class IterativeSession:
         return np.array(self.sensor.film().develop(), dtype=np.float32)
 
     @property
+    @by_turns
     def channels(self):
         """Channel names of `image()`."""
         film = self.sensor.film()

@@ -140,7 +140,7 @@ class OptimalWeights:
             lit = mask & (dr.max(known.direct) > 0) & ~lookup(self.traits.lambertian, bsdf, mi.Bool, mask)
             towards_light = bsdf.eval(self.context, si, wo, lit) * dr.rcp(dr.maximum(dr.abs(wo.z), SMALLEST_LOBE_COSINE))
             value = dr.select(lit, towards_light, lobe_f)
-        ambient = AMBIENT_SHARE * self.cache.mean * lobe_f / (lobe_p * dr.pi)
+        ambient = AMBIENT_SHARE * self.cache.level * lobe_f / (lobe_p * dr.pi)
         indirect = (known.second + known.later) * dr.inv_pi * lobe_f / lobe_p
         direct, kernel = value * known.direct * scale + ambient, dr.mean(lobe_f)
         # The noise law takes direct light for exact. Its noise costs as that of photons does: n times the variance over the radiance.

@@ -325,9 +325,12 @@ class ResampledSession(IterativeSession):
             radiance = dr.select(alpha > 0, radiance, 0)       # as `path` does: what is behind nothing but null surfaces is hidden
         return splat_samples(self.sensor.film(), position, radiance, alpha, spectral["matrix"], active), block
 
-    def _iteration(self, iteration):
+    def start(self):
         if self.cache is None and self.lit:
             self._prepare()
+
+    def _iteration(self, iteration):
+        self.start()
         spectral = shared_wavelengths(self.sensor, mix(self.seed, iteration, WAVELENGTH))
         parts = [self._chunk(iteration, chunk, spectral) for chunk in range(self.chunks)]
         block, light = (None if blocks[0] is None else sum(blocks[1:], blocks[0]) for blocks in zip(*parts))

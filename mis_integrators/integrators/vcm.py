@@ -113,6 +113,16 @@ class VCMSession(BDPTSession):
         spectral["radius"] = dr.opaque(mi.Float, self.radius_at(iteration))
         return spectral
 
+    def start(self):
+        self._spectral(0)
+
+    @property
+    def learned(self):
+        return {} if self.radius is None else {"radius": self.radius}
+
+    def recall(self, learned):
+        self.radius = learned.get("radius", self.radius)
+
     def _choose_radius(self, spectral):
         """A share of the spread of the vertices that camera paths meet first: the diagonal, over the root of three, of the box that leaves out 2 % of
         them at either end of each axis."""

@@ -13,6 +13,7 @@ from ..transport.lights import Lights
 from ..transport.random import mix, streams
 from ..transport.recording import recorder
 from ..transport.traits import UnsupportedScene, check_variant
+from ..turns import by_turns
 from ..volume.films import OWN, SHARED, ViewAccumulator, own_values, splat, write_film
 from ..volume.lines import common_nulls, connect, follow_nulls, sight
 from ..volume.pivots import NOWHERE, ON_SURFACE, OWN as OWN_BRANCH, of_paths, pivot_surface, trace_first_segments
@@ -121,6 +122,7 @@ class VolpathMultiview(IterativeIntegrator):
         check_volume_scene(scene, self.plugin)
         for sensor in sensors:
             Views.check_sensor(sensor, self.plugin)
+        self.check_path_number(sensors)
         camera_paths = self.camera_paths or self._automatic(sensors, spp)
         iterations = self.planned_iterations(spp, camera_paths)
         return MultiViewSession(self, scene, sensors, scalar_seed(seed), iterations, camera_paths)
@@ -242,14 +244,14 @@ class MultiViewSession(IterativeSession):
         dr.make_opaque(spectral)
         return spectral
 
-    def iterate(self):
-        """Runs one iteration to its end."""
-        with dr.suspend_grad():
-            seed, spectral = self._seed(self.iterations, PATHS), self._spectral(self.iterations)
-            layers = [self._part(first, seed, spectral) for first in range(0, self.views.paths, self.paths)]
-            self.accumulator.add(*(sum(layer[1:], layer[0]) for layer in zip(*layers)))
-            dr.eval(self.accumulator.shared, self.accumulator.own)
-            dr.sync_thread()
+    def _run(self, iteration):
+        seed, spectral = self._seed(iteration, PATHS), self._spectral(iteration)
+        layers = [self._part(first, seed, spectral) for first in range(0, self.views.paths, self.paths)]
+        self.accumulator.add(*(sum(layer[1:], layer[0]) for layer in zip(*layers)), iteration)
+
+    def estimate(self):
+        """As of other sessions, with all pixels of all views in one row: (1, pixels, 3)."""
+        return self.accumulator.estimate()
 
     def _part(self, first, seed, spectral):
         """One part of an iteration: its layers."""
@@ -302,10 +304,11 @@ class MultiViewSession(IterativeSession):
         images = [np.array(tensor, dtype=np.float32) for tensor in self.view_tensors()]
         return [image if image.ndim == 3 else image[:, :, None] for image in images]
 
+    @by_turns
     def view_tensors(self):
         """The images so far, one tensor a view, as films develop them."""
         images, first = [], 0
-        pictures = self.accumulator.pictures()
+        pictures = self.accumulator.pictures(self.integrator.variance)
         for sensor, members in zip(self.views.groups, self.views.members):
             image = self._fill(sensor.film(), pictures[first:first + members]).develop()
             width = self.views.sizes[first][0]
@@ -323,7 +326,7 @@ class MultiViewSession(IterativeSession):
 
     def fill_film(self):
         """Hands what has been rendered so far to the sensor's film, side by side for a `batch`."""
-        self._fill(self.sensor.film(), self.accumulator.pictures()[:self.views.members[0]])
+        self._fill(self.sensor.film(), self.accumulator.pictures(self.integrator.variance)[:self.views.members[0]])
 
 
 def render_views(scene, integrator=None, spp=0, seed=0):

@@ -63,15 +63,15 @@ class WeightedSession(BDPMSession):
             return weights.merging(level, state, f, p, notebook.read(level, photon_map.notes, index, active))
         return weigh
 
-    def _start(self):
+    def start(self):
         if not self._weighted and self.kinds() and self.mixes():
             if not self.weighted_pilot:
-                super()._start()
+                super().start()
             self.prepare(super()._spectral(0))
             self._weighted, self.one_vertex = True, False
             self.vertex_capacity = self._vertex_room(self.chunk)
             self._freeze()
-        super()._start()
+        super().start()
 
     def _vertex_room(self, paths):
         return super()._vertex_room(paths) if not self._weighted else paths * (2 if self.traits.has_mixed else 1)

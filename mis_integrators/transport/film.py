@@ -6,6 +6,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..sums import Sums
+
 
 def colour_matrix(wavelengths):
     """Linear sRGB of unit radiance at each of `wavelengths`: the conversion is linear, so an iteration that shares its wavelengths
@@ -86,57 +88,62 @@ def with_colour(block, colour):
 
 
 class Accumulator:
-    """Sums of the iterations' blocks and, for the variance, of their squares. Its size does not grow with iterations."""
+    """Sums of the iterations' blocks and, for the variance, of their squares. Its size does not grow with iterations.
+
+    The sums are `total`; with the variance `square` (colour squared), `cross` (colour times weight), `weight_square`.
+    """
 
     def __init__(self, with_variance):
         self.with_variance = with_variance
-        self.iterations = 0
-        self.total = None
-        self.square = None          # colour squared
-        self.cross = None           # colour times weight
-        self.weight_square = None
+        self.sums = Sums(mi.TensorXd)
 
-    def add(self, block):
-        """Adds one iteration's block tensor."""
-        if self.iterations == 0:
-            self.total = dr.zeros(mi.TensorXf, block.shape)
-            if self.with_variance:
-                height, width, _ = block.shape
-                self.square = dr.zeros(mi.TensorXf, (height, width, 3))
-                self.cross = dr.zeros(mi.TensorXf, (height, width, 3))
-                self.weight_square = dr.zeros(mi.TensorXf, (height, width, 1))
-        self.total += block
+    @property
+    def iterations(self):
+        """Iterations summed."""
+        return len(self.sums.done)
+
+    def add(self, block, iteration):
+        """Adds the block tensor of an iteration."""
+        self.sums.add("total", block)
         if self.with_variance:
-            colour, weight = block[:, :, :3], block[:, :, -1:]
-            self.square += colour * colour
-            self.cross += colour * weight
-            self.weight_square += weight * weight
-        self.iterations += 1
-        dr.schedule(self.total, self.square, self.cross, self.weight_square)
+            colour, weight = (mi.TensorXd(channels) for channels in (block[:, :, :3], block[:, :, -1:]))
+            self.sums.add("square", colour * colour)
+            self.sums.add("cross", colour * weight)
+            self.sums.add("weight_square", weight * weight)
+        self.sums.done.add(iteration)
+        dr.schedule(self.sums.tensors)
+
+    def mean(self):
+        """Mean colour (height, width, 3), and the sums of weights (height, width, 1) by which it was divided."""
+        total = self.sums["total"]
+        weight = total[:, :, -1:]
+        weight = dr.select(weight == 0, 1, weight)
+        return total[:, :, :3] / weight, weight
 
     def variance_of_mean(self):
         """Estimated variance of each pixel's mean (height, width, 3) from the iterations, by the ratio estimator's
         delta method: sum (A_i - m W_i)^2 / (n (n - 1) mean(W)^2), A_i and W_i the weighted colour and weight of iteration i."""
-        n = self.iterations
-        weight = self.total[:, :, -1:]
-        safe = dr.select(weight == 0, 1, weight)
-        mean = self.total[:, :, :3] / safe
-        spread = self.square - 2 * mean * self.cross + mean * mean * self.weight_square
-        return dr.maximum(spread, 0) * (n / ((n - 1) * safe * safe))
+        n, sums = self.iterations, self.sums
+        mean, weight = self.mean()
+        spread = sums["square"] - 2 * mean * sums["cross"] + mean * mean * sums["weight_square"]
+        return dr.maximum(spread, 0) * (n / ((n - 1) * weight * weight))
 
-    def put(self, film, extra=None):
-        """Writes the accumulated image, with variance channels where kept, into a film prepared with matching AOVs. `extra`: a tensor of more
+    def estimate(self, film):
+        """Mean colour and its estimated variance, float64 (height, width, 3) each, without the block's border."""
+        border = film.rfilter().border_size()
+        inside = slice(border, -border) if border else slice(None)
+        return tuple(np.array(tensor)[inside, inside] for tensor in (self.mean()[0], self.variance_of_mean()))
+
+    def put(self, film, variance, extra=None):
+        """Writes the accumulated image into a film prepared with matching AOVs: with channels of the `variance` or not. `extra`: a tensor of more
         channels, summed with the same weights."""
-        tensor = self.total
-        if self.with_variance:
-            weight = tensor[:, :, -1:]
-            variance = self.variance_of_mean() * weight
-            if mi.is_monochromatic:
-                variance = variance[:, :, :1]
-            tensor = dr.concat([tensor, variance], axis=2)
+        tensor = self.sums["total"]
+        if variance:
+            channels = self.variance_of_mean() * tensor[:, :, -1:]
+            tensor = dr.concat([tensor, channels[:, :, :1] if mi.is_monochromatic else channels], axis=2)
         if extra is not None:
             tensor = dr.concat([tensor, extra], axis=2)
-        film.put_block(mi.ImageBlock(tensor, film.crop_offset(), film.rfilter(), border=True))
+        film.put_block(mi.ImageBlock(mi.TensorXf(tensor), film.crop_offset(), film.rfilter(), border=True))
 
 
 def variance_channels():

@@ -51,7 +51,8 @@ class IrradianceCache:
     """Irradiance by cell.
 
     Attributes: `cell` (edge of the cells, width one), `photon_flux` (flux of a typical photon that is merged, for one light sub-path, a list of one
-    number a channel; `caustic_flux` that of caustic ones, `typical_flux` its mean over channels), `mean` (irradiance of a typical lit point),
+    number a channel; `caustic_flux` that of caustic ones, `typical_flux` its mean over channels), `mean` (irradiance of a typical lit point;
+    `level` is the same as an array of width one: numbers would be literals of kernels, compiled anew for each scene and seed),
     `center` and `facing` (mean position and normal of the photons of each cell, from cell number 1 on).
     """
 
@@ -77,7 +78,7 @@ class IrradianceCache:
         place = self._choose_cells(position, normal, stored, int(count[0]), bounds)
         self._sum_cells(position, normal, place, stored)
         self.table = dr.zeros(mi.Float, self.words * (dr.width(self.center) + 1))
-        self.mean = 0.0
+        self.mean, self.level = 0.0, dr.opaque(mi.Float, 0)
         if dr.width(self.center):
             reach = dr.maximum(GATHER_RADIUS * self.cell, smallest_cell(bounds, capacity))
             self._gather(scene, lights, build_photon_map(surface, power, count, bounds, reach, capacity, "all"), light_paths)
@@ -95,7 +96,7 @@ class IrradianceCache:
         for trial in range(3):
             cell = min(max(cell, smallest), LARGEST_SHARE * diagonal)
             self.cell = dr.opaque(mi.Float, cell)
-            self.columns, self.lines = (int((bounds.max[i] - bounds.min[i]) / cell) + 3 | 1 for i in (0, 1))
+            self.columns, self.lines = (dr.opaque(mi.UInt32, int((bounds.max[i] - bounds.min[i]) / cell) + 3 | 1) for i in (0, 1))
             place = self._place(position, normal)
             counts = dr.zeros(mi.UInt32, 1 << INDEX_BITS)
             dr.scatter_inc(counts, place, stored)
@@ -155,6 +156,7 @@ class IrradianceCache:
         dr.scatter(self.table, mi.Float([float(dr.mean(value)[0]) for value in irradiance]), dr.arange(mi.UInt32, 3 * channels))
         dr.eval(self.table)
         self.mean = float(dr.mean(sum(irradiance) / channels)[0])
+        self.level = dr.opaque(mi.Float, self.mean)
 
     def _strongest_light(self, scene, lights, direct):
         """The emitter that brings most direct light to each cell's center, and the share of its unoccluded light that the cell has."""
@@ -186,7 +188,7 @@ class IrradianceCache:
 
     def tables(self):
         """Every evaluated array that `lookup` reads, for `dr.freeze` to track."""
-        return [self.index, self.table, self.cell]
+        return [self.index, self.table, self.cell, self.columns, self.lines, self.level]
 
     def _place(self, p, n):
         """Entry of the index for point `p` on a surface with unit normal `n`: cells along x, y, z times six directions."""

@@ -12,6 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..sums import Sums
 from ..transport.film import colour_channels
 
 SHARED = 4
@@ -67,27 +68,30 @@ class ViewAccumulator:
     def __init__(self, views, with_variance, ratio):
         self.views, self.with_variance, self.ratio = views, with_variance, ratio
         self.expected = expected_weights(views) * views.camera_paths
-        self.iterations = 0
-        self.shared = self.own = self.square = self.cross = self.weight_square = None
+        self.sums = Sums(mi.TensorXd)
 
-    def add(self, shared, own):
-        """Adds one iteration's layers, tensors (height, width, `SHARED`) and (height, width, `OWN`)."""
-        if self.iterations == 0:
-            height, width, _ = own.shape
-            self.own = dr.zeros(mi.TensorXf, own.shape)
-            self.shared = [dr.zeros(mi.TensorXf, shared.shape) for _ in range(2)]
-            if self.with_variance:
-                self.square, self.cross = (dr.zeros(mi.TensorXf, (height, width, 3)) for _ in range(2))
-                self.weight_square = dr.zeros(mi.TensorXf, (height, width, 1))
-        self.own += own
-        self.shared[self.iterations % 2] += shared
+    @property
+    def iterations(self):
+        """Iterations summed."""
+        return len(self.sums.done)
+
+    @property
+    def shared(self):
+        """Sums of what all paths bring, of the even and of the odd iterations."""
+        return [self.sums["shared0"], self.sums["shared1"]]
+
+    def add(self, shared, own, iteration):
+        """Adds the layers of an iteration, tensors (height, width, `SHARED`) and (height, width, `OWN`)."""
+        self.sums.add("own", own)
+        for parity in range(2):
+            self.sums.add(f"shared{parity}", shared if iteration % 2 == parity else dr.zeros(mi.TensorXd, shared.shape))
         if self.with_variance:
-            colour, weight = shared[:, :, :3], shared[:, :, 3:]
-            self.square += colour * colour
-            self.cross += colour * weight
-            self.weight_square += weight * weight
-        self.iterations += 1
-        dr.schedule(self.own, self.shared, self.square, self.cross, self.weight_square)
+            colour, weight = (mi.TensorXd(channels) for channels in (shared[:, :, :3], shared[:, :, 3:]))
+            self.sums.add("square", colour * colour)
+            self.sums.add("cross", colour * weight)
+            self.sums.add("weight_square", weight * weight)
+        self.sums.done.add(iteration)
+        dr.schedule(self.sums.tensors)
 
     def _mean(self, shared):
         """Y/D, zero where nothing arrived."""
@@ -100,35 +104,44 @@ class ViewAccumulator:
         if self.ratio:
             return self._mean(even + odd)
         total = even[:, :, :3] + odd[:, :, :3]
-        for mine, other, count in ((even, odd, (n + 1) // 2), (odd, even, n // 2)):
+        evens = self.sums.done.even()
+        for mine, other, count in ((even, odd, evens), (odd, even, n - evens)):
             total += self._mean(other) * (self.expected * count - mine[:, :, 3:])
         return total / (self.expected * n)
 
     def picture(self):
         """The common image so far (height, width, 5): colour, alpha, 1."""
-        weight = self.own[:, :, 4:]
+        own = self.sums["own"]
+        weight = own[:, :, 4:]
         weight = dr.select(weight > 0, weight, 1)
-        return dr.concat([self._colour() + self.own[:, :, :3] / weight, self.own[:, :, 3:4] / weight,
-                          dr.ones(mi.TensorXf, self.own.shape[:2] + (1,))], axis=2)
+        return dr.concat([self._colour() + own[:, :, :3] / weight, own[:, :, 3:4] / weight, dr.ones(mi.TensorXd, own.shape[:2] + (1,))], axis=2)
 
     def variance(self):
         """Estimated variance of each pixel's mean (height, width, 3) from the iterations: that of Y - m D over W, or over the mean of D (delta
         method). The noise of emitters seen directly, if any, is not in it."""
-        n, total = self.iterations, self.shared[0] + self.shared[1]
+        n, total, sums = self.iterations, self.sums["shared0"] + self.sums["shared1"], self.sums
         mean = self._mean(total)
         rest = total[:, :, :3] - mean * total[:, :, 3:]
-        spread = self.square - 2 * mean * self.cross + mean * mean * self.weight_square - rest * rest / n
+        spread = sums["square"] - 2 * mean * sums["cross"] + mean * mean * sums["weight_square"] - rest * rest / n
         divisor = total[:, :, 3:] / n if self.ratio else self.expected
         return dr.maximum(spread, 0) / (n * (n - 1) * dr.square(dr.select(divisor > 0, divisor, 1)))
 
-    def pictures(self):
-        """Each view's picture (height, width, channels): colour, alpha, weight one, then variances where kept."""
+    def pictures(self, variance):
+        """Each view's picture (height, width, channels): colour, alpha, weight one, then those of the `variance` if asked for."""
         image = self.picture()
-        if self.with_variance:
-            variance = self.variance()
-            image = dr.concat([image, variance[:, :, :1] if mi.is_monochromatic else variance], axis=2)
+        if variance:
+            channels = self.variance()
+            image = dr.concat([image, channels[:, :, :1] if mi.is_monochromatic else channels], axis=2)
+        return [mi.TensorXf(window) for window in self._windows(image)]
+
+    def _windows(self, image):
         left = self.views.margin
         return [image[top:top + height, left:left + width, :] for (width, height), top in zip(self.views.sizes, self.views.tops)]
+
+    def estimate(self):
+        """Mean colour and its estimated variance, the pixels of all views in one row: float64 (1, pixels, 3) each."""
+        return tuple(np.concatenate([window.reshape(1, -1, 3) for window in self._windows(np.array(image))], axis=1)
+                     for image in (self.picture()[:, :, :3], self.variance()))
 
 
 def write_film(film, picture):

@@ -16,11 +16,13 @@ target exchanged.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Callable, Iterator
 
 import drjit as dr
 import numpy as np
 
+Array = Any
+"""A NumPy or Dr.Jit array of floats or booleans, or a number."""
 LOWEST = -1e30
 """Stands for the logarithm of zero."""
 
@@ -36,7 +38,7 @@ class Sections:
     tmax: list = field(default_factory=list)
     majorant: list = field(default_factory=list)
 
-    def __iter__(self):
+    def __iter__(self) -> Iterator[tuple[Array, Array, Array]]:
         return iter(zip(self.tmin, self.tmax, self.majorant))
 
 
@@ -55,36 +57,36 @@ class Shifted:
 # --- Elementary functions on either kind of array -----------------------------------------------------
 
 
-def _is_numpy(x):
+def _is_numpy(x: Array) -> bool:
     return isinstance(x, (int, float, bool, np.ndarray, np.generic))
 
 
-def _where(condition, a, b):
+def _where(condition: Array, a: Array, b: Array) -> Array:
     return np.where(condition, a, b) if _is_numpy(condition) else dr.select(condition, a, b)
 
 
-def _least(a, b):
+def _least(a: Array, b: Array) -> Array:
     return np.minimum(a, b) if _is_numpy(a) and _is_numpy(b) else dr.minimum(a, b)
 
 
-def _most(a, b):
+def _most(a: Array, b: Array) -> Array:
     return np.maximum(a, b) if _is_numpy(a) and _is_numpy(b) else dr.maximum(a, b)
 
 
-def _exp(x):
+def _exp(x: Array) -> Array:
     """exp(x), of which exp(80) is the largest value: single precision ends soon after."""
     x = _most(_least(x, 80.0), -600.0)
     return np.exp(x) if _is_numpy(x) else dr.exp(x)
 
 
-def _log(x):
+def _log(x: Array) -> Array:
     """ln x, `LOWEST` for x <= 0."""
     positive = x > 0
     x = _where(positive, x, 1.0)
     return _where(positive, np.log(x) if _is_numpy(x) else dr.log(x), LOWEST)
 
 
-def one_minus_exp(x):
+def one_minus_exp(x: Array) -> Array:
     """1 - exp(-x) for x >= 0, without cancellation for small x."""
     if _is_numpy(x):
         return -np.expm1(-x)
@@ -94,7 +96,7 @@ def one_minus_exp(x):
     return dr.select(x < 0.5, x * series, 1 - dr.exp(-x))
 
 
-def minus_log_one_minus(u):
+def minus_log_one_minus(u: Array) -> Array:
     """-ln(1 - u) for 0 <= u <= 1/2, without cancellation for small u."""
     if _is_numpy(u):
         return -np.log1p(-u)
@@ -106,7 +108,7 @@ def minus_log_one_minus(u):
     return 2 * z * series
 
 
-def _log_sum(a, b):
+def _log_sum(a: Array, b: Array) -> Array:
     """ln(exp(a) + exp(b))."""
     larger, gap = _most(a, b), _most(_least(a, b) - _most(a, b), -100.0)
     return larger + (np.log1p(np.exp(gap)) if _is_numpy(gap) else dr.log(1 + dr.exp(gap)))
@@ -115,32 +117,32 @@ def _log_sum(a, b):
 # --- A segment's scales --------------------------------------------------------------------------------
 
 
-def _inside(t, tmin, tmax):
+def _inside(t: Array, tmin: Array, tmax: Array) -> Array:
     """Length of [tmin, tmax] that lies before t."""
     return _most(_least(t, tmax) - tmin, 0.0)
 
 
-def length(sections, t):
+def length(sections: Sections, t: Array) -> Array:
     """Length in media before t: l(t)."""
     return sum((_where(mu > 0, _inside(t, tmin, tmax), 0.0) for tmin, tmax, mu in sections), 0 * t)
 
 
-def optical_depth(sections, t):
+def optical_depth(sections: Sections, t: Array) -> Array:
     """Majorant optical depth before t: tau(t) = sum of mu_k max(0, min(t, tmax_k) - tmin_k)."""
     return sum((mu * _inside(t, tmin, tmax) for tmin, tmax, mu in sections), 0 * t)
 
 
-def total_length(sections):
+def total_length(sections: Sections) -> Array:
     """l_max."""
     return sum(_where(mu > 0, _most(tmax - tmin, 0.0), 0.0) for tmin, tmax, mu in sections)
 
 
-def total_optical_depth(sections):
+def total_optical_depth(sections: Sections) -> Array:
     """tau_max."""
     return sum(mu * _most(tmax - tmin, 0.0) for tmin, tmax, mu in sections)
 
 
-def majorant_at(sections, t):
+def majorant_at(sections: Sections, t: Array) -> Array:
     """Majorant at t, zero outside the sections."""
     value = 0 * t
     for tmin, tmax, mu in sections:
@@ -148,7 +150,7 @@ def majorant_at(sections, t):
     return value
 
 
-def _invert(sections, x, density):
+def _invert(sections: Sections, x: Array, density: Callable[[Array], Array]) -> tuple[Array, Array]:
     """t and majorant where the cumulated `density` of the sections reaches x > 0; x beyond the total gives the last section's end."""
     t, majorant, before = 0 * x, 0 * x, 0 * x
     for tmin, tmax, mu in sections:
@@ -160,31 +162,31 @@ def _invert(sections, x, density):
     return t, majorant
 
 
-def at_length(sections, l):
+def at_length(sections: Sections, l: Array) -> tuple[Array, Array]:
     """Where the length in media reaches l: t and the majorant there."""
     return _invert(sections, l, lambda mu: 1.0 + 0 * mu)
 
 
-def at_optical_depth(sections, tau):
+def at_optical_depth(sections: Sections, tau: Array) -> tuple[Array, Array]:
     """Where the majorant optical depth reaches tau: t and the majorant there."""
     return _invert(sections, tau, lambda mu: mu)
 
 
-def _result(base, t, target_t, target_majorant, tau, log_rate, valid):
+def _result(base: Sections, t: Array, target_t: Array, target_majorant: Array, tau: Array, log_rate: Array, valid: Array) -> Array:
     majorant = majorant_at(base, t)
     valid = valid & (majorant > 0) & (target_majorant > 0)
     jacobian = _exp(log_rate) * _where(valid, majorant / _where(target_majorant > 0, target_majorant, 1.0), 0.0)
     return Shifted(target_t, tau, log_rate, jacobian, valid)
 
 
-def _ratio(a, b):
+def _ratio(a: Array, b: Array) -> Array:
     return a / _where(b > 0, b, 1.0)
 
 
 # --- Stretches: both ends stay where they are ------------------------------------------------------------
 
 
-def raw_depth(base, target, t):
+def raw_depth(base: Sections, target: Sections, t: Array) -> Shifted:
     """l'(t') = C l(t), C = l'max / lmax; dt'/dt = C. Keeps the base segment's distribution."""
     C = _ratio(total_length(target), total_length(base))
     at, majorant = at_length(target, C * length(base, t))
@@ -192,7 +194,7 @@ def raw_depth(base, target, t):
                    (total_length(base) > 0) & (total_length(target) > 0))
 
 
-def majorant_optical_depth(base, target, t):
+def majorant_optical_depth(base: Sections, target: Sections, t: Array) -> Shifted:
     """tau'(t') = C tau(t), C = tau'max / taumax; dt'/dt = C mu_k / mu'_k'. Piecewise constant derivative: the default."""
     C = _ratio(total_optical_depth(target), total_optical_depth(base))
     tau = C * optical_depth(base, t)
@@ -201,7 +203,7 @@ def majorant_optical_depth(base, target, t):
                    (total_optical_depth(base) > 0) & (total_optical_depth(target) > 0))
 
 
-def primary_sample(base, target, t):
+def primary_sample(base: Sections, target: Sections, t: Array) -> Shifted:
     """u'(t') = C u(t), C = u'max / umax; dt'/dt = (mu_k / mu'_k') C exp(-tau) / exp(-tau'). Follows the target's majorant density.
 
     With exp(-tau') = [exp(-tau)(1 - exp(tau - taumax)) + exp(-tau'max)(1 - exp(-tau))] / (1 - exp(-taumax)), whose terms are positive and are
@@ -221,20 +223,20 @@ def primary_sample(base, target, t):
 # --- Copies: earlier work, for comparison -----------------------------------------------------------------
 
 
-def raw_depth_copy(base, target, t):
+def raw_depth_copy(base: Sections, target: Sections, t: Array) -> Shifted:
     """t' = t; dt'/dt = 1. Lost where the target has no medium at t."""
     majorant = majorant_at(target, t)
     return _result(base, t, t, majorant, optical_depth(target, t), _log(_ratio(majorant, majorant_at(base, t))), majorant > 0)
 
 
-def majorant_optical_depth_copy(base, target, t):
+def majorant_optical_depth_copy(base: Sections, target: Sections, t: Array) -> Shifted:
     """tau' = tau; dt'/dt = mu_k / mu'_k'. Lost where the target is thinner than tau."""
     tau = optical_depth(base, t)
     at, majorant = at_optical_depth(target, tau)
     return _result(base, t, at, majorant, tau, 0 * tau, tau <= total_optical_depth(target))
 
 
-def primary_sample_copy(base, target, t):
+def primary_sample_copy(base: Sections, target: Sections, t: Array) -> Shifted:
     """u' = u, and so tau' = tau, for u is a function of tau that all segments share."""
     return majorant_optical_depth_copy(base, target, t)
 

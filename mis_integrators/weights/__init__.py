@@ -3,3 +3,8 @@
 Nothing here knows a renderer. `recursion` holds the optimal weights of any number of merging strategies, `mis2` and `mis3` the
 published closed forms for two and three of them, `heuristics` Veach's balance and power heuristic.
 """
+
+from typing import Any
+
+Array = Any
+"""A NumPy or Dr.Jit array of any shape that broadcasts, or a number."""

@@ -28,6 +28,7 @@ All arrays broadcast; NumPy and Dr.Jit alike.
 
 from __future__ import annotations
 
+from . import Array
 from .heuristics import bounded_power
 from .recursion import at_least, at_most
 
@@ -37,7 +38,7 @@ LARGEST = 1e15
 """Bound on what a sub-path carries along."""
 
 
-def norm(a, b, beta):
+def norm(a: Array, b: Array, beta: float) -> Array:
     """(a^beta + b^beta)^(1/beta) of non-negative numbers."""
     if beta == 1:
         return a + b
@@ -48,31 +49,31 @@ def norm(a, b, beta):
     return larger * (a ** beta + b ** beta) ** (1 / beta)
 
 
-def reciprocal(density):
+def reciprocal(density: Array) -> Array:
     """1 / density, bounded where the density vanishes."""
     return at_most(1 / at_least(density, SMALLEST), LARGEST)
 
 
-def nearer(near, far, p_back, beta, eta=0.0):
+def nearer(near: Array, far: Array, p_back: Array, beta: float, eta: Array = 0.0) -> Array:
     """A_i = near_i + P' far_i + eta (the brackets of equations 40 and 41): all techniques nearer to the sub-path's start than the one that
     joins x_i with the other side, over p<(x_i). `p_back`: P', the other side's density at x_i for the direction to x_{i-1}."""
     inner = norm(near, at_most(p_back * far, LARGEST), beta)
     return inner if isinstance(eta, float) and eta == 0 else norm(inner, eta, beta)
 
 
-def near_of(p_forward, geometry):
+def near_of(p_forward: Array, geometry: Array) -> Array:
     """near_i = 1 / (P(x_{i-1}) G) (equation 34): x_i was sampled from x_{i-1} with density `p_forward`, over a segment with G = `geometry`. To be
     replaced by zero where x_{i-1} scattered by a delta function."""
     return reciprocal(p_forward * geometry)
 
 
-def far_of(a, p_forward):
+def far_of(a: Array, p_forward: Array) -> Array:
     """far_{i+1} = A_i / P(x_i) (equation 35), where `a` is A_i and x_i scattered with density `p_forward`; beyond a delta surface far stays
     what it was (equation 35 with both densities cancelled)."""
     return at_most(a * reciprocal(p_forward), LARGEST)
 
 
-def light_start(emission, direct):
+def light_start(emission: Array, direct: Array) -> tuple[Array, Array]:
     """(near_1, far_1) of the vertex that a light sub-path meets first (equations 31 and 32).
 
     `emission` [1/m^2]: area density at the vertex with which light sub-paths start, over that of next-event estimation for the light's
@@ -82,7 +83,7 @@ def light_start(emission, direct):
     return near, at_most(near * reciprocal(direct), LARGEST)
 
 
-def camera_start(density, ratio):
+def camera_start(density: Array, ratio: Array) -> Array:
     """near_1 of the vertex that a camera sub-path meets first (equation 31); far_1 is zero, for no technique hits the lens.
 
     `density` [1/m^2]: area density there of camera rays through the whole film; `ratio`: light sub-paths over camera paths, both of all the film.
@@ -90,14 +91,14 @@ def camera_start(density, ratio):
     return at_most(ratio * reciprocal(density), LARGEST)
 
 
-def connection(p_to_light_end, a_light, p_to_camera_end, a_camera, beta):
+def connection(p_to_light_end: Array, a_light: Array, p_to_camera_end: Array, a_camera: Array, beta: float) -> Array:
     """Weight of joining two sub-paths' ends (equations 37, 40 and 41), from both ends' A and the area densities with which
     each is made from the other end. For next-event estimation (44, 45) `p_to_light_end` is that of BSDF sampling over its own, `a_light` one;
     for joining to the sensor (46, 47) a_camera is zero and `p_to_light_end` the area density of camera paths there over `ratio` of `camera_start`."""
     return 1 / (1 + bounded_power(p_to_light_end * a_light, beta) + bounded_power(p_to_camera_end * a_camera, beta))
 
 
-def met(direct_over_sampled, emission_density, far, beta):
+def met(direct_over_sampled: Array, emission_density: Array, far: Array, beta: float) -> Array:
     """Weight of emission that a camera path meets (equations 42 and 43), technique s = 0.
 
     `direct_over_sampled`: density of next-event estimation for this point over the density with which the path was sampled there, zero where
@@ -106,6 +107,6 @@ def met(direct_over_sampled, emission_density, far, beta):
     return 1 / (1 + bounded_power(norm(at_most(direct_over_sampled, LARGEST), at_most(emission_density * far, LARGEST), beta), beta))
 
 
-def merging(a_light, a_camera, eta, beta):
+def merging(a_light: Array, a_camera: Array, eta: Array, beta: float) -> Array:
     """Weight of merging two sub-paths that end in one disk (equations 38 and 39): their A without `eta`, over it."""
     return 1 / (1 + bounded_power(a_light / eta, beta) + bounded_power(a_camera / eta, beta))

@@ -11,6 +11,9 @@ neither can make, is the caller's to avoid). Any array shape that broadcasts, Nu
 
 from __future__ import annotations
 
+from typing import Sequence
+
+from . import Array
 from .recursion import at_least, at_most
 
 LIMIT = 1e12
@@ -20,12 +23,12 @@ weights' sum stays one. In single precision the sums overflow after three such r
 should be (up to seven strategies: more could come back from there)."""
 
 
-def bounded_power(ratio, beta=2):
+def bounded_power(ratio: Array, beta: float = 2) -> Array:
     """ratio^beta, within 1/LIMIT ... LIMIT."""
     return at_most(at_least(ratio, LIMIT ** (-1 / beta)), LIMIT ** (1 / beta)) ** beta
 
 
-def add_ratio(total, ratio, beta=2):
+def add_ratio(total: Array, ratio: Array, beta: float = 2) -> Array:
     """S' = ratio^beta (1 + S): one step of a running sum along a path.
 
     S: sum of (density of strategy j / density of this one)^beta over the strategies j on one side of this one (zero for the outermost);
@@ -35,12 +38,12 @@ def add_ratio(total, ratio, beta=2):
     return bounded_power(ratio, beta) * (1 + total)
 
 
-def weight(before, after):
+def weight(before: Array, after: Array) -> Array:
     """w = 1 / (1 + S_before + S_after) (Veach 9.8, 9.13): the strategy with the sums of `add_ratio` on its two sides."""
     return 1 / (1 + before + after)
 
 
-def heuristic_weights(ratios, beta=2):
+def heuristic_weights(ratios: Sequence[Array], beta: float = 2) -> list[Array]:
     """Weights of len(ratios) + 1 strategies, a list; their sum is one. beta = 1: balance (Veach 9.8), 2: power heuristic (9.13)."""
     powers = [bounded_power(ratio, beta) for ratio in ratios]
     before, after = [0.0], [0.0]

@@ -16,38 +16,43 @@ Integrals over the directions, projected solid angle, are arguments: `weights` t
 
 from __future__ import annotations
 
+from typing import Callable
 
-def shared_density(p, camera_paths=1, M=0):
+from . import Array
+
+
+def shared_density(p: Array, camera_paths: int = 1, M: int = 0) -> Array:
     """g = p_M, or N_B p_0 for M = 0, whose vertex all N_B camera paths share [1/sr] (MIS-2)."""
     return p if M > 0 else camera_paths * p
 
 
-def denominator(g, n, b, L):
+def denominator(g: Array, n: Array, b: Array, L: Array) -> Array:
     """alpha = g/n + b/(n L) + L (MIS-2)."""
     return g / n + b / (n * L) + L
 
 
-def local_weight(g, n, alpha):
+def local_weight(g: Array, n: Array, alpha: Array) -> Array:
     """W1 = g / (n alpha): w1 without the integrals (MIS-2)."""
     return g / (n * alpha)
 
 
-def light_integrand(W1, f, L):
+def light_integrand(W1: Array, f: Array, L: Array) -> Array:
     """Integrand of A2 = integral of W1 f L dmu (MIS-2)."""
     return W1 * f * L
 
 
-def loss_integrand(p, L, alpha):
+def loss_integrand(p: Array, L: Array, alpha: Array) -> Array:
     """Integrand of n B2 = integral of p L / alpha dmu, below one (MIS-2)."""
     return p * (L / alpha)
 
 
-def deeper_weight(W1, p, f, alpha, A2, nB2):
+def deeper_weight(W1: Array, p: Array, f: Array, alpha: Array, A2: Array, nB2: Array) -> Array:
     """w1 = W1 + (p/f) A2 / (alpha (1 - n B2)) (MIS-2); w0 = 1 - w1."""
     return W1 + p / f * A2 / (alpha * (1 - nB2))
 
 
-def weights(f, p, L, b, n, integrate, camera_paths=1, M=0):
+def weights(f: Array, p: Array, L: Array, b: Array, n: Array, integrate: Callable[[Array], Array], camera_paths: int = 1,
+            M: int = 0) -> tuple[Array, Array]:
     """(w0, w1); `integrate`: the sum of an array with the directions' quadrature weights dmu."""
     g = shared_density(p, camera_paths, M)
     alpha = denominator(g, n, b, L)

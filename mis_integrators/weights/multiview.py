@@ -10,17 +10,19 @@ sample of view j.
 
 from __future__ import annotations
 
+from . import Array
+
 HEURISTICS = ("mis", "power", "mwis", "none")
 
 
-def summand(heuristic, ratio):
+def summand(heuristic: str, ratio: Array) -> Array:
     """What each view that can make the path adds to the sum that `gain` needs."""
     if heuristic == "power":
         return ratio * ratio
     return 1.0 + 0 * ratio if heuristic == "none" else ratio
 
 
-def gain(heuristic, ratio, total):
+def gain(heuristic: str, ratio: Array, total: Array) -> Array:
     """w_{i->j} p_j(x_j) |dx_j/dx_i| / p_i(x_i): the weight of the path in view j times what turns f/p_{i->j} into f/p_j.
 
     `total` is the sum of the `summand` over all views that can make the path, the path's own included.

@@ -23,6 +23,8 @@ from __future__ import annotations
 import drjit as dr
 import numpy as np
 
+from . import Array
+
 SMALLEST = 1e-30
 """Stands for zero in a divisor: a direction that the camera path cannot take has r = 0."""
 
@@ -30,46 +32,46 @@ LARGEST = 1e18
 """Stands for infinity in responses and drives: products of two are still single precision numbers."""
 
 
-def at_least(x, low):
+def at_least(x: Array, low: Array) -> Array:
     """max(x, low) for numbers, NumPy and Dr.Jit arrays."""
     return np.maximum(x, low) if isinstance(x, (int, float, np.ndarray, np.generic)) else dr.maximum(x, low)
 
 
-def at_most(x, high):
+def at_most(x: Array, high: Array) -> Array:
     """min(x, high) for numbers, NumPy and Dr.Jit arrays."""
     return np.minimum(x, high) if isinstance(x, (int, float, np.ndarray, np.generic)) else dr.minimum(x, high)
 
 
 # ---------------------------------------------------------------- down: ratios
 
-def first_ratio(p0, camera_paths=1):
+def first_ratio(p0: Array, camera_paths: int = 1) -> Array:
     """r_1 = N_B p_0."""
     return camera_paths * p0
 
 
-def kernel_share(r, f):
+def kernel_share(r: Array, f: Array) -> Array:
     """theta_i = r_i / (r_i + f_i), in [0, 1]: how much of the remaining weight strategies before z_i could take cheaply."""
     return r / at_least(r + f, SMALLEST)
 
 
-def kernel_rest(r, f):
+def kernel_rest(r: Array, f: Array) -> Array:
     """1 - theta_i = f_i / (r_i + f_i), without cancellation where the BSDF nearly vanishes (f_i << r_i)."""
     return f / at_least(r + f, SMALLEST)
 
 
-def next_ratio(theta, p):
+def next_ratio(theta: Array, p: Array) -> Array:
     """r_{i+1} = theta_i p_i."""
     return theta * p
 
 
 # ---------------------------------------------------------------- up: responses
 
-def deepest_response(n, luminance, c, r):
+def deepest_response(n: Array, luminance: Array, c: Array, r: Array) -> Array:
     """gamma_{K-1} = n L / (r_{K-1} + b/L): expected photons over what merging at the deepest vertex costs."""
     return n * luminance / at_least(r + c, SMALLEST)
 
 
-def inner_response(n, direct, r, photon_sum, second_moment, first_moment, tau):
+def inner_response(n: Array, direct: Array, r: Array, photon_sum: Array, second_moment: Array, first_moment: Array, tau: Array) -> Array:
     """gamma_i for 0 < i < K - 1.
 
     gamma_i = n [L0_i / r_i + photon_sum] + second_moment + tau_i first_moment with
@@ -80,41 +82,41 @@ def inner_response(n, direct, r, photon_sum, second_moment, first_moment, tau):
     return n * direct / at_least(r, SMALLEST) + n * photon_sum + second_moment + tau * first_moment
 
 
-def remainder(gamma):
+def remainder(gamma: Array) -> Array:
     """e_i = 1 - eta_i = 1 / (1 + gamma_i), in (0, 1]."""
     return 1 / (1 + at_most(gamma, LARGEST))
 
 
-def response(gamma):
+def response(gamma: Array) -> Array:
     """eta_i = gamma_i / (1 + gamma_i), in [0, 1], without cancellation where gamma_i is small."""
     gamma = at_most(gamma, LARGEST)
     return gamma / (1 + gamma)
 
 
-def carry(first_moment, mean_remainder):
+def carry(first_moment: Array, mean_remainder: Array) -> Array:
     """tau_i = <(1 - theta_i) eta_{i+1}> / <e_{i+1}>."""
     return first_moment / at_least(mean_remainder, SMALLEST)
 
 
-def root_offset(mean_f_eta, mean_remainder):
+def root_offset(mean_f_eta: Array, mean_remainder: Array) -> Array:
     """n F / N_B = <f_0 eta_1> / <e_1>, the drift of the whole pixel [1/sr]."""
     return mean_f_eta / at_least(mean_remainder, SMALLEST)
 
 
 # ---------------------------------------------------------------- down: drives
 
-def first_drive(offset, f0):
+def first_drive(offset: Array, f0: Array) -> Array:
     """drive_1 = d_1 / H_1 = 1 + (n F / N_B) / f_0, where f_0 > 0; grows without bound as f_0 falls: what is finite is its product with f_0."""
     return 1 + offset / at_least(f0, SMALLEST)
 
 
-def next_drive(drive, e, tau, rest):
+def next_drive(drive: Array, e: Array, tau: Array, rest: Array) -> Array:
     """drive_{i+1} = (1 + tau_i / (1 - theta_i)) e_i drive_i, rest = 1 - theta_i = `kernel_rest`; unbounded as f_i falls, like the first."""
     u = e * drive
     return u + tau * u / at_least(rest, SMALLEST)
 
 
-def bounded_drive(drive, r):
+def bounded_drive(drive: Array, r: Array) -> Array:
     """drive_i, at most `LARGEST`, and 0 where r_i = 0: strategies at z_i and beyond that cannot make a path must not share in it.
 
     A function of the path alone, common to all deeper weights: they still sum to one."""
@@ -123,16 +125,16 @@ def bounded_drive(drive, r):
 
 # ---------------------------------------------------------------- up: weights
 
-def direct_weight(drive, e):
+def direct_weight(drive: Array, e: Array) -> Array:
     """w_{l, l-1} = e_{l-1} drive_{l-1}: direct light at z_{l-1}, l < K. (At z0, the only strategy: one.)"""
     return e * drive
 
 
-def deepest_weight(drive, e, r, c):
+def deepest_weight(drive: Array, e: Array, r: Array, c: Array) -> Array:
     """w_{K, K-1} = e_{K-1} drive_{K-1} r_{K-1} / (r_{K-1} + b/L)."""
     return e * drive * (r / at_least(r + c, SMALLEST))
 
 
-def inner_weight(drive, e, theta, deeper):
+def inner_weight(drive: Array, e: Array, theta: Array, deeper: Array) -> Array:
     """w_{l, i} = theta_i (e_i drive_i - s) for 0 < i < l - 1, s (`deeper`) the sum of the weights w_{l, k}, k > i. For i = 0: 1 - s."""
     return theta * (e * drive - deeper)

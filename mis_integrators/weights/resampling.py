@@ -19,22 +19,25 @@ Densities of whole paths overflow; what the renderer needs are the ratio q/p = r
 
 from __future__ import annotations
 
+from typing import Callable, Sequence
+
+from . import Array
 from .recursion import LARGEST, SMALLEST, at_least, at_most
 
 
 # ---------------------------------------------------------------- the draw
 
-def proposal_weight(q_star, p):
+def proposal_weight(q_star: Array, p: Array) -> Array:
     """r = q*/p, zero for what cannot be proposed (p = 0)."""
     return at_most(q_star / at_least(p, SMALLEST), LARGEST) * (p > 0)
 
 
-def safe_share(total, uniform):
+def safe_share(total: Array, uniform: Array) -> Array:
     """Share of the uniform pmf in the mixture: `uniform`, but all of it where nothing is worth drawing (`total` = 0)."""
     return uniform + (1 - uniform) * (total <= SMALLEST)
 
 
-def pmf(r, total, count, uniform=0.0):
+def pmf(r: Array, total: Array, count: Array, uniform: Array = 0.0) -> Array:
     """P_r = r / sum_s sum_i r, mixed with a share `uniform` of the uniform pmf over all `count` proposals; only that if the sum is zero.
 
     Without a uniform share a proposal that the cached pmf gives nothing, though it contributes, would be lost."""
@@ -42,25 +45,25 @@ def pmf(r, total, count, uniform=0.0):
     return (1 - share) * (r / at_least(total, SMALLEST)) + share / count
 
 
-def density_ratio(probability, M):
+def density_ratio(probability: Array, M: int) -> Array:
     """q/p = r/Q = M P_r, of a proposal drawn with `probability`."""
     return M * probability
 
 
-def estimate(g, p, probability, M):
+def estimate(g: Array, p: Array, probability: Array, M: int) -> Array:
     """What one of the N drawn proposals says: g / (M p P_r); I is the mean over the draws (and over p(Z))."""
     return g / at_least(M * p * probability, SMALLEST)
 
 
 # ---------------------------------------------------------------- the weights
 
-def bracket(share, M):
+def bracket(share: Array, M: int) -> Array:
     """1 - Q_s / (M Q), of share = Q_s/Q: the chance to draw another sub-path than the one at hand. Never negative, whatever rounding or
     estimates of Q and Q_s make of it."""
     return at_least(1 - share / M, 0)
 
 
-def gain(ratio, share, M, N=1):
+def gain(ratio: Array, share: Array, M: int, N: int = 1) -> Array:
     """p_t / p = 1 / (1/M + (1 - Q_s/(M Q)) / (N q/p)): how many times better than one connection to a light sub-path of its own.
 
     `ratio` = q/p and `share` = Q_s/Q. From zero (never drawn) to M (always drawn). M = 1 and a uniform pmf over S lengths give 1/S."""
@@ -68,19 +71,19 @@ def gain(ratio, share, M, N=1):
     return M * (x / at_least(x + bracket(share, M), SMALLEST))
 
 
-def resampled_density(p, q, share, M, N=1):
+def resampled_density(p: Array, q: Array, share: Array, M: int, N: int = 1) -> Array:
     """p_t = (1/(M p) + (1 - Q_s/(M Q)) / (N q))^-1 for t in Lambda_RIS (the paper prints N = 1)."""
     return p * gain(proposal_weight(q, p), share, M, N)
 
 
-def technique_weights(densities, counts):
+def technique_weights(densities: Sequence[Array], counts: Sequence[Array]) -> list[Array]:
     """w_t = n_t p_t / sum_i n_i p_i, a list. n_t = 1 for t in Lambda_RIS, N_t samples for t in Lambda_IS; zero for a path without techniques."""
     parts = [n * density for n, density in zip(counts, densities)]
     total = at_least(sum(parts), SMALLEST)
     return [part / total for part in parts]
 
 
-def doubtful_ratio(whole, spare, doubt):
+def doubtful_ratio(whole: Array, spare: Array, doubt: Array) -> Array:
     """q/p to put into `gain` where the pmf is a cached one, made for a place near by: 1 / E[p/q], for 1/q is what the variance is linear in.
 
     `whole`: q/p if the cache sees what can be seen here; `spare`: what is left of it if it does not, which happens with the probability `doubt`."""
@@ -89,12 +92,13 @@ def doubtful_ratio(whole, spare, doubt):
 
 # ---------------------------------------------------------------- the noise
 
-def sample_variance(g, p, integrate):
+def sample_variance(g: Array, p: Array, integrate: Callable[[Array], Array]) -> Array:
     """V[g/p] = integral of g^2/p - (integral of g)^2: one sample of density p. `integrate`: the caller's sum over the sub-paths."""
     return integrate(g * g / p) - integrate(g) ** 2
 
 
-def estimate_variance(g, p, q_star, M, N, integrate=sum):
+def estimate_variance(g: Sequence[Array], p: Sequence[Array], q_star: Sequence[Array], M: int, N: int, integrate: Callable[[Array],
+                      Array] = sum) -> Array:
     """V[I | Z] = (1/M) sum_s V[g/p] - (1/(M N)) sum_s V[g/q_s] + (1/N) V[g/q], exact if the proposals are independent.
 
     `g`, `p`, `q_star`: lists with an array of sub-paths for each length; q_star > 0 wherever g is not zero. Q and Q_s are the exact integrals
@@ -108,7 +112,8 @@ def estimate_variance(g, p, q_star, M, N, integrate=sum):
     return proposals / M - within / (M * N) + over_all / N
 
 
-def second_moment(g, p, q_star, M, N, integrate=sum):
+def second_moment(g: Sequence[Array], p: Sequence[Array], q_star: Sequence[Array], M: int, N: int, integrate: Callable[[Array],
+                  Array] = sum) -> Array:
     """sum_s integral of g^2 / p_t: the part of the variance that is quadratic in each value of g; what the weights minimise, summed over t."""
     Q_s = [integrate(x) for x in q_star]
     Q = sum(Q_s)

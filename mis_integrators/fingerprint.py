@@ -1,0 +1,61 @@
+"""What a scene file consists of, by content: the file itself, those it includes, and every file that any of them names."""
+
+from __future__ import annotations
+
+import hashlib
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+from typing import Mapping
+
+import mitsuba as mi
+
+
+def scene_digests(path: Path, variables: Mapping[str, str]) -> dict[str, str]:
+    """SHA-256 of the scene file and of all files that it refers to, by the name under which it does; ``variables`` are the values of its
+    ``$variables``. Call it after the scene was loaded: the folders in which Mitsuba looks for files are those that it then knows.
+    """
+    state = mi.parser.parse_file(mi.parser.ParserConfig(mi.variant()), str(path), **variables)
+    sources = [Path(str(file)) for file in state.files]
+    documents = [ElementTree.parse(file) for file in sources]
+    values = {e.get("name", ""): e.get("value", "") for document in documents for e in document.iter("default")}
+    values.update(variables)
+    resolver = mi.file_resolver()
+    named = {}
+    for document in documents:
+        for element in document.iter():
+            for attribute in (element.get("value"), element.get("filename")):
+                name = _substituted(attribute or "", values)
+                file = Path(str(resolver.resolve(name))) if name else None
+                if file and file.is_file():
+                    named[name] = file
+    named.update({_name(file, path): file for file in sources})
+    return {name: _digest(file) for name, file in sorted(named.items())}
+
+
+def changes(then: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
+    """What differs between two results of ``scene_digests``, a phrase each."""
+    return [
+        f"{name} {'is new' if name not in then else 'is gone' if name not in now else 'has changed'}"
+        for name in sorted({*then, *now})
+        if then.get(name) != now.get(name)
+    ]
+
+
+def _name(file: Path, scene: Path) -> str:
+    folder = scene.resolve().parent
+    return str(file.resolve().relative_to(folder)) if file.resolve().is_relative_to(folder) else str(file)
+
+
+def _substituted(text: str, values: Mapping[str, str]) -> str:
+    for name in sorted(values, key=len, reverse=True):
+        if name:
+            text = text.replace(f"${name}", values[name])
+    return text
+
+
+def _digest(file: Path) -> str:
+    digest = hashlib.sha256()
+    with open(file, "rb") as stream:
+        while part := stream.read(1 << 20):
+            digest.update(part)
+    return digest.hexdigest()

@@ -1,0 +1,100 @@
+"""The documentation: its code runs, its tables are those of the docstrings, its links and pictures exist."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import mitsuba as mi
+import pytest
+
+from mis_integrators import _plugins
+
+ROOT = Path(__file__).parent.parent
+PAGES = sorted((ROOT / "docs").glob("*.md"))
+OWN_PAGE = {"bdpm_opt2": "bdpm_opt", "bdpm_opt3": "bdpm_opt"}
+
+
+def blocks(page: Path, language: str) -> list[str]:
+    """The fenced blocks of a language."""
+    return re.findall(rf"^```{language}\n(.*?)^```$", page.read_text(), re.MULTILINE | re.DOTALL)
+
+
+def run(arguments: list[str], folder: Path) -> subprocess.CompletedProcess:
+    """Run a process in a folder, with this checkout's package and without a display."""
+    return subprocess.run(arguments, cwd=folder, capture_output=True, text=True, timeout=300,
+                          env={**os.environ, "PYTHONPATH": str(ROOT), "MPLBACKEND": "Agg"})
+
+
+def test_notebook_runs(tmp_path):
+    """Its cells one after the other, as Jupyter would run them; the tutorial's page has the same blocks."""
+    pytest.importorskip("matplotlib", reason="the tutorial draws a figure: pip install 'mis-integrators[bench]'")
+    cells = [cell for cell in json.loads((ROOT / "notebooks" / "tutorial.ipynb").read_text())["cells"] if cell["cell_type"] == "code"]
+    code = ["".join(cell["source"]) for cell in cells]
+    assert code == [block.strip("\n") for block in blocks(ROOT / "docs" / "tutorial.md", "python")] and len(code) > 4
+    result = run([sys.executable, "-c", "\n\n".join(code)], tmp_path)
+    assert result.returncode == 0, result.stderr[-2000:]
+    assert "(64, 64, 3)" in result.stdout and result.stdout.count("relMSE without") == 3
+    assert (tmp_path / "tutorial.png").stat().st_size > 10_000
+    assert run([sys.executable, str(ROOT / "tools" / "notebook.py"), "--check"], tmp_path).returncode == 0
+
+
+def test_commands_of_the_tutorial_run(tmp_path):
+    (tmp_path / "scenes").symlink_to(ROOT / "scenes")
+    commands = [line for block in blocks(ROOT / "docs" / "tutorial.md", "sh") for line in block.splitlines()]
+    assert len(commands) == 2
+    for command in commands:
+        program, *arguments = command.split()
+        assert program == "mis-render"
+        result = run([sys.executable, "-m", "mis_integrators", "render", *arguments], tmp_path)
+        assert result.returncode == 0, result.stderr
+    assert (tmp_path / "caustics.exr").exists() and (tmp_path / "final.png").exists()
+
+
+def test_strategy_of_the_documentation_works(tmp_path):
+    """The page's integrator, its comparison with `path`, and its refusal."""
+    code = "\n\n".join(blocks(ROOT / "docs" / "adding_a_strategy.md", "python"))
+    assert code.count("assert ") == 2
+    result = run([sys.executable, "-c", code], tmp_path)
+    assert result.returncode == 0, result.stderr[-2000:]
+
+
+def test_every_plugin_has_a_page(rgb):
+    """With its name in the title, a picture, equations, every parameter that it knows, and a line in the index."""
+    index = (ROOT / "docs" / "README.md").read_text()
+    for plugin in _plugins.PLUGINS:
+        page = ROOT / "docs" / f"{OWN_PAGE.get(plugin, plugin)}.md"
+        text = page.read_text()
+        assert f"`{plugin}`" in text.splitlines()[0] and f"({page.name})" in index and f"`{plugin}`" in index
+        assert re.search(r"^!\[.+\]\(images/", text, re.MULTILINE), page
+        assert len(re.findall(r"^    .*[=:] .*\S", text, re.MULTILINE)) >= 1 or re.search(r"\w_?i?\^?2? = ", text), page
+        for name in mi.load_dict({"type": plugin}).settings():
+            assert name == "integrator" or f"`{name}`" in text, (plugin, name)
+
+
+def test_tables_are_those_of_the_docstrings():
+    result = run([sys.executable, str(ROOT / "tools" / "parameter_tables.py"), "--check"], ROOT)
+    assert result.returncode == 0, result.stdout
+
+
+@pytest.mark.parametrize("page", [*PAGES, ROOT / "README.md"], ids=lambda page: page.name)
+def test_links_lead_somewhere(page):
+    """Files that exist, and headings of those that are named."""
+    text = re.sub(r"^```.*?^```$", "", page.read_text(), flags=re.MULTILINE | re.DOTALL)
+    for target in re.findall(r"\]\(([^)\s]+)\)", text):
+        if target.startswith("http"):
+            continue
+        name, _, heading = target.partition("#")
+        file = page.parent / name if name else page
+        assert file.exists(), f"{page.name}: {target}"
+        if heading:
+            slugs = {re.sub(r"[^\w -]", "", line.lstrip("# ").lower()).strip().replace(" ", "-")
+                     for line in file.read_text().splitlines() if line.startswith("#")}
+            assert heading in slugs, f"{page.name}: {target}"
+
+
+def test_index_names_every_page():
+    index = (ROOT / "docs" / "README.md").read_text()
+    assert [page.name for page in PAGES if page.name != "README.md" and f"({page.name})" not in index] == []
