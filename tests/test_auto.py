@@ -187,7 +187,7 @@ def test_what_was_decided_can_be_recalled(rgb):
 
 
 def test_means(rgb):
-    agree(auto(camera_paths=8), path(), tray("mixed1", "rectangle"), block=0.08)
+    agree(auto(camera_paths=8), path(), tray("lambertian", "rectangle"))
 
 
 def test_media_are_handed_over(rgb):
