@@ -28,8 +28,8 @@ g(u) = (acos u - u sqrt(1 - u^2)) / pi, and the ratio is the integral of g(u)^2 
 LEAST_BIAS, MOST_BIAS = 0.003, 1.0
 """Squared relative bias that disks of the ladder's largest radius can have, however little of it a short pilot sees. (In Cornell boxes, a
 corridor, rooms lit through a door or a window it is 0.002 to 0.04.)"""
-RARE_PIXELS = 0.005
-"""Share of the pixels that direct light's noise is judged without."""
+RARE_PIXELS = 0.001
+"""Share of the pixels, the noisiest, without which noise is judged."""
 SHARES_STRAY = 0.3
 """How far the share of what the correction at edges adds that plain estimates do lack strays from one, before anything was measured."""
 
@@ -84,7 +84,7 @@ def noise_and_difference(radii, samples, weights, at_first_vertex=True, alike=Fa
     `samples`: (iterations, radii, pixels) gathered values of independent iterations; `weights`: (pixels,); `at_first_vertex`: whether all
     noise is the photons', because the vertices that gather are those which the camera sees; `alike`: see `noise_of_photons`.
     """
-    variance = np.mean(weights * samples.var(axis=0, ddof=1), axis=1)
+    variance = np.array([usual_mean(values) for values in weights * samples.var(axis=0, ddof=1)])
     variance = noise_of_photons(radii, variance, 0.0 if at_first_vertex else variance.min(), alike)
     steps = np.diff(samples, axis=1)                                      # (iterations, radii - 1, pixels)
     difference, error = with_error(steps, steps, weights)
