@@ -215,6 +215,7 @@ def test_page_of_one_small_scene(module, tmp_path):
         assert (tmp_path / "out" / name).stat().st_size > 0
 
 
+@pytest.mark.full
 def test_resampling_is_swept(module, tmp_path):
     """N_c of two values: each method beside `bdpt`, whose own ratios are one, and error, noise and cost agree with each other."""
     pytest.importorskip("matplotlib")

@@ -34,11 +34,12 @@ def request_for(scene, plugin, spp, **parameters) -> Request:
 
 
 def test_image_is_that_of_one_process(scene, tmp_path, client):
-    """Through the scheduler's address, from a checkpoint on, with a pilot whose result the workers must be told."""
+    """Through the scheduler's address, from a checkpoint on, with a pilot whose result the workers must be told (its radius is for the three samples
+    that were planned then)."""
     options = ["-i", "bdpm_opt3", "-P", "mix_diffuse=true", "-P", "variance=true", "--seed", 3, "--quiet"]
-    assert render(scene, *options, "--spp", 12, "-o", tmp_path / "one.exr") == 0
-    assert render(scene, *options, "--spp", 3, "-o", tmp_path / "two.exr", "--checkpoint", 100) == 0
-    assert render(scene, *options, "--spp", 12, "-o", tmp_path / "two.exr", "--resume", "--scheduler", client.scheduler.address) == 0
+    for name, where in (("one", []), ("two", ["--scheduler", client.scheduler.address])):
+        assert render(scene, *options, "--spp", 3, "-o", tmp_path / f"{name}.exr", "--checkpoint", 100) == 0
+        assert render(scene, *options, "--spp", 12, "-o", tmp_path / f"{name}.exr", "--resume", *where) == 0
     (one_header, one), (header, image) = (read(tmp_path / f"{name}.exr") for name in ("one", "two"))
     assert header["iterations"] == one_header["iterations"] == 12 and header["radius.indirect"] == one_header["radius.indirect"]
     assert same(one, image)
