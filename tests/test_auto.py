@@ -46,7 +46,7 @@ class Unidirectional:
 # --- What the choice rests on ----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("variant_name, kind, rfilter", [(RGB, "perspective", "gaussian"), (MONO, "thinlens", "box"), (SPECTRAL, "orthographic", "tent")])
+@pytest.mark.parametrize("variant_name, kind, rfilter", [(RGB, "perspective", "gaussian"), (MONO, "thinlens", "box"), pytest.param(SPECTRAL, "orthographic", "tent", marks=pytest.mark.full)])
 def test_path_as_iterations(variant_name, kind, rfilter):
     mi.set_variant(variant_name)
     agree(Unidirectional(camera_paths=8), path(), tray("smooth1", "rectangle", kind, rfilter=rfilter), block=0.08)

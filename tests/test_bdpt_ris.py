@@ -205,14 +205,14 @@ def test_emitting_sphere(rgb, name):
 
 # plugin, emitter, family, sensor, variant, parameters
 ROWS = [
-    ("bdpt_ris", "envmap rotated", "mixed2", "thinlens", RGB, {"light_paths": 50}),
+    pytest.param("bdpt_ris", "envmap rotated", "mixed2", "thinlens", RGB, {"light_paths": 50}, marks=pytest.mark.full),
     ("pcbpt", "several", "smooth1", "orthographic", MONO, {}),
     ("bdpt_ris", "textured", "smooth0", "perspective", MONO, {"resamples": 4, "target": "f_y_f_yz"}),
 ]
 
 
 @pytest.mark.parametrize("name, emitter, family, sensor, variant_name, parameters",
-                         ROWS, ids=["-".join(row[:5]).replace(" ", "_") for row in ROWS])
+                         ROWS, ids=["-".join(getattr(row, "values", row)[:5]).replace(" ", "_") for row in ROWS])
 def test_agrees(name, emitter, family, sensor, variant_name, parameters):
     mi.set_variant(variant_name)
     agree(plugin(name, camera_paths=16, **parameters), path(rr_depth=50), tray(family, emitter, sensor), whole=0.03, block=0.1, most=200)
