@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+
 import drjit as dr
 import mitsuba as mi
 
@@ -133,8 +135,9 @@ class BDPMSession(IterativeSession):
         self.vertex_capacity = self._vertex_room(self.chunk)
         self.radii = {kind: integrator.initial_radius for kind in self.kinds()} if integrator.initial_radius else None
         self.corrected = {kind: False for kind in self.kinds()}
-        self.seconds = None
+        self.seconds = self.begun = None           # what rendering may take, and when it began
         self.forecast = self.judged_by = None      # what the pilot expects, and the image (of its pixels) that errors are relative to
+        self.rehearsed = {}                        # iterations that the pilot has rendered already, by number
         self.photons_found = 0                     # by the last light pass
         self._sized = False
         self.recorded = recorder()
@@ -195,7 +198,7 @@ class BDPMSession(IterativeSession):
         return gather_photons(self.traits, photon_map, vertices, radii, spectral["wavelengths"], self.light_paths, self.integrator.max_depth,
                               only_last=kind == "indirect", grey=grey)
 
-    def _covered(self, scene, vertices, radius, seed):
+    def _covered(self, scene, tables, vertices, radius, seed):
         """Share of each vertex' merge disk that holds surface; one where the surface is not Lambertian: in a highlight the noise of dividing by
         an estimate would outweigh what it mends."""
         probed = dr.max(vertices["throughput"]) > 0
@@ -232,7 +235,7 @@ class BDPMSession(IterativeSession):
             photon_map = PhotonMap.with_grid(maps[kind], self.traits.bounds, self._cell(radius), self.photon_capacity)
             (gathered,) = self._gather(photon_map, vertices, kind, [radius], spectral)
             if self.corrected[kind]:
-                gathered *= dr.rcp(self._covered(scene, vertices, radius, seed))
+                gathered *= dr.rcp(self._covered(scene, tables, vertices, radius, seed))
             radiance += self._per_path(gathered, vertices, self.chunk)
         if self.integrator.hide_emitters:
             radiance = dr.select(alpha > 0, radiance, 0)       # as `path` does: what is behind nothing but null surfaces is hidden
@@ -261,6 +264,7 @@ class BDPMSession(IterativeSession):
             self._freeze()
 
     def start(self):
+        self.begun = self.begun or time.perf_counter()
         if self.radii is None:
             self.forecast = choose_radii(self)
 
@@ -278,6 +282,8 @@ class BDPMSession(IterativeSession):
 
     def _iteration(self, iteration):
         self.start()
+        if iteration in self.rehearsed:
+            return self.rehearsed.pop(iteration)
         radii = self.radii_at(iteration)
         spectral = self._spectral(iteration)
         maps = self._map_pass(self._photons(iteration, spectral), radii) if radii else None

@@ -15,6 +15,7 @@ from ..transport.lights import Lights
 from ..transport.packing import rounded_up
 from ..transport.random import mix, next_2d, vertex_streams
 from ..transport.recording import lanes, recorder
+from ..transport.spectra import channel_mean
 from ..transport.subpaths import read_vertices, trace_camera_subpaths, trace_light_subpaths
 from ..transport.traits import SceneTraits
 from .common import IterativeIntegrator, IterativeSession
@@ -175,7 +176,7 @@ class BDPTSession(IterativeSession):
         vertices, count, lengths = light
         start, order = by_path(vertices, count, lengths, self.capacity["light"])
         thinning = THINNING if self.integrator.technique_weights else 0
-        level = dr.zeros(mi.Float, self.chunk) + dr.mean(dr.mean(radiance)) * thinning
+        level = dr.zeros(mi.Float, self.chunk) + dr.mean(channel_mean(radiance)) * thinning
         dr.eval(level, start, order)
         return list_pairs(self.traits, self.weights(spectral), camera, camera_count, self.capacity["camera"], vertices, start, order, lengths,
                           self.integrator.max_depth, self.capacity["pairs"], level, seed)

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from ..transport.census import mean_segments
 from ..transport.radius import relative_weights, usual_mean
+from ..transport.spectra import channel_mean
 from . import costs
 from .pilot import FEWEST_ITERATIONS, PILOT_INDEX, UNPLANNED_ITERATIONS, pilot_pixels
 from .unidirectional import PathSession
@@ -170,7 +170,7 @@ def _try_path(path, segments, stride, pixels, mean):
     for number in range(PATH_TRIALS):
         number += PILOT_INDEX
         radiance, *_ = path.trace(number, 0, mi.UInt32(0), stride * path.samples_per_iteration, pixels, path._spectral(number))
-        values.append(np.broadcast_to(np.array(dr.mean(radiance)), pixels))
+        values.append(np.broadcast_to(np.array(channel_mean(radiance)), pixels))
     path.sampler.seed(0, 1)
     variance = usual_mean(relative_weights(mean) * np.var(values, axis=0, ddof=1))
     return Trial("path", {}, path, 0.0, variance, costs.cost("path", costs.events(path, segments, None, 0.0)))

@@ -11,6 +11,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..transport.packing import bits_float, float_bits
+from ..transport.spectra import channel_mean
 from ..transport.traits import lookup
 from ..weights import recursion
 from .surroundings import SHARES
@@ -134,7 +135,7 @@ class OptimalWeights:
         sharp = mask & (known.visible_share > 0)
         ds, unoccluded = self.lights.unoccluded(si, dr.select(sharp, known.light, 0), sharp)
         wo = si.to_local(dr.select(sharp, ds.d, known.direction))
-        scale = dr.select(sharp, unoccluded * known.visible_share * dr.abs(wo.z) / recursion.at_least(dr.mean(known.direct), recursion.SMALLEST), 1)
+        scale = dr.select(sharp, unoccluded * known.visible_share * dr.abs(wo.z) / recursion.at_least(channel_mean(known.direct), recursion.SMALLEST), 1)
         value = lobe_f
         if self.traits.has_rough:
             lit = mask & (dr.max(known.direct) > 0) & ~lookup(self.traits.lambertian, bsdf, mi.Bool, mask)
@@ -142,9 +143,9 @@ class OptimalWeights:
             value = dr.select(lit, towards_light, lobe_f)
         ambient = AMBIENT_SHARE * self.cache.level * lobe_f / (lobe_p * dr.pi)
         indirect = (known.second + known.later) * dr.inv_pi * lobe_f / lobe_p
-        direct, kernel = value * known.direct * scale + ambient, dr.mean(lobe_f)
+        direct, kernel = value * known.direct * scale + ambient, channel_mean(lobe_f)
         # The noise law takes direct light for exact. Its noise costs as that of photons does: n times the variance over the radiance.
-        noise = dr.mean(self.n * direct) * known.noise * dr.square(1 - known.caustic_share)
+        noise = channel_mean(self.n * direct) * known.noise * dr.square(1 - known.caustic_share)
         if self.has_caustics:
             noise += self.caustic_cost * known.caustic_share * kernel
         return Node(f, p, direct, indirect, kernel, lobe_f, lobe_p, noise, self.is_last(bsdf, mask))

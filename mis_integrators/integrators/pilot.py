@@ -13,6 +13,7 @@ import numpy as np
 from ..transport.camera_pass import film_sample_count
 from ..transport.gather import mean_photon_count
 from ..transport.radius import best_radius, ladder, relative_weights, usual_mean
+from ..transport.spectra import channel_mean
 
 PILOT_PIXELS = 4096
 FEWEST_ITERATIONS, FEWEST_TIMED_ITERATIONS, MOST_ITERATIONS = 4, 3, 16
@@ -27,6 +28,10 @@ GATHER_COST = 0.013
 """Cost of one gathered photon a vertex, in units of an iteration's light and camera passes (0.006 to 0.018 on the bundled scenes)."""
 PROBE_COST = 0.3
 """Cost of the coverage probes, in the same units (0.05 to 0.36)."""
+LIKE_A_PILOT = 1.5
+"""What an iteration takes, in seconds of one of the pilot, until it is known."""
+TOO_SLOW = 1.5
+"""An iteration that takes so many times the guess is not believed to be typical."""
 USUAL_PHOTONS = 10
 """Photons a gather at which an iteration counts as one planned iteration: larger gathers must pay for themselves."""
 
@@ -50,22 +55,37 @@ def choose_radii(session):
             over = done + 1 >= max(PILOT_SHARE * count, FEWEST_ITERATIONS)
         if over or pilot.ladder is None:
             break
-    choices = pilot.decide(count)
     if session.seconds is None:
-        return pilot.forecast(choices, count)
-    seconds = now - start                                      # a pilot iteration takes about as long as one of the render
-    if now - started < 2 * PILOT_SHARE * session.seconds:
-        start = time.perf_counter()
-        dr.eval(session._iteration(PILOT_INDEX))
-        dr.sync_thread()
-        seconds = time.perf_counter() - start
-    left = session.seconds - (time.perf_counter() - started)
-    decided = dict(session.corrected)
+        return pilot.forecast(pilot.decide(count), count)
+    guess = LIKE_A_PILOT * (now - start)
+    left = max(session.seconds - (now - session.begun), guess)
+    pilot.decide(left / guess)
+    seconds, spent = rehearse(session, guess, left)
     count = max(left / seconds * pilot.cost_of_choice(), 1)
-    choices = pilot.decide(count)
-    if session.corrected != decided:
+    before = dict(session.radii), dict(session.corrected)
+    choices = pilot.decide(count, min(spent / left, 1))
+    if (session.radii, session.corrected) != before:
+        session.rehearsed.clear()
+    if session.corrected != before[1]:
         session._freeze()
     return pilot.forecast(choices, count)
+
+
+def rehearse(session, guess, left):
+    """Renders the session's first iteration, and the second where the first took longer than it should have (it may have had to be compiled) but
+    not most of the seconds that are `left`; returns the seconds of an iteration, and those of all. The session keeps the iterations."""
+    spent = 0.0
+    for number in range(2):
+        start = time.perf_counter()
+        block = session._iteration(number)
+        dr.eval(block)
+        dr.sync_thread()
+        seconds = time.perf_counter() - start
+        session.rehearsed[number] = block
+        spent += seconds
+        if seconds < TOO_SLOW * guess or spent > left / 2:
+            break
+    return seconds, spent
 
 
 @dataclass(frozen=True)
@@ -148,11 +168,11 @@ class Pilot:
             return
         radii = [dr.opaque(mi.Float, float(radius)) for radius in self.ladder]
         gathered = self._gather(session.scene, session._tables, photons, vertices, radii, spectral)
-        self.direct.append(self._numpy(dr.mean(radiance)))
+        self.direct.append(self._numpy(channel_mean(radiance)))
         for (kind, way), store in self.samples.items():
             values = gathered[kind]
             if way:
-                values = [v * dr.rcp(self._covered(session.scene, vertices, r, seed)) for v, r in zip(values, radii)]
+                values = [v * dr.rcp(self._covered(session.scene, session._tables, vertices, r, seed)) for v, r in zip(values, radii)]
             store.append([self._numpy(session._per_path(value, vertices, self.paths)) for value in values])
 
     def _numpy(self, value):
@@ -187,8 +207,8 @@ class Pilot:
             return None
         mean = self.mean()
         direct = usual_mean(relative_weights(mean) * np.var(self.direct, axis=0, ddof=1)) if len(self.direct) > 1 else np.inf
-        session, middle = self.session, self.samples.get(("caustic", False))
-        caustics = np.mean([step[len(self.ladder) * 2 // 3] for step in middle]) if middle else 0.0
+        session = self.session
+        caustics = np.mean(self.middling("caustic")) if "caustic" in self.ways else 0.0
         return Forecast(sum(choice.squared_bias for choice in choices.values()), direct + sum(choice.variance for choice in choices.values()),
                         sum(self.gathered(kind, session.radii[kind]) for kind in choices), count, mean,
                         float(caustics / max(np.mean(mean), 1e-30)), len(self.direct))
@@ -202,17 +222,18 @@ class Pilot:
         return max((self._cost(kind, self.session.corrected[kind], radius) for kind, radius in self.session.radii.items()
                     if kind in self.photons), default=1.0)
 
-    def decide(self, count):
-        """Sets the session's radii and corrections for `count` iterations of usual cost; returns the choice for each kind of photons."""
+    def decide(self, count, reluctance=None):
+        """Sets the session's radii and corrections for `count` iterations of usual cost; returns the choice for each kind of photons. With a
+        `reluctance` those that are set already are kept unless the predicted error falls by more than this share."""
         session = self.session
         if self.ladder is None:
             session.radii = {kind: 1e-3 * float(dr.norm(session.traits.bounds.extents())) for kind in self.ways}
             return {}
-        samples = {key: np.array(values) for key, values in self.samples.items()}
+        samples, mean = {key: np.array(values) for key, values in self.samples.items()}, self.mean()
         choices = {kind: best_radius(
-            self.ladder, samples[kind, False], samples.get((kind, True)), self.mean(),
+            self.ladder, samples[kind, False], samples.get((kind, True)), mean,
             lambda radius, corrected, kind=kind: np.maximum(count / self._cost(kind, corrected, radius), 1), self.at_first_vertex,
-            kind == "caustic")
+            kind == "caustic", None if reluctance is None else (session.radii[kind], session.corrected[kind]), reluctance or 0.0)
             for kind in self.ways}
         session.radii = {kind: choice.radius for kind, choice in choices.items()}
         session.corrected.update({kind: choice.correct for kind, choice in choices.items()})
@@ -222,7 +243,8 @@ class Pilot:
         """The pilot's pixels, gathered at a middling radius: (pixels,), or those that the session is to be judged by."""
         if self.session.judged_by is not None:
             return self.session.judged_by
-        if self.ladder is None:
-            return np.mean(self.direct, axis=0)
-        middle = len(self.ladder) * 2 // 3
-        return np.mean(self.direct, axis=0) + sum(np.mean([step[middle] for step in self.samples[kind, False]], axis=0) for kind in self.ways)
+        return np.mean(self.direct, axis=0) + sum(np.mean(self.middling(kind), axis=0) for kind in self.ways)
+
+    def middling(self, kind):
+        """What photons of a kind bring at a middling radius: (iterations, pixels)."""
+        return [step[len(self.ladder) * 2 // 3] for step in self.samples[kind, False]]

@@ -21,6 +21,7 @@ from ..transport.packing import rounded_up
 from ..transport.proposals import Proposals, cumulative_sums
 from ..transport.random import mix, next_2d, vertex_streams
 from ..transport.recording import lanes, recorder
+from ..transport.spectra import channel_mean
 from ..transport.subpaths import junction_of, read_vertices, trace_light_subpaths
 from ..transport.traits import SceneTraits
 from .common import IterativeIntegrator, IterativeSession
@@ -147,9 +148,9 @@ class ResampledSession(IterativeSession):
             n = dr.mulsign(z["n"], dr.dot(z["n"], z["towards"]))
             cosine = dr.dot(n, sent.d)
             cosine = dr.select(z["through"], dr.abs(cosine), dr.maximum(cosine, 0))
-            r = dr.mean(sent.light) * cosine
+            r = channel_mean(sent.light) * cosine
         else:
-            r = dr.mean(sent.light * junction_of(self.traits, z, spectral["wavelengths"], active).between(z["towards"], sent.d, active)[0])
+            r = channel_mean(sent.light * junction_of(self.traits, z, spectral["wavelengths"], active).between(z["towards"], sent.d, active)[0])
         active &= (r > 0) & dr.isfinite(r)
         seen = ends.unblocked(scene, z["p"], z["n"], sent, active)
         return dr.select(active, r, 0), seen, starts, places, found, sent.vertices, guessed_weight(z, sent)

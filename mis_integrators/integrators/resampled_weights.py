@@ -21,6 +21,7 @@ import numpy as np
 
 from ..transport.light_ends import END
 from ..transport.proposals import BLIND_SHARE, uniform_share
+from ..transport.spectra import channel_mean
 from ..weights import bidirectional as theory
 from ..weights import resampling
 
@@ -83,7 +84,7 @@ class ResampledWeights:
         start = self.lights.start_density(si, ds, active)
         across = self.lights.forward_density(si, ds, active)
         made = across * dr.abs(dr.dot(si.n, ds.d))
-        strength = dr.select(self.lights.untold(ds.emitter, active), self.lights.total_power, dr.mean(flux))
+        strength = dr.select(self.lights.untold(ds.emitter, active), self.lights.total_power, channel_mean(flux))
         row = self.row(si.p, dr.mulsign(si.n, dr.dot(si.n, ds.d)))
         better = self.gain(strength * self.softened(row, made, dr.select(infinite, dr.inf, dr.square(ds.dist))), row, mi.UInt32(1), active)
         met = self.lights.can_be_met(ds.emitter, active)

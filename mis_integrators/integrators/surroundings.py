@@ -8,6 +8,7 @@ import numpy as np
 
 from ..transport.irradiance_cache import colours
 from ..transport.random import next_2d, streams
+from ..transport.spectra import channel_mean
 
 RAYS, SECTORS = 32, 8
 SHARES = (1 / 8, 1 / 8, 1 / 4, 1 / 2)
@@ -36,13 +37,13 @@ class Surroundings:
         node = weights.node(si, bsdf, active)
         albedo = dr.sum(dr.select(active, node.kernel / node.lobe_p, 0)) / dr.maximum(dr.count(active), 1)
         self.albedo = dr.opaque(mi.Float, min(float(albedo[0]), 1.0))
-        grey = np.array(dr.select(active, dr.mean(node.direct + node.indirect), 0)).reshape(cells, RAYS)
+        grey = np.array(dr.select(active, channel_mean(node.direct + node.indirect), 0)).reshape(cells, RAYS)
         order = np.argsort(grey, axis=1)
         ends = np.round(np.cumsum((0,) + SHARES) * RAYS).astype(int)
         table = np.zeros((cells + 1, len(SHARES), 2, channels), dtype=np.float32)
         for number, spectrum in enumerate((node.direct, node.indirect)):
             for channel in range(channels):
-                value = dr.mean(spectrum) if channels == 1 else spectrum[channel]
+                value = channel_mean(spectrum) if channels == 1 else spectrum[channel]
                 value = np.array(dr.select(active, value, 0)).reshape(cells, RAYS)
                 value = np.take_along_axis(value, order, axis=1)
                 for group, (a, b) in enumerate(zip(ends[:-1], ends[1:])):

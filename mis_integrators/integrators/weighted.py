@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+
 import drjit as dr
 import mitsuba as mi
 
@@ -64,6 +66,7 @@ class WeightedSession(BDPMSession):
         return weigh
 
     def start(self):
+        self.begun = self.begun or time.perf_counter()
         if not self._weighted and self.kinds() and self.mixes():
             if not self.weighted_pilot:
                 super().start()

@@ -14,6 +14,7 @@ from .lenses import Lens
 from .packing import Store
 from .random import next_2d
 from .records import Layout
+from .spectra import channel_mean
 from .subpaths import NO_PARENT, keep_vertex, new_vertices, vertex_layout
 
 STEP = ("near", "geometry", "forward", "back", "scattered", "row")
@@ -60,7 +61,7 @@ def step_to_hit(lights, soften, left, density, origin, ds, light, squared, mask)
     start = lights.start_density(origin, ds, mask)
     geometry = soften.softened(mi.UInt32(row), there, squared)
     near = dr.select(density > 0, dr.rcp(dr.maximum(density, 1e-20)), 0)
-    return dict(zip((*STEP, *HIT), (near, geometry, forward, back, scattered, row, dr.mean(light) * dr.rcp(dr.maximum(start, 1e-20)), start,
+    return dict(zip((*STEP, *HIT), (near, geometry, forward, back, scattered, row, channel_mean(light) * dr.rcp(dr.maximum(start, 1e-20)), start,
                                     lights.forward_density(origin, ds, mask))))
 
 

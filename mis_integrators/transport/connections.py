@@ -14,6 +14,7 @@ from .junctions import SMALLEST_COSINE
 from .lenses import unblocked, unblocked_by_visible
 from .packing import Store
 from .random import vertex_streams
+from .spectra import channel_mean
 from .subpaths import STATES, junction_of, read_vertices
 
 
@@ -98,7 +99,7 @@ def list_pairs(traits, weights, camera, camera_count, camera_capacity: int, ligh
         chance = mi.Float(1)
         if dr.hint(traits.has_lambertian, mode='scalar'):
             pair = join(traits, z, y, [], keep)
-            worth = dr.mean(pair.value) * weights.connected(pair, z, y)
+            worth = channel_mean(pair.value) * weights.connected(pair, z, y)
             simple = (y["density"] >= 0) & (z["density"] >= 0)
             chance = dr.select(simple, dr.minimum(worth * dr.rcp(dr.maximum(level, 1e-30)), 1), 1)
             keep &= rng.next_float32() < chance

@@ -8,6 +8,7 @@ import mitsuba as mi
 from .camera_pass import LAST_VERTEX
 from .packing import unpack_depth, unpack_direction, unpack_normal
 from .photon_map import for_each_photon, read_power
+from .spectra import channel_mean
 from .traits import lookup
 
 SAME_SURFACE_COSINE = 0.7
@@ -99,7 +100,7 @@ def gather_photons(traits, photon_map, vertices, radii, wavelengths, light_paths
             value *= dr.select(dr.max(value) > 0, weigh(index, f, p, back, hit), 0)
         value *= flux * dr.rcp(landing)
         if grey:
-            value = dr.mean(value * factor)
+            value = channel_mean(value * factor)
         height = dr.abs(dr.dot(offset, si.n))
         return tuple(total + dr.select(hit & (distance_squared < dr.square(radius)) & (height < SAME_SURFACE_OFFSET * radius),
                                        value, 0)

@@ -13,6 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 from .random import next_2d, streams
+from .spectra import channel_mean
 from .traits import scene_bounds
 
 POLAR_CELLS = 16
@@ -180,7 +181,7 @@ class EnvironmentGuide:
         smooth_power = smooth * reach * (4 * np.pi / DIRECTION_CELLS)
         ds, weight = emitter.sample_direction(self._point(self.center, mi.Float(0)), next_2d(streams(cell, mi.UInt32(1))))
         drawn = np.array(direction_cell(ds.d))
-        weight = np.nan_to_num(np.broadcast_to(np.array(dr.mean(weight)), drawn.shape))
+        weight = np.nan_to_num(np.broadcast_to(np.array(channel_mean(weight)), drawn.shape))
         total_power = np.bincount(drawn, weights=weight, minlength=DIRECTION_CELLS) / len(drawn)
         if smooth_power.sum() <= 0:
             return
@@ -205,7 +206,7 @@ class EnvironmentGuide:
         si.wi = -towards
         if mi.is_spectral:
             si.wavelengths = mi.UnpolarizedSpectrum(450, 520, 590, 640)
-        return dr.mean(emitter.eval(si, active)) + dr.zeros(mi.Float, dr.width(towards))
+        return channel_mean(emitter.eval(si, active)) + dr.zeros(mi.Float, dr.width(towards))
 
     def _pilot(self, sensor):
         """Yields records (p, direction to the light, table row, weight, tested, reached) along camera paths.
@@ -227,21 +228,21 @@ class EnvironmentGuide:
             for index, emitter in self.infinite:
                 first = int(np.array(self._first_row)[index])
                 ds, weight = emitter.sample_direction(si, next_2d(rng), smooth)
-                tests = [(ds.d, dr.mean(weight), smooth & (ds.pdf > 0))]
+                tests = [(ds.d, channel_mean(weight), smooth & (ds.pdf > 0))]
                 if emitter.is_environment():
                     towards = mi.warp.square_to_uniform_sphere(next_2d(rng))
                     tests.append((towards, self._radiance(emitter, towards, smooth) * (4 * dr.pi), smooth))
                 for towards, light, tested in tests:
                     response = bsdf.eval(context, si, si.to_local(towards), tested)
-                    tested &= dr.mean(response) > 0
+                    tested &= channel_mean(response) > 0
                     reached = _sees_sky(self.scene, si.spawn_ray(towards), tested)
                     row = first + (direction_cell(towards) if emitter.is_environment() else dr.zeros(mi.UInt32, PILOT_PATHS))
-                    weight = dr.select(reached, light * dr.mean(throughput * dr.minimum(response, 1)), 0)
+                    weight = dr.select(reached, light * channel_mean(throughput * dr.minimum(response, 1)), 0)
                     records.append((si.p, towards + dr.zeros(mi.Vector3f, PILOT_PATHS), row, weight,
                                     dr.select(tested, mi.Float(1), 0), dr.select(reached, mi.Float(1), 0)))
             bs, value = bsdf.sample(context, si, rng.next_float32(), next_2d(rng), active)
             throughput *= value
-            active &= dr.mean(throughput) > 0
+            active &= channel_mean(throughput) > 0
             ray = si.spawn_ray(si.to_world(bs.wo))
             dr.eval(ray, active, throughput, rng, records)
             yield from records
@@ -335,7 +336,7 @@ class EnvironmentGuide:
                 value = self._radiance(emitter, towards) * dr.select(pdf > 0, dr.rcp(pdf), 0)
             else:
                 ds, irradiance = emitter.sample_direction(it, mi.Point2f(0.5))
-                towards, value = ds.d + dr.zeros(mi.Vector3f, count), dr.mean(irradiance)
+                towards, value = ds.d + dr.zeros(mi.Vector3f, count), channel_mean(irradiance)
                 row, extra = self.row_of_emitter(number), rng.next_float32()
             p, density = self.sample_position(towards, row, next_2d(rng), next_2d(rng), extra, True)
             cell, inside = self._position_cell(towards, p)

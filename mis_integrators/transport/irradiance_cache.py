@@ -11,9 +11,10 @@ import mitsuba as mi
 import numpy as np
 
 from .gather import SAME_SURFACE_COSINE
-from .packing import bits_float, float_bits, unpack_caustic, unpack_depth, unpack_direction, unpack_normal
+from .packing import bits_float, float_bits, rounded_up, unpack_caustic, unpack_depth, unpack_direction, unpack_normal
 from .photon_map import build_photon_map, for_each_photon, read_power, smallest_cell
 from .random import streams
+from .spectra import channel_mean
 
 PHOTONS_A_CELL = 32
 GATHER_RADIUS = 2.0
@@ -85,7 +86,7 @@ class IrradianceCache:
 
     @staticmethod
     def _channels(flux):
-        return [dr.mean(flux)] if colours() == 1 else [flux[i] for i in range(colours())]
+        return [channel_mean(flux)] if colours() == 1 else [flux[i] for i in range(colours())]
 
     def _choose_cells(self, position, normal, stored, count, bounds):
         """Sets the cells' size so that those which hold photons hold `PHOTONS_A_CELL` on average; returns each photon's place."""
@@ -111,7 +112,7 @@ class IrradianceCache:
         dr.scatter(self.index, number, self._occupied)
         del self._occupied
         slot = dr.gather(mi.UInt32, self.index, place, stored)
-        sums = dr.zeros(mi.Float, 8 * (cells + 1))
+        sums = dr.zeros(mi.Float, rounded_up(8 * (cells + 1)))
         for offset, value in enumerate((1, *position, *normal)):
             dr.scatter_add(sums, mi.Float(value), 8 * slot + offset, stored)
         dr.eval(sums)
@@ -134,8 +135,8 @@ class IrradianceCache:
             straight = hit & unpack_caustic(record.w)
             soon = hit & ~straight & (unpack_depth(record.w) <= 2)
             added = [dr.select(kind, value, 0) for kind in (straight, soon, hit & ~straight & ~soon) for value in self._channels(flux)]
-            added += [dr.select(straight, dr.mean(flux) * x, 0) for x in towards]
-            added += [dr.select(straight & (unpack_depth(record.w) > 1), dr.mean(flux), 0)]
+            added += [dr.select(straight, channel_mean(flux) * x, 0) for x in towards]
+            added += [dr.select(straight & (unpack_depth(record.w) > 1), channel_mean(flux), 0)]
             return tuple(old + new for old, new in zip(totals, added))
 
         totals = for_each_photon(photon_map, self.center, GATHER_RADIUS * self.cell, mi.Bool(True), visit,
@@ -153,9 +154,9 @@ class IrradianceCache:
                                           caustic_share)):
             dr.scatter(self.table, mi.Float(value), self.words * number + offset)
         # A cell that no photon met: dark, or hardly touched by a surface, which is worse to get wrong. As bright as others are.
-        dr.scatter(self.table, mi.Float([float(dr.mean(value)[0]) for value in irradiance]), dr.arange(mi.UInt32, 3 * channels))
+        dr.scatter(self.table, mi.Float([_mean(value) for value in irradiance]), dr.arange(mi.UInt32, 3 * channels))
         dr.eval(self.table)
-        self.mean = float(dr.mean(sum(irradiance) / channels)[0])
+        self.mean = _mean(sum(irradiance)) / channels
         self.level = dr.opaque(mi.Float, self.mean)
 
     def _strongest_light(self, scene, lights, direct):
@@ -181,7 +182,7 @@ class IrradianceCache:
         si = dr.zeros(mi.SurfaceInteraction3f, cells * DIRECT_SAMPLES)
         si.p, si.n = dr.gather(mi.Point3f, self.center, number // DIRECT_SAMPLES), mi.Normal3f(facing)
         ds, weight, _ = lights.sample_direct(si, streams(number, mi.UInt32(OWN_STREAM)), mi.Bool(True))
-        value = dr.mean(weight) * dr.maximum(dr.dot(ds.d, facing), 0)
+        value = channel_mean(weight) * dr.maximum(dr.dot(ds.d, facing), 0)
         mean, square = dr.block_sum(value, DIRECT_SAMPLES) / DIRECT_SAMPLES, dr.block_sum(dr.square(value), DIRECT_SAMPLES) / DIRECT_SAMPLES
         noise = (square / dr.maximum(dr.square(mean), 1e-30) - 1) * (DIRECT_SAMPLES / (DIRECT_SAMPLES - 1))
         return dr.select(mean > 0, dr.maximum(noise, 0), UNSEEN_NOISE)
@@ -215,6 +216,11 @@ class IrradianceCache:
         rest = words[3 * channels:]
         light, visible_share = _unpack_light(rest[3])
         return Irradiance(*spectra, mi.Vector3f(*rest[:3]), slot, light, visible_share, *rest[4:6])
+
+
+def _mean(values):
+    """Mean of an array, whose width no kernel is to know."""
+    return float(dr.sum(values)[0]) / dr.width(values)
 
 
 def _typical(flux):

@@ -9,6 +9,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from .spectra import channel_mean
 from .traits import lookup
 
 SMALLEST_COSINE = 1e-6
@@ -18,7 +19,7 @@ ROUGH = -1.0
 
 def scattered_mean(value, n, to_light):
     """Mean over the channels of the BSDF [1/sr], where `value` is that of `Junction.between`: what geometric cosines turn into the light that goes on."""
-    return dr.mean(value) * dr.rcp(dr.maximum(dr.abs(dr.dot(n, to_light)), SMALLEST_COSINE))
+    return channel_mean(value) * dr.rcp(dr.maximum(dr.abs(dr.dot(n, to_light)), SMALLEST_COSINE))
 
 
 class Junction:

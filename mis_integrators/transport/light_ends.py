@@ -10,6 +10,7 @@ import mitsuba as mi
 from .junctions import SMALLEST_COSINE, scattered_mean
 from .lenses import unblocked
 from .light_starts import read_starts
+from .spectra import channel_mean
 from .subpaths import junction_of, read_vertices
 
 
@@ -73,7 +74,7 @@ class LightEnds:
         across = self.lights.forward_density(reference, ds, start)
         per = dr.select(density > 0, dr.rcp(dr.maximum(density, 1e-20)), 0)
         light *= per
-        mean = dr.select(self.lights.untold(ds.emitter, start), self.lights.total_power * across, dr.mean(light))
+        mean = dr.select(self.lights.untold(ds.emitter, start), self.lights.total_power * across, channel_mean(light))
         met = start & self.lights.can_be_met(ds.emitter, start)
         return Sent(dr.select(start, ds.d, sent.d), dr.select(start, ds.dist, sent.distance), dr.select(active, dr.select(start, light, sent.light), 0),
                     dr.select(start, mean, sent.mean), dr.select(start, across, sent.across),

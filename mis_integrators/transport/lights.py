@@ -14,6 +14,7 @@ import numpy as np
 
 from .guide import direction_cell
 from .random import next_2d, streams
+from .spectra import channel_mean
 from .traits import UnsupportedScene, lookup, registry_table
 
 POWER_SAMPLES = 4096
@@ -25,11 +26,6 @@ def mis_power(pdf_a, pdf_b):
     """Power heuristic weight (beta = 2) of the strategy with density `pdf_a`; zero where both vanish (Veach 1997, eq. 9.13)."""
     ratio = dr.minimum(pdf_b / pdf_a, 1e18)          # in ratios: squared densities overflow
     return dr.select(pdf_a > 0, dr.rcp(1 + dr.square(ratio)), 0)
-
-
-def luminance_of(spectrum):
-    """Mean over channels or wavelengths: the scalar by which samples are distributed."""
-    return dr.mean(spectrum)
 
 
 class Choice:
@@ -65,7 +61,7 @@ def _mean_power(emitter):
     """Estimated emitted power (channel mean, deterministic), from Mitsuba's own light rays."""
     rng = streams(dr.arange(mi.UInt32, POWER_SAMPLES), mi.UInt32(0x70776572))
     _, weight = emitter.sample_ray(0, rng.next_float32(), next_2d(rng), next_2d(rng))
-    value = dr.mean(luminance_of(weight))[0]
+    value = dr.mean(channel_mean(weight))[0]
     return float(value) if np.isfinite(value) and value > 0 else 0.0
 
 
@@ -222,7 +218,7 @@ class Lights:
         """Light that emitter `index` would bring to `ref` if nothing stood between, from one fixed point on it: `(ds, irradiance)`, a
         `DirectionSample3f` of that point and the irradiance at a surface that faces it, channel mean."""
         ds, weight = self.pointer(index).sample_direction(ref, mi.Point2f(0.5), active)
-        value = dr.mean(weight)
+        value = channel_mean(weight)
         return ds, dr.select(active & dr.isfinite(value), value, 0)
 
     def pdf_direct(self, ref, ds, active):
@@ -296,7 +292,7 @@ class Lights:
             if name == "directionalarea":
                 unreachable |= chosen
         flux = dr.select(active, flux * dr.rcp(probability), 0)
-        return ray, dr.select(dr.isfinite(luminance_of(flux)), flux, 0), unreachable, source
+        return ray, dr.select(dr.isfinite(channel_mean(flux)), flux, 0), unreachable, source
 
     def emission_ratio(self, ref, ds, active):
         """How likely a light sub-path brings the light of `ds` to `ref`, over how likely next-event estimation does: density of
@@ -390,7 +386,7 @@ class Lights:
                 ds.d, ds.dist = dr.select(chosen, sampled.d, ds.d), dr.select(chosen, sampled.dist, ds.dist)
         if self.guide is not None:
             ds.dist = dr.select(self._of_kind(index, "environment", "directional", active=active), dr.inf, ds.dist)
-        return ds, dr.select(dr.isfinite(luminance_of(light)), light, 0)
+        return ds, dr.select(dr.isfinite(channel_mean(light)), light, 0)
 
     @staticmethod
     def _ratio_point(ref, ds, index, active):

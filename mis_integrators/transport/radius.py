@@ -155,8 +155,9 @@ class Choice(NamedTuple):
     """Of one iteration."""
 
 
-def best_radius(radii, plain, corrected, mean, iterations, at_first_vertex=True, alike=False):
-    """The `Choice` that minimises the predicted relative error.
+def best_radius(radii, plain, corrected, mean, iterations, at_first_vertex=True, alike=False, used=None, reluctance=0.0):
+    """The `Choice` that minimises the predicted relative error; `used`, a radius and whether it corrects, if the least error is not below its by more
+    than this share, `reluctance`.
 
     `radii`: the ladder; `plain`, `at_first_vertex`, `alike`: see `noise_and_difference`; `corrected`: the same samples corrected at edges, or `None`;
     `mean`: (pixels,) mean radiance; `iterations(R, corrected)`: how many iterations there will be, so that larger gathers and the correction are
@@ -179,6 +180,9 @@ def best_radius(radii, plain, corrected, mean, iterations, at_first_vertex=True,
         predicted = bias + variance / iterations(fine, way)
         at = int(np.argmin(predicted))
         choices.append((float(predicted[at]), Choice(float(fine[at]), way, float(bias[at]), float(variance[at]))))
+        if used is not None and used[1] == way:
+            at = int(np.argmin(np.abs(np.log(fine / used[0]))))
+            choices.append((float(predicted[at]) * (1 - reluctance), Choice(used[0], way, float(bias[at]), float(variance[at]))))
     return min(choices)[1]
 
 

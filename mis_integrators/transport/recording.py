@@ -1,6 +1,7 @@
 """Frozen passes: a pass is recorded once, and its kernels are launched again without running its Python."""
 
 import contextlib
+import functools
 import gc
 
 import drjit as dr
@@ -21,9 +22,13 @@ def _no_garbage_collection():
 
 
 def recorder():
-    """`frozen`, or what leaves a function as it is in spectral variants: Dr.Jit 1.5 records sensors with a response function wrongly
-    (and leaves them corrupted), and cannot record some spectral textures."""
-    return (lambda function: function) if mi.is_spectral else frozen
+    """What records the passes of one session: `frozen` (garbage is collected once, before the first pass), or what leaves a function as it is in
+    spectral variants: Dr.Jit 1.5 records sensors with a response function wrongly (and leaves them corrupted), and cannot record some
+    spectral textures."""
+    if mi.is_spectral:
+        return lambda function: function
+    tidy = functools.cache(gc.collect)
+    return lambda function: frozen(function, tidy)
 
 
 _anchor = None
@@ -53,27 +58,35 @@ def _anchored(function):
     return call
 
 
-def frozen(function):
+def frozen(function, tidy=gc.collect):
     """`dr.freeze(function)`, safe against garbage collection while it records. It numbers its lanes by `lanes`.
 
     Evaluated arrays that `function` reads must be among its arguments, and numbers that change from call to call must be
     opaque arrays. Nothing inside may read an array's value. Where Dr.Jit refuses to record, the function runs as it is, with the same
-    result and some more Python.
+    result and some more Python. `tidy` is called before the recording: objects of a forgotten scene that the collector has not met yet are
+    still called, but are not among the arguments.
     """
     recorded = dr.freeze(_anchored(function))
     anchor = dr.opaque(mi.UInt32, 0)
     fresh, plain = True, False
+
+    def attempt(args):
+        with _no_garbage_collection():
+            return recorded(anchor, *args)
 
     def call(*args):
         nonlocal fresh, plain
         if plain:
             return function(*args)
         if fresh:
-            gc.collect()          # objects of a forgotten scene are still called, but are not among the arguments
+            tidy()
             fresh = False
         try:
-            with _no_garbage_collection():
-                return recorded(anchor, *args)
+            return attempt(args)
+        except RuntimeError:
+            gc.collect()              # a scene may have been forgotten since
+        try:
+            return attempt(args)
         except RuntimeError as error:
             mi.Log(mi.LogLevel.Debug, f"not recorded: {error.__cause__ or error}")
             plain = True

@@ -5,6 +5,8 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from ..transport.spectra import channel_mean
+
 FAINT = 0.05
 """Transmittance below which the estimate on the way to a light plays roulette."""
 
@@ -31,9 +33,9 @@ def collision(medium, p, majorant, time, wavelengths, active):
     probability of the former. With the probability's mean over the spectrum, one density serves all channels (prbvolpath does the same)."""
     sigma_s, _, sigma_t = medium.get_scattering_coefficients(point_in(medium, p, time, wavelengths), active)
     share = sigma_t * dr.rcp(dr.maximum(majorant, 1e-30))
-    probability = dr.clip(1 - dr.mean(share), 0, 1)
+    probability = dr.clip(1 - channel_mean(share), 0, 1)
     null = dr.select(probability > 0, (1 - share) * dr.rcp(dr.maximum(probability, 1e-30)), 0)
-    total = dr.mean(sigma_t)
+    total = channel_mean(sigma_t)
     return null, dr.select(total > 0, sigma_s * dr.rcp(dr.maximum(total, 1e-30)), 0), probability
 
 

@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..transport.random import streams
+from ..transport.spectra import channel_mean
 from .media import collision, section
 
 NOWHERE, IN_MEDIUM, ON_SURFACE = range(3)
@@ -36,7 +37,7 @@ def passing(bsdf, surface, active):
     """Null transmission of a surface (a spectrum, zero for what does not transmit) and the probability with which paths pass."""
     null = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null)
     value = dr.select(null, bsdf.eval_null_transmission(surface, null), 0)
-    return value, dr.clip(dr.mean(value), 0, 1)
+    return value, dr.clip(channel_mean(value), 0, 1)
 
 
 @dr.syntax
