@@ -52,6 +52,7 @@ class Trial:
     plugin: str
     parameters: dict
     session: object
+    """None once another is chosen."""
     squared_bias: float
     variance: float
     cost: float
@@ -121,6 +122,9 @@ def choose(integrator, scene, sensor, seed, iterations, seconds):
     reasons.insert(0, f"{best.name}: least predicted error in this time; bias {best.squared_bias:.2g}, noise "
                       f"{best.variance * best.cost / budget:.2g} (squared, relative)")
     best.session.iterations_planned = iterations
+    for trial in trials:
+        if trial is not best:
+            trial.session = None                              # its photons' and kernels' memory is free to go
     errors = {trial.name: float(trial.error(budget)) for trial in trials}
     return Decision(best.plugin, best.parameters, best.session, reasons, errors, trials, usual)
 
