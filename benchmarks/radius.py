@@ -88,7 +88,9 @@ def sweep(opened: OpenScene, references: References, bdd: int, times: list[float
     take_turns([*chosen_for_free, *fixed], rendering, tell)
     take_turns([*chosen_for_free, *fixed], 0, tell, FEWEST_ITERATIONS)
     automatic = [law(free, references) for free in chosen_for_free]
-    automatic = [replace(own, set_up=pilot.first - own.seconds) for own, pilot in zip(automatic, pilots)]
+    # A pilot keeps the iterations by which it has measured time: what is left of them after the first is no set-up either.
+    rendered = [1 + len(pilot.session.rehearsed) for pilot in pilots]
+    automatic = [replace(own, set_up=pilot.first - count * own.seconds) for own, pilot, count in zip(automatic, pilots, rendered)]
     return automatic, [law(one, references) for one in fixed]
 
 
