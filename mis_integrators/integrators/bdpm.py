@@ -11,15 +11,13 @@ from ..transport.camera_pass import film_sample_count, trace_camera_paths
 from ..transport.coverage import covered_share
 from ..transport.film import shared_wavelengths, splat_samples
 from ..transport.gather import gather_photons
-from ..transport.guide import EnvironmentGuide, infinite_emitters
 from ..transport.light_pass import trace_light_paths
-from ..transport.lights import Lights
 from ..transport.packing import rounded_up
 from ..transport.photon_map import PhotonMap, build_photon_map, smallest_cell
 from ..transport.random import mix
 from ..transport.recording import recorder
-from ..transport.traits import SceneTraits, lookup
-from .common import IterativeIntegrator, IterativeSession
+from ..transport.traits import lookup
+from .common import IterativeIntegrator, IterativeSession, surveyed
 from .pilot import choose_radii
 
 SPARE_PHOTONS = 1 << 20
@@ -93,6 +91,9 @@ class BDPM(IterativeIntegrator):
             'max_depth': 10
     """
 
+    survey = None
+    """Traits and lights of the scene, where another session knows them already."""
+
     def read_parameters(self, parameters):
         self.read_photon_parameters(parameters)
         self.bdd = parameters.integer("bdd", 1, 0, "at least 0")
@@ -117,9 +118,7 @@ class BDPMSession(IterativeSession):
 
     def __init__(self, integrator, scene, sensor, seed, iterations):
         super().__init__(integrator, scene, sensor, seed, iterations)
-        self.traits = SceneTraits(scene)
-        guide = EnvironmentGuide(scene, sensor) if infinite_emitters(scene) else None
-        self.lights = Lights(scene, integrator.plugin, guide)
+        self.traits, self.lights = integrator.survey or surveyed(scene, sensor, integrator.plugin)
         pixels = film_sample_count(sensor)
         self.light_paths = integrator.photon_count or pixels
         self.path_count = pixels * integrator.camera_paths

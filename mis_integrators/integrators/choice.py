@@ -14,6 +14,7 @@ import numpy as np
 
 from ..transport.census import mean_segments
 from ..transport.radius import relative_weights, usual_mean
+from ..transport.recording import lanes
 from ..transport.spectra import channel_mean
 from . import costs
 from .pilot import FEWEST_ITERATIONS, PILOT_INDEX, UNPLANNED_ITERATIONS, pilot_pixels
@@ -111,7 +112,7 @@ def choose(integrator, scene, sensor, seed, iterations, seconds):
         if spent + FEWEST_ITERATIONS * usual * 0.5 > PILOT_SHARE * budget:
             reasons.append(f"not {name}: trying it would take more than {PILOT_SHARE:.0%} of the time")
             continue
-        session = new_session(plugin, parameters, integrator, scene, sensor, seed, max(int(budget / usual), 1))
+        session = new_session(plugin, parameters, integrator, scene, sensor, seed, max(int(budget / usual), 1), (first.traits, first.lights))
         session.judged_by = forecast.mean
         session.start()
         if session.forecast is None:
@@ -129,11 +130,12 @@ def choose(integrator, scene, sensor, seed, iterations, seconds):
     return Decision(best.plugin, best.parameters, best.session, reasons, errors, trials, usual)
 
 
-def new_session(plugin, parameters, integrator, scene, sensor, seed, iterations):
-    """A session of a candidate, with the parameters of `integrator` that all share."""
+def new_session(plugin, parameters, integrator, scene, sensor, seed, iterations, survey=None):
+    """A session of a candidate, with the parameters of `integrator` that all share; `survey` as in `BDPM`."""
     if plugin == "path":
         return PathSession(integrator, scene, sensor, seed, iterations)
     made = mi.load_dict({"type": plugin, **handed_on(integrator), **parameters})
+    made.survey = survey
     return made.new_session(scene, sensor, seed, iterations)
 
 
@@ -170,11 +172,15 @@ def _pilot_cost(session, segments):
 
 def _try_path(path, segments, stride, pixels, mean):
     """`path` on the pilot's pixels."""
+    passes = PATH_TRIALS if mi.is_spectral else 1            # wavelengths are shared by all that is traced at once
+    together = PATH_TRIALS // passes
+    trial = lanes(together * pixels) // pixels
     values = []
-    for number in range(PATH_TRIALS):
-        number += PILOT_INDEX
-        radiance, *_ = path.trace(number, 0, mi.UInt32(0), stride * path.samples_per_iteration, pixels, path._spectral(number))
-        values.append(np.broadcast_to(np.array(channel_mean(radiance)), pixels))
+    stride *= path.samples_per_iteration
+    first = trial * (-pixels * stride % 2 ** 32)             # back to the first pixel
+    for number in range(PILOT_INDEX, PILOT_INDEX + passes):
+        radiance, *_ = path.trace(number, 0, first, stride, together * pixels, path._spectral(number), trial)
+        values += list(np.broadcast_to(np.array(channel_mean(radiance)), together * pixels).reshape(together, pixels))
     path.sampler.seed(0, 1)
     variance = usual_mean(relative_weights(mean) * np.var(values, axis=0, ddof=1))
     return Trial("path", {}, path, 0.0, variance, costs.cost("path", costs.events(path, segments, None, 0.0)))

@@ -9,9 +9,11 @@ import mitsuba as mi
 import numpy as np
 
 from ..transport.film import Accumulator, variance_channels
+from ..transport.guide import EnvironmentGuide, infinite_emitters
+from ..transport.lights import Lights
 from ..transport.packing import rounded_up
 from ..transport.random import mix
-from ..transport.traits import UnsupportedScene, check_scene, check_variant
+from ..transport.traits import SceneTraits, UnsupportedScene, check_scene, check_variant
 from ..turns import TURN, by_turns
 from .parameters import Parameters
 
@@ -120,6 +122,12 @@ class IterativeIntegrator(mi.AdjointIntegrator):
 
     def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0):
         raise RuntimeError(f"{self.plugin}: gradients are not supported; use Mitsuba's prb")
+
+
+def surveyed(scene, sensor, plugin):
+    """Traits and lights of the scene as the sensor sees it; `plugin` is named in errors."""
+    guide = EnvironmentGuide(scene, sensor) if infinite_emitters(scene) else None
+    return SceneTraits(scene), Lights(scene, plugin, guide)
 
 
 class IterativeSession:

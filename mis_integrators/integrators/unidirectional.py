@@ -32,9 +32,10 @@ class PathSession(IterativeSession):
     def settings(self):
         return {**super().settings, "integrator": "path"}
 
-    def trace(self, iteration, chunk, first, stride, paths, spectral):
-        """Radiance and alpha of camera paths `first`, `first + stride`, ..., and their positions on the film."""
-        seed = self._seed(iteration, PATHS)
+    def trace(self, iteration, chunk, first, stride, paths, spectral, variation=0):
+        """Radiance and alpha of camera paths `first`, `first + stride`, ..., and their positions on the film. Where `first` and `variation` are
+        arrays, each lane has its own, and the paths of one number differ with the variation."""
+        seed = self._seed(iteration, PATHS) + variation
         _, active, _, ray, weight, position, _ = start_camera_paths(
             self.sensor, seed, first, stride, paths, self.integrator.camera_paths, spectral["sample"])
         differential = mi.RayDifferential3f(ray)
