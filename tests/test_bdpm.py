@@ -1,5 +1,6 @@
 """Behaviour of the plugin `bdpm`: strategies, seeds, films, limits, and errors."""
 
+import gc
 import sys
 
 import drjit as dr
@@ -580,3 +581,53 @@ def test_alpha_at_the_last_depth(rgb, max_depth):
         ours, theirs = (np.array(mi.render(scene, integrator=mi.load_dict({"type": kind, "max_depth": max_depth}), spp=256))[:, :, 3]
                         for kind in ("bdpm", "path"))
         assert abs(ours.mean() - theirs.mean()) < 0.01
+
+
+# --- Set-up ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("changed", [False, True], ids=["kept", "changed"])
+def test_timed_iterations_are_of_the_radii_rendered_with(rgb, monkeypatch, changed):
+    """Iterations by which a pilot measures time belong to the image, unless the time they took changes the radii."""
+    from mis_integrators.integrators.pilot import Pilot
+
+    scene, decisions = box_scene(), []
+    decide = Pilot.decide
+
+    def decide_again(pilot, count, reluctance=None):
+        choices = decide(pilot, count, 1.0 if reluctance is not None else None)
+        if changed and decisions:
+            pilot.session.radii = {kind: 1.5 * radius for kind, radius in pilot.session.radii.items()}
+        decisions.append(count)
+        return choices
+
+    monkeypatch.setattr(Pilot, "decide", decide_again)
+    timed, same = (bdpm(bdd=0, initial_radius=0.0, photon_count=3000).session(scene, seed=4) for _ in range(2))
+    timed.plan_time(2.0)
+    timed.start()
+    assert len(decisions) == 2 and bool(timed.rehearsed) != changed
+    same.recall(timed.learned)
+    for session in (timed, same):
+        for _ in range(3):
+            session.iterate()
+    np.testing.assert_allclose(timed.image(), same.image(), rtol=1e-4, atol=1e-5)
+    assert not timed.rehearsed
+
+
+def kernels(integrator, scene, seed):
+    """What a short render launches: hashes of its kernels."""
+    session = integrator.session(scene, seed=seed)
+    dr.kernel_history_clear()
+    for _ in range(2):
+        session.iterate()
+    return {entry["hash"] for entry in dr.kernel_history() if "hash" in entry}
+
+
+@pytest.mark.parametrize("plugin", ["bdpm", "bdpm_opt2"])
+def test_no_seed_has_kernels_of_its_own(rgb, plugin):
+    """Numbers that depend on chance are not literals: seconds of compiling would come again with each seed."""
+    gc.collect()                                 # kernels know all the scenes that there are
+    scene, integrator = glossy_box(), mi.load_dict({"type": plugin, "photon_count": 3000})
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        first, second, third = (kernels(integrator, scene, seed) for seed in (1, 2, 3))
+    assert first and second <= first and third <= first

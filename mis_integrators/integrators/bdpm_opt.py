@@ -165,9 +165,9 @@ class BDPMOptSession(WeightedSession):
 
     def merging(self, radii):
         cache = self.cache
-        inverse = [self.light_paths / flux if flux > 0 else 0.0 for flux in cache.photon_flux]
+        inverse = [dr.opaque(mi.Float, self.light_paths / flux if flux > 0 else 0.0) for flux in cache.photon_flux]      # no kernel's literals
         radius = radii.get("indirect", radii.get("caustic"))
-        dearer = sum(cache.caustic_flux) / max(sum(cache.photon_flux), 1e-30)
+        dearer = dr.opaque(mi.Float, sum(cache.caustic_flux) / max(sum(cache.photon_flux), 1e-30))
         return {"n": dr.pi * dr.square(radius) * mi.Spectrum(inverse if len(inverse) > 1 else inverse[0]),
                 "caustic_cost": dearer * dr.square(radius / radii.get("caustic", radius))}
 

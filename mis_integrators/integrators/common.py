@@ -13,6 +13,7 @@ from ..transport.guide import EnvironmentGuide, infinite_emitters
 from ..transport.lights import Lights
 from ..transport.packing import rounded_up
 from ..transport.random import mix
+from ..transport.recording import settle
 from ..transport.traits import SceneTraits, UnsupportedScene, check_scene, check_variant
 from ..turns import TURN, by_turns
 from .parameters import Parameters
@@ -143,6 +144,7 @@ class IterativeSession:
         self.samples_per_iteration = integrator.camera_paths
         self.accumulator = Accumulator(integrator.variance)
         self.variant = mi.variant()
+        settle(scene)
 
     @property
     def sums(self):

@@ -93,3 +93,10 @@ def frozen(function, tidy=gc.collect):
             return function(*args)        # raises again what is not the recording's fault
 
     return call
+
+
+def settle(scene):
+    """Evaluates what a scene's plugins have left unevaluated (`plastic` its sampling weight). A recording does so anyway; done before, the kernels
+    of a process's first session are those of the later ones."""
+    if not mi.is_spectral:
+        frozen(lambda scene, number: number + 1, tidy=lambda: None)(scene, dr.opaque(mi.UInt32, 0))
