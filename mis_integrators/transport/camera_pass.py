@@ -8,6 +8,7 @@ import mitsuba as mi
 from .lights import mis_power
 from .packing import Store
 from .random import next_2d, streams
+from .roulette import russian_roulette
 
 
 def film_samples(sensor, index, camera_paths: int, rng):
@@ -227,12 +228,7 @@ def trace_camera_paths(scene, sensor, integrator, lights, traits, seed, first, s
         scatter_pdf[scattered] = bs.pdf
         vertex[scattered] = dr.select(ends, mi.UInt32(bdd), vertex) + 1
         behind_delta = mi.Bool(delta)
-        strength = dr.max(throughput)
-        active &= strength > 0
-        survival = dr.minimum(strength * dr.square(eta), 0.95)
-        roulette = active & (depth >= rr_depth)
-        active &= ~roulette | (rng.next_float32(roulette) < survival)
-        throughput = dr.select(roulette, throughput * dr.rcp(survival), throughput)
+        throughput, active = russian_roulette(rng, throughput, dr.max(throughput), eta, depth >= rr_depth, active)
         hit = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
 
     alpha = dr.select(visible, mi.Float(1), mi.Float(0))

@@ -14,6 +14,7 @@ from .lenses import Lens
 from .packing import Store
 from .random import next_2d
 from .records import Layout
+from .roulette import russian_roulette
 from .subpaths import NO_PARENT, keep_vertex, new_vertices, vertex_layout
 
 STEP = ("near", "geometry", "forward", "back", "scattered", "row")
@@ -156,12 +157,7 @@ def trace_camera_vertices(scene, sensor, integrator, lights, traits, soften, see
         throughput *= weight
         eta *= bs.eta
         ray = si.spawn_ray(wo)
-        strength = dr.max(throughput)
-        active &= strength > 0
-        survival = dr.minimum(strength * dr.square(eta), 0.95)
-        roulette = active & (depth >= rr_depth)
-        active &= ~roulette | (rng.next_float32(roulette) < survival)
-        throughput = dr.select(roulette, throughput * dr.rcp(survival), throughput)
+        throughput, active = russian_roulette(rng, throughput, dr.max(throughput), eta, depth >= rr_depth, active)
         hit = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
 
     alpha = dr.select(visible, mi.Float(1), mi.Float(0))

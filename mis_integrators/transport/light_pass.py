@@ -7,6 +7,7 @@ import mitsuba as mi
 
 from .packing import Store, float_bits, pack_direction, pack_surface
 from .random import next_2d, streams
+from .roulette import russian_roulette
 from .traits import lookup
 
 
@@ -183,13 +184,7 @@ def trace_light_paths(scene, lights, traits, seed, n_paths: int, capacity: int, 
         eta *= bs.eta
         ray = si.spawn_ray(wo)
 
-        # ---- Russian roulette
-        relative = dr.max(flux) * strength
-        active &= relative > 0
-        survival = dr.minimum(relative * dr.square(eta), 0.95)
-        roulette = active & (depth >= rr_depth)
-        active &= ~roulette | (rng.next_float32(roulette) < survival)
-        flux = dr.select(roulette, flux * dr.rcp(survival), flux)
+        flux, active = russian_roulette(rng, flux, dr.max(flux) * strength, eta, depth >= rr_depth, active)
 
     if dr.hint(notebook is not None, mode='scalar'):
         return store.surface, store.power, store.count, store.notes

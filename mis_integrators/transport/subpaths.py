@@ -32,6 +32,7 @@ from .light_pass import PATHS_PER_LANE, scatter_light
 from .packing import Store
 from .random import next_2d, streams
 from .records import Layout
+from .roulette import russian_roulette
 
 NO_PARENT = 0xffffffff
 STATES = ("near", "far")
@@ -174,13 +175,7 @@ def trace_light_subpaths(scene, lights, traits, weights, seed, n_paths: int, cap
         eta *= bs.eta
         ray = si.spawn_ray(wo)
 
-        # ---- Russian roulette
-        relative = dr.max(flux) * strength
-        active &= relative > 0
-        survival = dr.minimum(relative * dr.square(eta), 0.95)
-        roulette = active & (depth >= rr_depth)
-        active &= ~roulette | (rng.next_float32(roulette) < survival)
-        flux = dr.select(roulette, flux * dr.rcp(survival), flux)
+        flux, active = russian_roulette(rng, flux, dr.max(flux) * strength, eta, depth >= rr_depth, active)
 
     return store.vertices, store.count, store.lengths
 
@@ -291,12 +286,7 @@ def trace_camera_subpaths(scene, sensor, integrator, lights, traits, weights, se
         throughput *= weight
         eta *= bs.eta
         ray = si.spawn_ray(wo)
-        strength = dr.max(throughput)
-        active &= strength > 0
-        survival = dr.minimum(strength * dr.square(eta), 0.95)
-        roulette = active & (depth >= rr_depth)
-        active &= ~roulette | (rng.next_float32(roulette) < survival)
-        throughput = dr.select(roulette, throughput * dr.rcp(survival), throughput)
+        throughput, active = russian_roulette(rng, throughput, dr.max(throughput), eta, depth >= rr_depth, active)
         hit = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
 
     return radiance, dr.select(visible, mi.Float(1), mi.Float(0)), splat, store.vertices, store.count
