@@ -19,23 +19,9 @@ class BDPMAuto(IterativeIntegrator):
 
     .. pluginparameters::
 
-     * - camera_paths
-       - |int|
-       - Camera paths per pixel and iteration. (Default: 1)
-     * - variance
-       - |bool|
-       - Adds the channels ``var.R``, ``var.G``, ``var.B`` (mono: ``var.Y``): the estimated variance of the pixel mean over the
-         iterations, of which there must be two at least. (Default: no, i.e. |false|)
-     * - max_depth
-       - |int|
-       - Longest path in segments, both halves together (-1: unlimited). A value of 1 shows only directly visible emitters, 2 adds
-         direct light, and so on. (Default: -1)
-     * - rr_depth
-       - |int|
-       - Depth from which Russian roulette may end a sub-path, in each half. (Default: 5)
-     * - hide_emitters
-       - |bool|
-       - Hide directly visible emitters. (Default: no, i.e. |false|)
+     * - camera_paths, variance, max_depth, rr_depth, hide_emitters
+       -
+       - As of :monosp:`bdpm`.
 
     Chooses among ``path``, ``bdpm`` and ``bdpm_opt`` with two or three strategies: those that can see all the light of the scene are tried on a few
     thousand pixels for a few iterations, and the one of which the least error is expected in the time that is planned renders the image. What an
