@@ -73,6 +73,11 @@ class AutoSession(IterativeSession):
                 **{f"choice.because.{number}": reason for number, reason in enumerate(self.decision.reasons, 1)},
                 **{f"choice.relmse.{name}": error for name, error in self.decision.errors.items()}}
 
+    @property
+    def remarks(self):
+        """Why what renders was chosen, line by line."""
+        return [f"{self.integrator.plugin}: {reason}" for reason in self.decision.reasons] if self.decision else []
+
     def start(self):
         if self.decision is None:
             self.decision = choose(self.integrator, self.scene, self.sensor, self.seed, self.iterations_planned, self.seconds)
