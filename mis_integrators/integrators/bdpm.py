@@ -118,11 +118,8 @@ class BDPMSession(IterativeSession):
         self.traits = SceneTraits(scene)
         guide = EnvironmentGuide(scene, sensor) if infinite_emitters(scene) else None
         self.lights = Lights(scene, integrator.plugin, guide)
-        pixels = film_sample_count(sensor)
-        self.light_paths = integrator.photon_count or pixels
-        self.path_count = pixels * integrator.camera_paths
-        self.chunks = -(-self.path_count // CAMERA_CHUNK)
-        self.chunk = -(-self.path_count // self.chunks)
+        self.split_paths(CAMERA_CHUNK)
+        self.light_paths = integrator.photon_count or film_sample_count(sensor)
         depth = integrator.max_depth
         unreachable = self.lights.needs_photons_for_direct_light()
         self.has_caustics = not self.lights.dark and ((unreachable and (depth < 0 or depth >= 2)) or
@@ -236,8 +233,7 @@ class BDPMSession(IterativeSession):
             radiance += self._per_path(gathered, vertices, self.chunk)
         if self.integrator.hide_emitters:
             radiance = dr.select(alpha > 0, radiance, 0)       # as `path` does: what is behind nothing but null surfaces is hidden
-        active = dr.arange(mi.UInt32, self.chunk) + first < self.path_count
-        return splat_samples(sensor.film(), position, radiance, alpha, spectral["matrix"], active), count
+        return splat_samples(sensor.film(), position, radiance, alpha, spectral["matrix"], self.in_chunk(first)), count
 
     def _spectral(self, iteration):
         """The wavelengths that all sub-paths of an iteration share, the sample that makes them, and their conversion to colour."""
@@ -281,19 +277,19 @@ class BDPMSession(IterativeSession):
         radii = self.radii_at(iteration)
         spectral = self._spectral(iteration)
         maps = self._map_pass(self._photons(iteration, spectral), radii) if radii else None
-        total = None
-        for chunk in range(self.chunks):
+
+        def render(chunk, first):
             while True:
-                first = dr.opaque(mi.UInt32, chunk * self.chunk)
                 block, count = self._camera_pass(self.scene, self.sensor, self._tables, maps, self._seed(iteration, CAMERA), first,
                                                  spectral, radii)
                 wanted = 0 if self.one_vertex else int(dr.max(count)[0])
                 if wanted <= self.vertex_capacity or not radii:
-                    break
+                    return (block,)
                 self.vertex_capacity = rounded_up(wanted + wanted // 8)
                 self._freeze()
-            total = block if total is None else total + block
-        return total
+
+        (block,) = self.sum_of_chunks(render)
+        return block
 
 
 LIGHT, CAMERA, WAVELENGTH = range(3)

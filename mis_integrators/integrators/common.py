@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..transport.camera_pass import film_sample_count
 from ..transport.film import Accumulator, variance_channels
 from ..transport.packing import rounded_up
 from ..transport.random import mix
@@ -180,6 +181,24 @@ class IterativeSession:
             self._run(self.sums.done.first_missing if iteration is None else iteration)
             dr.eval(self.sums.tensors)
             dr.sync_thread()
+
+    def split_paths(self, largest):
+        """Splits the `path_count` camera paths of an iteration into `chunks` parts of `chunk` paths, at most `largest` each: that bounds memory."""
+        self.path_count = film_sample_count(self.sensor) * self.integrator.camera_paths
+        self.chunks = -(-self.path_count // largest)
+        self.chunk = -(-self.path_count // self.chunks)
+
+    def sum_of_chunks(self, render):
+        """What `render(chunk, first)` returns, a tuple of tensors or `None`s, summed over all parts; `first`: the number of the part's first path."""
+        total = None
+        for chunk in range(self.chunks):
+            blocks = render(chunk, dr.opaque(mi.UInt32, chunk * self.chunk))
+            total = blocks if total is None else tuple(None if a is None else a + b for a, b in zip(total, blocks))
+        return total
+
+    def in_chunk(self, first):
+        """Which of `chunk` paths from number `first` on there are: the last part may have fewer."""
+        return dr.arange(mi.UInt32, self.chunk) + first < self.path_count
 
     def _run(self, iteration):
         """Adds an iteration to the sums."""
