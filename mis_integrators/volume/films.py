@@ -83,8 +83,10 @@ class ViewAccumulator:
     def add(self, shared, own, iteration):
         """Adds the layers of an iteration, tensors (height, width, `SHARED`) and (height, width, `OWN`)."""
         self.sums.add("own", own)
-        for parity in range(2):
-            self.sums.add(f"shared{parity}", shared if iteration % 2 == parity else dr.zeros(mi.TensorXd, shared.shape))
+        same, other = (f"shared{(iteration + step) % 2}" for step in range(2))
+        self.sums.add(same, shared)
+        if other not in self.sums.tensors:
+            self.sums.add(other, dr.zeros(mi.TensorXd, shared.shape))
         if self.with_variance:
             colour, weight = (mi.TensorXd(channels) for channels in (shared[:, :, :3], shared[:, :, 3:]))
             self.sums.add("square", colour * colour)
