@@ -27,9 +27,9 @@ class BDPMAuto(IterativeIntegrator):
     thousand pixels for a few iterations, and the one of which the least error is expected in the time that is planned renders the image. What an
     iteration costs is counted (segments, photons) and priced, not clocked. Scenes with media are rendered by ``volpath_multiview``.
 
-    The settings of the image (in the EXR's header) say which integrator was chosen and why, with the predictions; ``mis-render`` prints the reasons, too.
-    Without a time limit, the same seed and number of samples make the same choice and image again. ``bdpm`` with ``bdd`` 0, if chosen, makes the same
-    image by itself. The others' merge radii are judged by the image that this first candidate's pilot saw, so that by themselves they may find
+    The settings of the image (in the EXR's header) say which integrator was chosen and why, with the predictions; ``mis-render`` prints the reasons,
+    too. Without a time limit, the same seed and number of samples make the same choice and image again. ``bdpm`` with ``bdd`` 0, if chosen, makes the
+    same image by itself. The others' merge radii are judged by the image that this first candidate's pilot saw, so that by themselves they may find
     different ones. ``path`` draws the random numbers of this package, not those of Mitsuba: the same mean, other noise.
 
     .. tabs::
