@@ -10,7 +10,7 @@ pixels, so that the noise in the divisor and that in the products hardly correla
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Sequence
 
 import numpy as np
@@ -86,12 +86,6 @@ def errors(image: np.ndarray, references: References) -> Errors:
         mape=mape(image, references),
         mean_ratio=float(image.astype(np.float64).mean() / max(float(references.mean.mean()), 1e-30)),
     )
-
-
-def mean_errors(images: Sequence[np.ndarray], references: References) -> Errors:
-    """Mean errors of renders under different seeds."""
-    several = [errors(image, references) for image in images]
-    return Errors(*(float(np.mean([getattr(e, f.name) for e in several])) for f in fields(Errors)))
 
 
 def mape(image: np.ndarray, references: References) -> float:

@@ -264,7 +264,7 @@ class Lights:
 
     # ------------------------------------------------------------------ light sub-paths
 
-    def sample_emission(self, rng, time, wavelengths, active=True):
+    def sample_emission(self, rng, time, wavelengths):
         """Starts a light sub-path.
 
         Returns `(ray, flux, unreachable, source)`: the ray, the flux it carries (emitted radiance times cosine over all densities,
@@ -295,7 +295,7 @@ class Lights:
             flux = dr.select(chosen, value, flux)
             if name == "directionalarea":
                 unreachable |= chosen
-        flux = dr.select(active, flux * dr.rcp(probability), 0)
+        flux *= dr.rcp(probability)
         return ray, dr.select(dr.isfinite(luminance_of(flux)), flux, 0), unreachable, source
 
     def emission_ratio(self, ref, ds, active):
