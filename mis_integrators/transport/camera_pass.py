@@ -38,6 +38,14 @@ def film_sample_count(sensor):
     return (int(size[0]) + border) * (int(size[1]) + border)
 
 
+def within_crop(film, splat):
+    """Whether positions for splatting lie in the crop window, and not in a border that the film samples besides."""
+    if not film.sample_border():
+        return mi.Bool(True)
+    offset, size = mi.ScalarVector2f(film.crop_offset()), mi.ScalarVector2f(film.crop_size())
+    return dr.all((splat >= offset) & (splat < offset + size))
+
+
 def start_camera_paths(sensor, seed, first, stride: int, n_paths: int, camera_paths: int, wavelength_sample):
     """Camera rays of `n_paths` paths, numbers `first`, `first + stride`, ... of `film_samples`.
 

@@ -25,7 +25,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from .camera_pass import behind_emitters, start_camera_paths
+from .camera_pass import behind_emitters, start_camera_paths, within_crop
 from .junctions import Junction, scattered_mean
 from .lenses import Lens
 from .light_pass import PATHS_PER_LANE, scatter_light
@@ -192,11 +192,7 @@ def trace_camera_subpaths(scene, sensor, integrator, lights, traits, weights, se
     """
     path, active, rng, ray, sensor_weight, splat, aperture = start_camera_paths(sensor, seed, first, 1, n_paths, camera_paths, wavelength_sample)
     lens = Lens(sensor)
-    film = sensor.film()
-    offset, size = mi.ScalarVector2f(film.crop_offset()), mi.ScalarVector2f(film.crop_size())
-    inside = mi.Bool(True)
-    if dr.hint(film.sample_border(), mode='scalar'):
-        inside = dr.all((splat >= offset) & (splat < offset + size))
+    inside = within_crop(sensor.film(), splat)
     throughput = mi.Spectrum(sensor_weight)
     radiance = mi.Spectrum(0)
     depth = mi.UInt32(0)
