@@ -19,6 +19,7 @@ from ..transport.recording import recorder
 from ..transport.traits import SceneTraits, lookup
 from .common import IterativeIntegrator, IterativeSession
 from .pilot import choose_radii
+from .schedule import read_radius, shrunk
 
 SPARE_PHOTONS = 1 << 20
 """Unused room beyond half of a photon buffer that is worth the time to record the passes anew."""
@@ -98,9 +99,7 @@ class BDPM(IterativeIntegrator):
     def read_photon_parameters(self, parameters):
         """Reads what concerns the photon map."""
         self.photon_count = parameters.integer("photon_count", 0, 0, "at least 0 (0: as many as pixels)", high=2 ** 31)
-        self.initial_radius = parameters.number("initial_radius", 0.0, lambda r: 0 <= r < float("inf"),
-                                                "finite and at least 0 (0: automatic)")
-        self.alpha = parameters.number("alpha", 1.0, lambda a: 0 < a <= 1, "in (0, 1]")
+        self.initial_radius, self.alpha = read_radius(parameters)
 
     def settings(self):
         return {**super().settings(), "photon_count": self.photon_count, "initial_radius": self.initial_radius,
@@ -157,9 +156,8 @@ class BDPMSession(IterativeSession):
         return [kind for kind, needed in (("caustic", self.has_caustics), ("indirect", self.has_indirect)) if needed]
 
     def radii_at(self, iteration):
-        """Merge radius of each kind of photon: R_i^2 = R_0^2 (i + 1)^(alpha - 1), a schedule of the iteration's index alone."""
-        shrink = (iteration + 1) ** (0.5 * (self.integrator.alpha - 1))
-        return {kind: dr.opaque(mi.Float, radius * shrink) for kind, radius in self.radii.items()}
+        """Merge radius of each kind of photon."""
+        return {kind: dr.opaque(mi.Float, shrunk(radius, self.integrator.alpha, iteration)) for kind, radius in self.radii.items()}
 
     def _vertex_room(self, paths):
         if not self.kinds():
