@@ -270,10 +270,7 @@ class BDPTSession(IterativeSession):
         return block
 
     def fill_film(self):
-        film = self.sensor.film()
-        film.clear()
-        film.prepare(self.integrator.aov_names())
-        self.accumulator.put(film, self.integrator.variance, self.sums.tensors.get("techniques"))
+        self.accumulator.put(self._emptied(self.sensor.film()), self.integrator.variance, self.sums.tensors.get("techniques"))
 
 
 LIGHT, CAMERA, WAVELENGTH, APERTURE, THIN = range(5)

@@ -219,10 +219,13 @@ class IterativeSession:
 
     def fill_film(self):
         """Hands what has been rendered so far to the sensor's film, ready to develop."""
-        film = self.sensor.film()
+        self.accumulator.put(self._emptied(self.sensor.film()), self.integrator.variance)
+
+    def _emptied(self, film):
+        """The film, empty, with all channels."""
         film.clear()
         film.prepare(self.integrator.aov_names())
-        self.accumulator.put(film, self.integrator.variance)
+        return film
 
     @by_turns
     def image(self):
@@ -236,10 +239,7 @@ class IterativeSession:
     @by_turns
     def channels(self):
         """Channel names of `image()`."""
-        film = self.sensor.film()
-        film.clear()
-        film.prepare(self.integrator.aov_names())
-        return [field.name for field in film.bitmap().struct_()]
+        return [field.name for field in self._emptied(self.sensor.film()).bitmap().struct_()]
 
 
 def scalar_seed(seed):

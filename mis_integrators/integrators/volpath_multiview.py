@@ -319,9 +319,7 @@ class MultiViewSession(IterativeSession):
 
     def _fill(self, film, pictures):
         """Writes pictures side by side into a film."""
-        film.clear()
-        film.prepare(self.integrator.aov_names())
-        write_film(film, pictures[0] if len(pictures) == 1 else dr.concat(pictures, axis=1))
+        write_film(self._emptied(film), pictures[0] if len(pictures) == 1 else dr.concat(pictures, axis=1))
         return film
 
     def fill_film(self):
