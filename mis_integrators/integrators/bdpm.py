@@ -9,7 +9,6 @@ from ..transport.camera_pass import film_sample_count, trace_camera_paths
 from ..transport.coverage import covered_share
 from ..transport.film import shared_wavelengths, splat_samples
 from ..transport.gather import gather_photons
-from ..transport.guide import EnvironmentGuide, infinite_emitters
 from ..transport.light_pass import trace_light_paths
 from ..transport.lights import Lights
 from ..transport.packing import rounded_up
@@ -115,8 +114,7 @@ class BDPMSession(IterativeSession):
     def __init__(self, integrator, scene, sensor, seed, iterations):
         super().__init__(integrator, scene, sensor, seed, iterations)
         self.traits = SceneTraits(scene)
-        guide = EnvironmentGuide(scene, sensor) if infinite_emitters(scene) else None
-        self.lights = Lights(scene, integrator.plugin, guide)
+        self.lights = Lights.seen_by(scene, sensor, integrator.plugin)
         self.split_paths(CAMERA_CHUNK)
         self.light_paths = integrator.photon_count or film_sample_count(sensor)
         depth = integrator.max_depth

@@ -10,7 +10,6 @@ import mitsuba as mi
 from ..transport.connections import by_path, join, join_sensor, list_pairs, visible
 from ..transport.film import (as_camera_weights, colour_channels, expected_weight, shared_wavelengths, splat_channels, splat_samples,
                               with_colour)
-from ..transport.guide import EnvironmentGuide, infinite_emitters
 from ..transport.lenses import Lens
 from ..transport.lights import Lights
 from ..transport.packing import rounded_up
@@ -117,8 +116,7 @@ class BDPTSession(IterativeSession):
     def __init__(self, integrator, scene, sensor, seed, iterations):
         super().__init__(integrator, scene, sensor, seed, iterations)
         self.traits = SceneTraits(scene)
-        guide = EnvironmentGuide(scene, sensor) if infinite_emitters(scene) else None
-        self.lights = Lights(scene, integrator.plugin, guide)
+        self.lights = Lights.seen_by(scene, sensor, integrator.plugin)
         self.split_paths(CHUNK)
         self.light_chunk = self.light_count()
         self.light_paths = self.chunks * self.light_chunk

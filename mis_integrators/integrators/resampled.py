@@ -12,7 +12,6 @@ from ..transport.cache_points import CacheGrid
 from ..transport.camera_vertices import STEP, hit_layout, sum_before, trace_camera_vertices
 from ..transport.connections import join_sensor
 from ..transport.film import as_camera_weights, colour_channels, expected_weight, shared_wavelengths, splat_channels, splat_samples, with_colour
-from ..transport.guide import EnvironmentGuide, infinite_emitters
 from ..transport.junctions import scattered_mean
 from ..transport.lenses import Lens
 from ..transport.light_ends import END, LightEnds, list_ends
@@ -68,8 +67,7 @@ class ResampledSession(IterativeSession):
     def __init__(self, integrator, scene, sensor, seed, iterations):
         super().__init__(integrator, scene, sensor, seed, iterations)
         self.traits = SceneTraits(scene)
-        guide = EnvironmentGuide(scene, sensor) if infinite_emitters(scene) else None
-        self.lights = Lights(scene, integrator.plugin, guide)
+        self.lights = Lights.seen_by(scene, sensor, integrator.plugin)
         self.split_paths(CHUNK)
         self.light_chunk = max(self.chunk, integrator.light_paths)
         width, height = sensor.film().crop_size()

@@ -12,7 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .guide import direction_cell
+from .guide import EnvironmentGuide, direction_cell, infinite_emitters
 from .random import next_2d, streams
 from .traits import UnsupportedScene, lookup, registry_table
 
@@ -103,6 +103,11 @@ class Lights:
         self.kind_table = mi.UInt32([_KINDS.index(k) for k in self.kinds])
         self._spot_tables(self.emitters)
         self._sphere_tables(self.emitters)
+
+    @classmethod
+    def seen_by(cls, scene, sensor, plugin):
+        """The lights of a scene; its environments, if any, send their light sub-paths where `sensor` will see something of them."""
+        return cls(scene, plugin, EnvironmentGuide(scene, sensor) if infinite_emitters(scene) else None)
 
     @property
     def dark(self):
