@@ -23,6 +23,11 @@ PATHS_PER_LANE = 8
 of waiting for the longest path beside it. (A GPU needs the paths side by side.)"""
 
 
+def lane_count(n_paths):
+    """Lanes that trace so many light sub-paths."""
+    return -(-n_paths // PATHS_PER_LANE) if dr.backend_v(mi.Float) == dr.JitBackend.LLVM else n_paths
+
+
 def delta_adjoint(wi, wo, eta):
     """Ratio of the cosines of `wi` and `wo` to the normal at which a delta function scattered, which a bump or normal map keeps to
     itself: it lies along wi + eta wo (reflection: eta = 1). One where nothing was deflected."""
@@ -100,9 +105,7 @@ def trace_light_paths(scene, lights, traits, seed, n_paths: int, capacity: int, 
     next-event estimation could bring the same light there, from the point `source` (a `DirectionSample3f` as `sample_emission` makes it). The
     result then has a fourth array, these words.
     """
-    lanes = n_paths
-    if dr.hint(dr.backend_v(mi.Float) == dr.JitBackend.LLVM, mode='scalar'):
-        lanes = -(-n_paths // PATHS_PER_LANE)
+    lanes = lane_count(n_paths)
     lane = dr.arange(mi.UInt32, lanes)
     rng = streams(lane, seed)
     words = photon_words()

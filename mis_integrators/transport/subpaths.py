@@ -28,7 +28,7 @@ import mitsuba as mi
 from .camera_pass import behind_emitters, start_camera_paths, within_crop
 from .junctions import Junction, scattered_mean
 from .lenses import Lens
-from .light_pass import PATHS_PER_LANE, scatter_light
+from .light_pass import lane_count, scatter_light
 from .packing import Store
 from .random import next_2d, streams
 from .records import Layout
@@ -105,9 +105,7 @@ def trace_light_subpaths(scene, lights, traits, weights, seed, n_paths: int, cap
     Returns `(vertices, count, lengths)`: the kept vertices, how many there were (width one; more than `capacity`: the surplus is missing), and the
     number of kept vertices of each path. `throughput` is flux through the surface, for one sub-path.
     """
-    lanes = n_paths
-    if dr.hint(dr.backend_v(mi.Float) == dr.JitBackend.LLVM, mode='scalar'):
-        lanes = -(-n_paths // PATHS_PER_LANE)
+    lanes = lane_count(n_paths)
     lane = dr.arange(mi.UInt32, lanes)
     rng = streams(lane, seed)
     store = Store(vertices=new_vertices(traits, capacity, weights.states), count=dr.zeros(mi.UInt32, 1), lengths=dr.zeros(mi.UInt32, n_paths))
