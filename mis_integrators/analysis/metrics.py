@@ -91,7 +91,8 @@ def errors(image: np.ndarray, references: References) -> Errors:
 
 
 def relative_differences(image: np.ndarray, references: References) -> np.ndarray:
-    """(x - r) / (r + 0.1) of each pixel and channel, (H, W, 3); r the references' mean and 0.1 the root of `RELATIVE_OFFSET`; includes the noise of r."""
+    """(x - r) / (r + 0.1) of each pixel and channel, (H, W, 3), r the references' mean and 0.1 the root of `RELATIVE_OFFSET`; includes the
+    noise of r."""
     return (image.astype(np.float64) - references.mean) / (np.abs(references.level()) + RELATIVE_OFFSET ** 0.5)
 
 
