@@ -14,12 +14,13 @@ import mitsuba as mi
 import numpy as np
 
 from mis_integrators.integrators import costs
+from mis_integrators.integrators.choice import PHOTON_MAPPERS, name_of
 from mis_integrators.integrators.unidirectional import PathSession
 from mis_integrators.transport.census import mean_segments
 from reports import show, tell
 from scene_files import open_scene, scaled_size
 
-METHODS = (("path", {}), ("bdpm", {"bdd": 0}), ("bdpm", {"bdd": 1}), ("bdpm_opt2", {}), ("bdpm_opt3", {}))
+METHODS = (("path", {}), *PHOTON_MAPPERS)
 RADII = (1.0, 2.0)
 """Multiples of the automatic radius, so that the price of a gathered photon shows."""
 ITERATIONS, SKIPPED = 8, 2
@@ -38,7 +39,7 @@ def run(options: argparse.Namespace) -> None:
         own = [row for row in rows if row["plugin"] == plugin]
         prices[plugin] = fit(own)
         for row in own:
-            predicted = sum(prices[plugin][name] * count for name, count in zip(costs.EVENTS, row["events"]))
+            predicted = costs.cost(plugin, row["events"], prices)
             table.append({"scene": row["scene"], "method": row["method"], "cost": row["cost"], "predicted / cost": predicted / row["cost"]})
     show("Cost of an iteration, in segments of path a pixel", table, ("scene", "method", "cost", "predicted / cost"))
     TARGET.write_text(json.dumps({plugin: {name: round(value, 5) for name, value in price.items()} for plugin, price in prices.items()}, indent=1)
@@ -67,7 +68,7 @@ def measured(opened) -> list[dict]:
             session.radii = {kind: radius * factor for kind, radius in pilot.radii.items()}
             session.iterate()
             counted = costs.events(session, segments, session.last_vertex, pilot.forecast.gathered * factor ** 2)
-            sessions.append((plugin, f"{plugin} {parameters or ''} x {factor:g}", session, counted))
+            sessions.append((plugin, f"{name_of(plugin, parameters)} x {factor:g}", session, counted))
     seconds = {label: [] for _, label, _, _ in sessions}
     for _ in range(ITERATIONS):
         for _, label, session, _ in sessions:

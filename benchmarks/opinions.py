@@ -10,13 +10,11 @@ import numpy as np
 import stability
 from methods import Method, registered
 from measuring import measure
-from mis_integrators.analysis.metrics import References
+from mis_integrators.analysis.metrics import BLOCKS, References, block_means
 from references import are_there, find_references, recipe
 from reports import Row, console, save, show, tell
 from scene_files import OpenScene, open_scene, scaled_size
 
-BLOCKS = 8
-"""Blocks a side whose means are compared."""
 ALLOWED, STANDARD_ERRORS = 0.03, 4.0
 """Methods disagree where their block means differ by more than this share of the mean in the median block, and by so many standard errors."""
 
@@ -43,8 +41,7 @@ def opinion(opened: OpenScene, method: Method, references: References, seconds: 
     The standard error of a block's difference comes from the differences of the two renders and of the two references there.
     """
     found = measure(opened, [method], references, seconds, None, 2, [], tell).methods[0]
-    first, second = (block_means(image) for image in found.images)
-    one, two = block_means(references.first), block_means(references.second)
+    first, second, one, two = (block_means(image.astype(np.float64).mean(axis=-1)) for image in (*found.images, references.first, references.second))
     level = 0.5 * (one + two) + 1e-3 * references.mean.mean()
     difference = (0.5 * (first + second) - 0.5 * (one + two)) / level
     error = np.sqrt((first - second) ** 2 + (one - two) ** 2) / (2 * level)
@@ -54,10 +51,3 @@ def opinion(opened: OpenScene, method: Method, references: References, seconds: 
     return {"scene": opened.name, "references": references.origin, "opinion": method.label, "median difference": typical,
             "standard error": typical_error, "difference of means": mean,
             "error of means": float(math.hypot(first.mean() - second.mean(), one.mean() - two.mean()) / (2 * level.mean())), "agrees": agrees}
-
-
-def block_means(image: np.ndarray) -> np.ndarray:
-    """(BLOCKS, BLOCKS): grey means."""
-    height, width = (n // BLOCKS * BLOCKS for n in image.shape[:2])
-    grey = image[:height, :width].astype(np.float64).mean(axis=-1)
-    return grey.reshape(BLOCKS, height // BLOCKS, BLOCKS, width // BLOCKS).mean(axis=(1, 3))

@@ -92,7 +92,7 @@ def overhead(options: argparse.Namespace) -> float:
     points = sum(count for _, count in values) * options.point_time
     compiling = sum((0.3 if sweep.of_method else 1.0) * count for sweep, count in values) * 0.5 * COMPILING_SECONDS
     views = sum(options.view_seeds * options.view_time * max(count, view_counts.FEW) + COMPILING_SECONDS for count in options.view_counts)
-    drawn = sum(len(sweep.values[::2] if options.coarse else sweep.values) for sweep in resampling.SWEEPS if sweep.name in options.parameters)
+    drawn = sum(len(sweep.chosen(options.coarse)) for sweep in resampling.SWEEPS if sweep.name in options.parameters)
     resampled = len(options.resampled) * drawn * len(resampling.METHODS) * (options.draw_seeds * options.draw_time + COMPILING_SECONDS)
     return scenes + points + compiling + resampled + len(options.view_scenes) * (1 + len(options.view_weights)) * views
 

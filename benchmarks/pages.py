@@ -14,6 +14,7 @@ from compare import told_apart
 from measuring import Measurement
 from methods import Method
 from mis_integrators.analysis import charts
+from mis_integrators.analysis.metrics import relative_differences
 from mis_integrators.analysis.zooms import telling_windows
 from mis_integrators.output import write_png
 from multiview import Race
@@ -103,7 +104,8 @@ def pictures(measurement: Measurement, rows: Sequence[Row], folder: Path) -> str
     white = max(float(np.quantile(references.mean, 0.97)), 1e-9)
     found = [measured.perceived(references) for measured in measurement.methods]
     with_flip = all(found)
-    maps = [one[1] for one in found] if with_flip else [_relative(measured.images[0], references) for measured in measurement.methods]
+    maps = [one[1] for one in found] if with_flip else [
+        np.abs(relative_differences(measured.images[0], references)).mean(axis=-1) for measured in measurement.methods]
     windows = telling_windows(maps, ZOOM)
     framed = references.mean / white
     for (y, x), colour in zip(windows, FRAMES):
@@ -146,11 +148,6 @@ def _embed(image: np.ndarray, path: Path | None) -> str:
     mi.Bitmap(image, mi.Bitmap.PixelFormat.RGB).convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.UInt8, srgb_gamma=True).write(
         stream, mi.Bitmap.FileFormat.JPEG, 90)
     return charts.data_uri(stream.raw_buffer(), "image/jpeg")
-
-
-def _relative(image: np.ndarray, references) -> np.ndarray:
-    """|x - r| / (r + 0.1), mean of the channels."""
-    return (np.abs(image - references.mean) / (np.abs(references.level()) + 0.1)).mean(axis=-1)
 
 
 def convergence(measurement: Measurement, points: Sequence[Row], fitted: Sequence[Row], folder: Path) -> str:

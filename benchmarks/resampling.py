@@ -60,7 +60,7 @@ def sweep_scene(opened: OpenScene, references: References, options: argparse.Nam
     rows: list[Row] = []
     for sweep in SWEEPS:
         if sweep.name in options.parameters:
-            for value in sweep.values[::2] if options.coarse else sweep.values:
+            for value in sweep.chosen(options.coarse):
                 rows += measure_value(opened, references, sweep, value, options)
     return rows
 

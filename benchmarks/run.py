@@ -57,7 +57,7 @@ def _parser() -> argparse.ArgumentParser:
 
     command = _measuring(commands, "page", overview)
     _renders(command, None)
-    _compares_with_references(command, seeds=3)
+    _compares_with_references(command)
     command.add_argument("--minutes", type=float, default=26, metavar="MINUTES", help="what all should take, if --time is not given (default: 26)")
     command.add_argument("--snapshots", type=int, default=5, metavar="N", help="at times T, T/2, T/4, ... (default: 5)")
     command.add_argument("--varied", nargs="+", type=parse_method, default=registered(VARIED), metavar="PLUGIN[:...]",
@@ -69,18 +69,18 @@ def _parser() -> argparse.ArgumentParser:
     _views(command, (2, 8, 16, 64), 0.08, 2, 0.5)
     command.add_argument("--resampled", nargs="*", type=Path, default=[path for path in bundled() if path.stem == "door"], metavar="FILE.xml",
                          help="scenes of the sweeps of resampling (default: door)")
-    _resampling(command, 1.0, 2)
+    _resampling(command, 1.0)
 
     command = _measuring(commands, "compare", compare)
     _renders(command, 10)
-    _compares_with_references(command, seeds=3)
+    _compares_with_references(command)
     command.add_argument("--baseline", type=Path, metavar="FILE",
                          help="figures of an earlier run (compare.json or benchmarks/history/*.json): print what became slower or noisier")
     command.add_argument("--record", action="store_true", help="keep the figures in benchmarks/history")
 
     command = _measuring(commands, "converge", converge)
     _renders(command, 16)
-    _compares_with_references(command, seeds=3)
+    _compares_with_references(command)
     command.add_argument("--snapshots", type=int, default=6, metavar="N", help="at times T, T/2, T/4, ... (default: 6)")
 
     command = _measuring(commands, "variance", variance)
@@ -97,7 +97,7 @@ def _parser() -> argparse.ArgumentParser:
 
     command = _measuring(commands, "resampling", resampling)
     command.set_defaults(scenes=[path for path in bundled() if path.stem == "door"])
-    _resampling(command, 2.0, 2)
+    _resampling(command, 2.0)
     command.add_argument("--coarse", action="store_true", help="only every other value of a sweep")
     references.add_options(command)
 
@@ -204,13 +204,13 @@ def _views(command: argparse.ArgumentParser, counts: tuple[int, ...], seconds: f
     command.add_argument("--view-scale", type=float, default=scale, metavar="SCALE", help=f"film size, scene's own = 1 (default: {scale:g})")
 
 
-def _resampling(command: argparse.ArgumentParser, seconds: float, seeds: int) -> None:
+def _resampling(command: argparse.ArgumentParser, seconds: float) -> None:
     """Which parameters of resampled connections are swept, and how carefully."""
     names = [sweep.name for sweep in resampling.SWEEPS]
     command.add_argument("--parameters", nargs="*", choices=names, default=names, metavar="NAME", help=f"of resampling (default: {' '.join(names)})")
     command.add_argument("--draw-time", type=float, default=seconds, metavar="SECONDS",
                          help=f"rendering seconds of each setting and seed of resampling (default: {seconds:g})")
-    command.add_argument("--draw-seeds", type=int, default=seeds, metavar="N", help=f"renders of each (default: {seeds})")
+    command.add_argument("--draw-seeds", type=int, default=2, metavar="N", help="renders of each (default: 2)")
     command.add_argument("--resampling-scale", type=float, default=0.35, metavar="SCALE", help="film size, scene's own = 1 (default: 0.35)")
 
 
@@ -222,8 +222,8 @@ def _renders(command: argparse.ArgumentParser, seconds: float | None) -> None:
     command.add_argument("--spp", type=int, metavar="N", help="samples per pixel of each, instead of equal time")
 
 
-def _compares_with_references(command: argparse.ArgumentParser, seeds: int = 1) -> None:
-    command.add_argument("--seeds", type=int, default=seeds, help=f"renders of each method (default: {seeds})")
+def _compares_with_references(command: argparse.ArgumentParser) -> None:
+    command.add_argument("--seeds", type=int, default=3, help="renders of each method (default: 3)")
     command.add_argument("--scale", type=float, default=1, help="film size, scene's own = 1 (default: 1)")
     references.add_options(command)
 

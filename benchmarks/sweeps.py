@@ -87,9 +87,13 @@ class Sweep:
         """Methods that are compared where these are `asked` for."""
         return registered(self.labels) if self.labels else asked
 
+    def chosen(self, coarse: bool) -> tuple[float, ...]:
+        """All values, or every other if `coarse`."""
+        return self.values[::2] if coarse else self.values
+
     def scenes(self, coarse: bool) -> list[tuple[float, dict[str, float]]]:
-        """The sweep's values, and what each changes in the scene: every other value if `coarse`."""
-        return [(value, {} if self.of_method else {self.parameter: value}) for value in (self.values[::2] if coarse else self.values)]
+        """The `chosen` values, and what each changes in the scene."""
+        return [(value, {} if self.of_method else {self.parameter: value}) for value in self.chosen(coarse)]
 
 
 OF_VIEWS = {"scene": smoke_views, "reference": "volpath", "labels": (

@@ -103,7 +103,8 @@ def iterate(
     interrupt: Interrupt,
 ) -> None:
     """Iterate until there are as many iterations as ``planned``, ``seconds`` of rendering have passed, or the error reaches its target,
-    whichever is first of those that are given, or the user interrupts. A session that has enough already is left as it is.
+    whichever is first of those that are given, or the user interrupts. A session that has enough already is left as it is. Its remarks, if it has
+    some, are said once.
     """
 
     def enough() -> bool:
@@ -114,10 +115,15 @@ def iterate(
         )
 
     interrupt.have_result = session.iterations > 0
+    remarked = False
     while not (session.iterations and (enough() or interrupt.requested)):
         with clock:
             session.iterate()
         interrupt.have_result = True
+        if not remarked:
+            remarked = True
+            for remark in getattr(session, "remarks", []):
+                progress.say(remark)
         progress.update(session.iterations, clock.rendering, target.share_done() if target else None)
         for chore in chores:
             chore.when_due()

@@ -24,7 +24,8 @@ class Session(Protocol):
     """One render in progress: ``iterate`` adds an independent iteration, ``image`` is the mean of those done.
 
     A session may have a method ``plan_time(seconds: float) -> None``. It is called once, before the first
-    iteration, when the render has a time limit instead of a number of samples.
+    iteration, when the render has a time limit instead of a number of samples. It may have ``remarks``, a list of lines that
+    the user should read, complete once an iteration is done.
     """
 
     iterations_planned: int | None

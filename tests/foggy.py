@@ -10,6 +10,19 @@ from worlds import T, bitmap, film, grey, look, waves
 
 SIZE = 16
 
+THREE_VIEWS = """<scene version="3.0.0">
+  <default name="resx" value="48"/><default name="resy" value="16"/>
+  <integrator type="volpath_multiview"><integer name="max_depth" value="2"/></integrator>
+  <emitter type="constant"/>
+  <shape type="sphere"><bsdf type="diffuse"/></shape>
+  <sensor type="batch"><film type="hdrfilm"><integer name="width" value="$resx"/><integer name="height" value="$resy"/><rfilter type="box"/></film>
+    <sensor type="perspective"><transform name="to_world"><lookat origin="0,0,5" target="0,0,0" up="0,1,0"/></transform></sensor>
+    <sensor type="perspective"><transform name="to_world"><lookat origin="1,0,5" target="0,0,0" up="0,1,0"/></transform></sensor>
+    <sensor type="perspective"><transform name="to_world"><lookat origin="0,1,5" target="0,0,0" up="0,1,0"/></transform></sensor>
+  </sensor>
+</scene>"""
+"""A scene file: a sphere seen by the three sensors of a batch."""
+
 
 def view(origin, target=(0, 0, 0), size=SIZE, fov=36.0, kind="perspective", **extra):
     """A sensor that looks at the origin; its film counts only outside a batch."""

@@ -11,6 +11,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from foggy import THREE_VIEWS
 from mis_integrators.analysis.fronts import pareto_front
 from mis_integrators.analysis.metrics import References
 from mis_integrators.analysis.stability import Point, breaks, choose, judge
@@ -166,18 +167,6 @@ def test_defaults_name_registered_plugins_only(module):
     assert methods.registered(methods.COMPARED)[0].label == methods.BASE
 
 
-VIEWS = """<scene version="3.0.0">
-  <default name="resx" value="48"/><default name="resy" value="16"/>
-  <integrator type="volpath_multiview"><integer name="max_depth" value="2"/></integrator>
-  <emitter type="constant"/>
-  <shape type="sphere"><bsdf type="diffuse"/></shape>
-  <sensor type="batch"><film type="hdrfilm"><integer name="width" value="$resx"/><integer name="height" value="$resy"/><rfilter type="box"/></film>
-    <sensor type="perspective"><transform name="to_world"><lookat origin="0,0,5" target="0,0,0" up="0,1,0"/></transform></sensor>
-    <sensor type="perspective"><transform name="to_world"><lookat origin="1,0,5" target="0,0,0" up="0,1,0"/></transform></sensor>
-    <sensor type="perspective"><transform name="to_world"><lookat origin="0,1,5" target="0,0,0" up="0,1,0"/></transform></sensor>
-  </sensor>
-</scene>"""
-
 TINY = """<scene version="3.0.0"><integrator type="path"><integer name="max_depth" value="4"/></integrator>
     <sensor type="perspective"><transform name="to_world"><lookat origin="0,0,4" target="0,0,0" up="0,1,0"/></transform>
     <film type="hdrfilm"><integer name="width" value="48"/><integer name="height" value="40"/></film></sensor>
@@ -190,7 +179,7 @@ def test_page_of_one_small_scene(module, tmp_path):
     scene = tmp_path / "tiny.xml"
     scene.write_text(TINY)
     views = tmp_path / "views.xml"
-    views.write_text(VIEWS)
+    views.write_text(THREE_VIEWS)
     argv = ["page", "--scenes", str(scene), "--view-scenes", str(views), "--view-counts", "2", "3", "4", "--view-time", "0.01", "--view-seeds", "2",
             "--integrators", "path", "bdpm:bdd=0", "bdpm:bdd=0,bogus=1", "--varied", "bdpm:bdd=0", "--time", "0.3",
             "--seeds", "2", "--reference-time", "0.2", "--references", str(tmp_path / "references"), "--iterations", "2", "--sweeps", "camera_paths",

@@ -300,6 +300,24 @@ def test_progress_in_lines_and_quiet(scene, tmp_path, use, capsys, monkeypatch):
     assert capsys.readouterr() == ("", "")
 
 
+def test_remarks_are_said_once(scene, tmp_path, use, capsys):
+    remarks = ["one: [of] two", "another that is long " + 20 * "and longer "]
+    use(FakeSession()).remarks = remarks
+    assert render(scene, "-o", tmp_path / "a.exr") == 0
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[:2] == remarks and len(lines) == 3
+
+
+def test_why_bdpm_auto_chose_is_said(scene, tmp_path, capsys):
+    arguments = "-i", "bdpm_auto", "-P", "max_depth=2", "-o", tmp_path / "a.exr"
+    assert render(scene, *arguments) == 0
+    said = [line.partition(": ")[2] for line in capsys.readouterr().err.splitlines() if line.startswith("bdpm_auto: ")]
+    header, _ = read(tmp_path / "a.exr")
+    assert said == [header[name] for name in sorted(header) if name.startswith("choice.because.")] and "needs no photons" in said[0]
+    assert render(scene, *arguments, "--quiet") == 0
+    assert capsys.readouterr() == ("", "")
+
+
 # --- Errors ---------------------------------------------------------------------------------------
 
 

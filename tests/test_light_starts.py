@@ -5,7 +5,6 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mis_integrators.transport.guide import EnvironmentGuide, infinite_emitters
 from mis_integrators.transport.light_starts import read_starts, sample_light_starts
 from mis_integrators.transport.lights import Lights
 from mis_integrators.transport.random import streams
@@ -16,7 +15,7 @@ COUNT = 4096
 
 def lights_of(emitter):
     scene = tray("lambertian", emitter)
-    return scene, Lights(scene, guide=EnvironmentGuide(scene, scene.sensors()[0]) if infinite_emitters(scene) else None)
+    return scene, Lights.seen_by(scene, scene.sensors()[0], "bdpm")
 
 
 def spread(x):

@@ -13,8 +13,8 @@ import pytest
 
 import mis_integrators
 from comparing import Estimate, assert_same, collect_until, differences, smallest_visible
-from foggy import (SIZE, MultiviewBatches, OracleBatches, around, arrived, batch, container, even, grid, lamp, multiview, orbit, pockets, sparse,
-                   uneven, view, views_agree, volpath, world)
+from foggy import (SIZE, THREE_VIEWS, MultiviewBatches, OracleBatches, around, arrived, batch, container, even, grid, lamp, multiview, orbit, pockets,
+                   sparse, uneven, view, views_agree, volpath, world)
 from mis_integrators import cli, output
 from mis_integrators.volume.media import transmittance
 from mis_integrators.volume.shifts import SHIFTS
@@ -419,25 +419,14 @@ def test_scenes_refused(rgb):
 
 # --- The command ------------------------------------------------------------------------------------------------
 
-XML = """<scene version="3.0.0">
-  <integrator type="volpath_multiview"><integer name="max_depth" value="2"/></integrator>
-  <emitter type="constant"/>
-  <shape type="sphere"><bsdf type="diffuse"/></shape>
-  <sensor type="batch"><film type="hdrfilm"><integer name="width" value="24"/><integer name="height" value="6"/><rfilter type="box"/></film>
-    <sensor type="perspective"><transform name="to_world"><lookat origin="0,0,5" target="0,0,0" up="0,1,0"/></transform></sensor>
-    <sensor type="perspective"><transform name="to_world"><lookat origin="1,0,5" target="0,0,0" up="0,1,0"/></transform></sensor>
-    <sensor type="perspective"><transform name="to_world"><lookat origin="0,1,5" target="0,0,0" up="0,1,0"/></transform></sensor>
-  </sensor>
-</scene>"""
-
 
 def test_command(rgb, tmp_path, capsys):
     """Side by side, as a contact sheet, and as frames."""
     scene = tmp_path / "a.xml"
-    scene.write_text(XML)
+    scene.write_text(THREE_VIEWS)
 
     def run(*options):
-        return cli.main([str(scene), "-o", str(tmp_path / "b.exr"), "--spp", "4", "--quiet", *options])
+        return cli.main([str(scene), "-o", str(tmp_path / "b.exr"), "-D", "resx=24", "-D", "resy=6", "--spp", "4", "--quiet", *options])
 
     def same(a, b):                                         # Mitsuba dithers
         return np.abs(a.astype(int) - b).max() <= 1 and b.std() > 1

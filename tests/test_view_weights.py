@@ -23,7 +23,7 @@ def weights(heuristic, p):
         total = sum(np.where(r > 0, summand(heuristic, r), 0) for r in ratio)
         for r in ratio:
             sees = r > 0
-            found[i, np.flatnonzero(can)[sees]] = gain(heuristic, r[sees], total[sees]) / r[sees]
+            found[i, np.flatnonzero(can)[sees]] = gain(r[sees], total[sees]) / r[sees]
     return found
 
 
@@ -42,4 +42,4 @@ def test_definitions():
     i, j = 0, 3
     ratio = p[:, p[j] > 0] / p[i, p[j] > 0]
     total = ratio.sum(axis=0)
-    assert np.allclose(gain("mwis", ratio[j], total), (1 / total) * ratio[j]) and np.allclose(summand("mwis", ratio), ratio)
+    assert np.allclose(gain(ratio[j], total), (1 / total) * ratio[j]) and np.allclose(summand("mwis", ratio), ratio)

@@ -10,7 +10,7 @@ pixels, so that the noise in the divisor and that in the products hardly correla
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Sequence
 
 import numpy as np
@@ -21,6 +21,8 @@ TRIMMED_SHARE = 1e-3
 """Share of the pixels, the worst ones, that trimmed errors leave out."""
 GROUPS = 15
 """Groups of pixels of the median of means."""
+BLOCKS = 8
+"""Blocks a side of an image whose means are compared, or whose spread is a standard error."""
 
 
 @dataclass(frozen=True)
@@ -88,16 +90,15 @@ def errors(image: np.ndarray, references: References) -> Errors:
     )
 
 
-def mean_errors(images: Sequence[np.ndarray], references: References) -> Errors:
-    """Mean errors of renders under different seeds."""
-    several = [errors(image, references) for image in images]
-    return Errors(*(float(np.mean([getattr(e, f.name) for e in several])) for f in fields(Errors)))
+def relative_differences(image: np.ndarray, references: References) -> np.ndarray:
+    """(x - r) / (r + 0.1) of each pixel and channel, (H, W, 3), r the references' mean and 0.1 the root of `RELATIVE_OFFSET`; includes the
+    noise of r."""
+    return (image.astype(np.float64) - references.mean) / (np.abs(references.level()) + RELATIVE_OFFSET ** 0.5)
 
 
 def mape(image: np.ndarray, references: References) -> float:
-    """Mean of |x - r| / (r + 0.1), r the references' mean and 0.1 the root of `RELATIVE_OFFSET`; includes the noise of r."""
-    difference = np.abs(image.astype(np.float64) - references.mean)
-    return float((difference / (np.abs(references.level()) + RELATIVE_OFFSET ** 0.5)).mean())
+    """Mean magnitude of `relative_differences`."""
+    return float(np.abs(relative_differences(image, references)).mean())
 
 
 # --- Bias and variance ----------------------------------------------------------------------------------
@@ -176,6 +177,12 @@ def flip(image: np.ndarray, references: References) -> tuple[float, np.ndarray] 
     test = np.nan_to_num(np.maximum(image, 0), posinf=1e6).astype(np.float32)
     error_map, mean, _ = flip_evaluator.evaluate(reference, test, "HDR", applyMagma=False)
     return float(mean), np.asarray(error_map)[..., 0] if np.ndim(error_map) == 3 else np.asarray(error_map)
+
+
+def block_means(values: np.ndarray) -> np.ndarray:
+    """Means over the blocks of an image (H, W) that is cut into `BLOCKS` times `BLOCKS`; left over rows and columns are left out."""
+    height, width = (n // BLOCKS * BLOCKS for n in values.shape)
+    return values[:height, :width].reshape(BLOCKS, height // BLOCKS, BLOCKS, width // BLOCKS).mean(axis=(1, 3))
 
 
 def _smooth(image: np.ndarray) -> np.ndarray:

@@ -7,7 +7,7 @@ from typing import Sequence
 
 import numpy as np
 
-from .metrics import RELATIVE_OFFSET, TRIMMED_SHARE, References, relative_squared_errors, trimmed_mean
+from .metrics import BLOCKS, TRIMMED_SHARE, References, block_means, relative_differences, relative_squared_errors, trimmed_mean
 
 ERROR_FACTOR = 3.0
 """A method breaks where its error is more than so many times its own median over the sweep."""
@@ -15,8 +15,6 @@ MEAN_DEVIATION = 0.05
 """... or where the image's mean is off by more than this share, significantly."""
 STANDARD_ERRORS = 4.0
 """How many of its standard errors a mean must be off to count as off."""
-BLOCKS = 8
-"""Blocks a side over which the standard error of the mean is taken."""
 
 
 @dataclass(frozen=True)
@@ -44,11 +42,9 @@ def judge(value: float, image: np.ndarray, references: References) -> Point:
     """
     if not np.isfinite(image).all():
         return Point(value, float("inf"), float("inf"), 0.0)
-    height, width = (n // BLOCKS * BLOCKS for n in image.shape[:2])
-    relative = ((image - references.mean) / (np.abs(references.level()) + RELATIVE_OFFSET ** 0.5)).mean(axis=-1)
+    relative = relative_differences(image, references).mean(axis=-1)
     low, high = np.quantile(relative, [TRIMMED_SHARE, 1 - TRIMMED_SHARE])
-    relative = np.clip(relative, low, high)[:height, :width]
-    blocks = relative.reshape(BLOCKS, height // BLOCKS, BLOCKS, width // BLOCKS).mean(axis=(1, 3))
+    blocks = block_means(np.clip(relative, low, high))
     return Point(value, trimmed_mean(relative_squared_errors(image, references)), float(blocks.mean()), float(blocks.std(ddof=1)) / BLOCKS)
 
 

@@ -12,13 +12,15 @@ from ..transport.coverage import covered_share
 from ..transport.film import shared_wavelengths, splat_samples
 from ..transport.gather import gather_photons
 from ..transport.light_pass import trace_light_paths
+from ..transport.lights import Lights
 from ..transport.packing import rounded_up
 from ..transport.photon_map import PhotonMap, build_photon_map, smallest_cell
 from ..transport.random import mix
 from ..transport.recording import recorder
-from ..transport.traits import lookup
-from .common import IterativeIntegrator, IterativeSession, surveyed
+from ..transport.traits import SceneTraits, lookup
+from .common import IterativeIntegrator, IterativeSession
 from .pilot import choose_radii
+from .schedule import read_radius, shrunk
 
 SPARE_PHOTONS = 1 << 20
 """Unused room beyond half of a photon buffer that is worth the time to record the passes anew."""
@@ -101,9 +103,7 @@ class BDPM(IterativeIntegrator):
     def read_photon_parameters(self, parameters):
         """Reads what concerns the photon map."""
         self.photon_count = parameters.integer("photon_count", 0, 0, "at least 0 (0: as many as pixels)", high=2 ** 31)
-        self.initial_radius = parameters.number("initial_radius", 0.0, lambda r: 0 <= r < float("inf"),
-                                                "finite and at least 0 (0: automatic)")
-        self.alpha = parameters.number("alpha", 1.0, lambda a: 0 < a <= 1, "in (0, 1]")
+        self.initial_radius, self.alpha = read_radius(parameters)
 
     def settings(self):
         return {**super().settings(), "photon_count": self.photon_count, "initial_radius": self.initial_radius,
@@ -118,12 +118,9 @@ class BDPMSession(IterativeSession):
 
     def __init__(self, integrator, scene, sensor, seed, iterations):
         super().__init__(integrator, scene, sensor, seed, iterations)
-        self.traits, self.lights = integrator.survey or surveyed(scene, sensor, integrator.plugin)
-        pixels = film_sample_count(sensor)
-        self.light_paths = integrator.photon_count or pixels
-        self.path_count = pixels * integrator.camera_paths
-        self.chunks = -(-self.path_count // CAMERA_CHUNK)
-        self.chunk = -(-self.path_count // self.chunks)
+        self.traits, self.lights = integrator.survey or (SceneTraits(scene), Lights.seen_by(scene, sensor, integrator.plugin))
+        self.split_paths(CAMERA_CHUNK)
+        self.light_paths = integrator.photon_count or film_sample_count(sensor)
         depth = integrator.max_depth
         unreachable = self.lights.needs_photons_for_direct_light()
         self.has_caustics = not self.lights.dark and ((unreachable and (depth < 0 or depth >= 2)) or
@@ -162,9 +159,8 @@ class BDPMSession(IterativeSession):
         return [kind for kind, needed in (("caustic", self.has_caustics), ("indirect", self.has_indirect)) if needed]
 
     def radii_at(self, iteration):
-        """Merge radius of each kind of photon: R_i^2 = R_0^2 (i + 1)^(alpha - 1), a schedule of the iteration's index alone."""
-        shrink = (iteration + 1) ** (0.5 * (self.integrator.alpha - 1))
-        return {kind: dr.opaque(mi.Float, radius * shrink) for kind, radius in self.radii.items()}
+        """Merge radius of each kind of photon."""
+        return {kind: dr.opaque(mi.Float, shrunk(radius, self.integrator.alpha, iteration)) for kind, radius in self.radii.items()}
 
     def _vertex_room(self, paths):
         if not self.kinds():
@@ -238,8 +234,7 @@ class BDPMSession(IterativeSession):
             radiance += self._per_path(gathered, vertices, self.chunk)
         if self.integrator.hide_emitters:
             radiance = dr.select(alpha > 0, radiance, 0)       # as `path` does: what is behind nothing but null surfaces is hidden
-        active = dr.arange(mi.UInt32, self.chunk) + first < self.path_count
-        return splat_samples(sensor.film(), position, radiance, alpha, spectral["matrix"], active), count
+        return splat_samples(sensor.film(), position, radiance, alpha, spectral["matrix"], self.in_chunk(first)), count
 
     def _spectral(self, iteration):
         """The wavelengths that all sub-paths of an iteration share, the sample that makes them, and their conversion to colour."""
@@ -286,19 +281,19 @@ class BDPMSession(IterativeSession):
         radii = self.radii_at(iteration)
         spectral = self._spectral(iteration)
         maps = self._map_pass(self._photons(iteration, spectral), radii) if radii else None
-        total = None
-        for chunk in range(self.chunks):
+
+        def render(chunk, first):
             while True:
-                first = dr.opaque(mi.UInt32, chunk * self.chunk)
                 block, count = self._camera_pass(self.scene, self.sensor, self._tables, maps, self._seed(iteration, CAMERA), first,
                                                  spectral, radii)
                 wanted = 0 if self.one_vertex else int(dr.max(count)[0])
                 if wanted <= self.vertex_capacity or not radii:
-                    break
+                    return (block,)
                 self.vertex_capacity = rounded_up(wanted + wanted // 8)
                 self._freeze()
-            total = block if total is None else total + block
-        return total
+
+        (block,) = self.sum_of_chunks(render)
+        return block
 
 
 LIGHT, CAMERA, WAVELENGTH = range(3)

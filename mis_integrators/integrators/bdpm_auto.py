@@ -19,30 +19,18 @@ class BDPMAuto(IterativeIntegrator):
 
     .. pluginparameters::
 
-     * - camera_paths
-       - |int|
-       - Camera paths per pixel and iteration. (Default: 1)
-     * - variance
-       - |bool|
-       - Adds the channels ``var.R``, ``var.G``, ``var.B`` (mono: ``var.Y``): the estimated variance of the pixel mean over the
-         iterations, of which there must be two at least. (Default: no, i.e. |false|)
-     * - max_depth
-       - |int|
-       - Longest path in segments, both halves together (-1: unlimited). A value of 1 shows only directly visible emitters, 2 adds
-         direct light, and so on. (Default: -1)
-     * - rr_depth
-       - |int|
-       - Depth from which Russian roulette may end a sub-path, in each half. (Default: 5)
-     * - hide_emitters
-       - |bool|
-       - Hide directly visible emitters. (Default: no, i.e. |false|)
+     * - camera_paths, variance, max_depth, rr_depth, hide_emitters
+       -
+       - As of :monosp:`bdpm`.
 
     Chooses among ``path``, ``bdpm`` and ``bdpm_opt`` with two or three strategies: those that can see all the light of the scene are tried on a few
     thousand pixels for a few iterations, and the one of which the least error is expected in the time that is planned renders the image. What an
     iteration costs is counted (segments, photons) and priced, not clocked. Scenes with media are rendered by ``volpath_multiview``.
 
-    The settings of the image (in the EXR's header, and printed by ``mis-render``) say which integrator was chosen and why, with its prediction; that
-    integrator with the same seed and the same number of samples makes the same image.
+    The settings of the image (in the EXR's header) say which integrator was chosen and why, with the predictions; ``mis-render`` prints the reasons,
+    too. Without a time limit, the same seed and number of samples make the same choice and image again. ``bdpm`` with ``bdd`` 0, if chosen, makes the
+    same image by itself. The others' merge radii are judged by the image that this first candidate's pilot saw, so that by themselves they may find
+    different ones. ``path`` draws the random numbers of this package, not those of Mitsuba: the same mean, other noise.
 
     .. tabs::
         .. code-tab:: xml
@@ -86,6 +74,11 @@ class AutoSession(IterativeSession):
         return {**chosen, "integrator": self.integrator.plugin, "choice": self.decision.plugin,
                 **{f"choice.because.{number}": reason for number, reason in enumerate(self.decision.reasons, 1)},
                 **{f"choice.relmse.{name}": error for name, error in self.decision.errors.items()}}
+
+    @property
+    def remarks(self):
+        """Why what renders was chosen, line by line."""
+        return [f"{self.integrator.plugin}: {reason}" for reason in self.decision.reasons] if self.decision else []
 
     def start(self):
         if self.decision is None:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import drjit as dr
 import mitsuba as mi
 
-from ..transport.camera_pass import film_sample_count
 from ..transport.connections import by_path, join, join_sensor, list_pairs, visible
 from ..transport.film import (as_camera_weights, colour_channels, expected_weight, shared_wavelengths, splat_channels, splat_samples,
                               with_colour)
-from ..transport.guide import EnvironmentGuide, infinite_emitters
 from ..transport.lenses import Lens
 from ..transport.lights import Lights
 from ..transport.packing import rounded_up
@@ -117,11 +117,8 @@ class BDPTSession(IterativeSession):
     def __init__(self, integrator, scene, sensor, seed, iterations):
         super().__init__(integrator, scene, sensor, seed, iterations)
         self.traits = SceneTraits(scene)
-        guide = EnvironmentGuide(scene, sensor) if infinite_emitters(scene) else None
-        self.lights = Lights(scene, integrator.plugin, guide)
-        self.path_count = film_sample_count(sensor) * integrator.camera_paths
-        self.chunks = -(-self.path_count // CHUNK)
-        self.chunk = -(-self.path_count // self.chunks)
+        self.lights = Lights.seen_by(scene, sensor, integrator.plugin)
+        self.split_paths(CHUNK)
         self.light_chunk = self.light_count()
         self.light_paths = self.chunks * self.light_chunk
         width, height = sensor.film().crop_size()
@@ -218,8 +215,7 @@ class BDPTSession(IterativeSession):
 
     def _splat(self, radiance, alpha, position, first, spectral, entries):
         """Block of the camera paths, and that of their techniques (or None)."""
-        active = dr.arange(mi.UInt32, self.chunk) + first < self.path_count
-        film, techniques = self.sensor.film(), None
+        active, film, techniques = self.in_chunk(first), self.sensor.film(), None
         if entries:
             channels = camera_images(self._ledger(entries), spectral["matrix"])
             techniques = splat_channels(film, position, channels, active)
@@ -227,9 +223,8 @@ class BDPTSession(IterativeSession):
 
     # ------------------------------------------------------------------ iterations
 
-    def _chunk(self, iteration, chunk, spectral):
+    def _chunk(self, iteration, spectral, chunk, first):
         """Blocks of one part of the paths: of camera paths, of their techniques, of light that met the sensor (None where there is none)."""
-        first = dr.opaque(mi.UInt32, chunk * self.chunk)
         light = lit = None
         while self.bidirectional:
             light = self._light_pass(self.scene, self.sensor, self._tables, self._seed(iteration, LIGHT, chunk), spectral)
@@ -262,8 +257,7 @@ class BDPTSession(IterativeSession):
 
     def _iteration(self, iteration):
         spectral = self._spectral(iteration)
-        parts = [self._chunk(iteration, chunk, spectral) for chunk in range(self.chunks)]
-        block, techniques, light = (None if blocks[0] is None else sum(blocks[1:], blocks[0]) for blocks in zip(*parts))
+        block, techniques, light = self.sum_of_chunks(partial(self._chunk, iteration, spectral))
         if light is not None:
             light = as_camera_weights(light, block, self.expected_weight)
             block = with_colour(block, light[:, :, :3])
@@ -275,10 +269,7 @@ class BDPTSession(IterativeSession):
         return block
 
     def fill_film(self):
-        film = self.sensor.film()
-        film.clear()
-        film.prepare(self.integrator.aov_names())
-        self.accumulator.put(film, self.integrator.variance, self.sums.tensors.get("techniques"))
+        self.accumulator.put(self._emptied(self.sensor.film()), self.integrator.variance, self.sums.tensors.get("techniques"))
 
 
 LIGHT, CAMERA, WAVELENGTH, APERTURE, THIN = range(5)

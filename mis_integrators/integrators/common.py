@@ -8,13 +8,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..transport.camera_pass import film_sample_count
 from ..transport.film import Accumulator, variance_channels
-from ..transport.guide import EnvironmentGuide, infinite_emitters
-from ..transport.lights import Lights
 from ..transport.packing import rounded_up
 from ..transport.random import mix
 from ..transport.recording import settle
-from ..transport.traits import SceneTraits, UnsupportedScene, check_scene, check_variant
+from ..transport.traits import UnsupportedScene, check_scene, check_variant
 from ..turns import TURN, by_turns
 from .parameters import Parameters
 
@@ -125,12 +124,6 @@ class IterativeIntegrator(mi.AdjointIntegrator):
         raise RuntimeError(f"{self.plugin}: gradients are not supported; use Mitsuba's prb")
 
 
-def surveyed(scene, sensor, plugin):
-    """Traits and lights of the scene as the sensor sees it; `plugin` is named in errors."""
-    guide = EnvironmentGuide(scene, sensor) if infinite_emitters(scene) else None
-    return SceneTraits(scene), Lights(scene, plugin, guide)
-
-
 class IterativeSession:
     """Runs iterations and accumulates them; a subclass implements `_iteration(index) -> block tensor`.
 
@@ -191,6 +184,24 @@ class IterativeSession:
             dr.eval(self.sums.tensors)
             dr.sync_thread()
 
+    def split_paths(self, largest):
+        """Splits the `path_count` camera paths of an iteration into `chunks` parts of `chunk` paths, at most `largest` each: that bounds memory."""
+        self.path_count = film_sample_count(self.sensor) * self.integrator.camera_paths
+        self.chunks = -(-self.path_count // largest)
+        self.chunk = -(-self.path_count // self.chunks)
+
+    def sum_of_chunks(self, render):
+        """What `render(chunk, first)` returns, a tuple of tensors or `None`s, summed over all parts; `first`: the number of the part's first path."""
+        total = None
+        for chunk in range(self.chunks):
+            blocks = render(chunk, dr.opaque(mi.UInt32, chunk * self.chunk))
+            total = blocks if total is None else tuple(None if a is None else a + b for a, b in zip(total, blocks))
+        return total
+
+    def in_chunk(self, first):
+        """Which of `chunk` paths from number `first` on there are: the last part may have fewer."""
+        return dr.arange(mi.UInt32, self.chunk) + first < self.path_count
+
     def _run(self, iteration):
         """Adds an iteration to the sums."""
         self.accumulator.add(self._iteration(iteration), iteration)
@@ -210,10 +221,13 @@ class IterativeSession:
 
     def fill_film(self):
         """Hands what has been rendered so far to the sensor's film, ready to develop."""
-        film = self.sensor.film()
+        self.accumulator.put(self._emptied(self.sensor.film()), self.integrator.variance)
+
+    def _emptied(self, film):
+        """The film, empty, with all channels."""
         film.clear()
         film.prepare(self.integrator.aov_names())
-        self.accumulator.put(film, self.integrator.variance)
+        return film
 
     @by_turns
     def image(self):
@@ -227,10 +241,7 @@ class IterativeSession:
     @by_turns
     def channels(self):
         """Channel names of `image()`."""
-        film = self.sensor.film()
-        film.clear()
-        film.prepare(self.integrator.aov_names())
-        return [field.name for field in film.bitmap().struct_()]
+        return [field.name for field in self._emptied(self.sensor.film()).bitmap().struct_()]
 
 
 def scalar_seed(seed):

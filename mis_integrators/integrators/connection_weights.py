@@ -9,6 +9,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from ..transport.light_starts import seen_from
 from ..transport.subpaths import STATES
 from ..weights import bidirectional as theory
 
@@ -32,10 +33,7 @@ class ConnectionWeights:
     # ------------------------------------------------------------------ hooks of the sub-paths
 
     def lit(self, si, source, reachable, active, flux=None):
-        ds = dr.copy(source)
-        ds.d = ds.p - si.p
-        ds.dist = dr.norm(ds.d)
-        ds.d = dr.select(active, ds.d * dr.rcp(ds.dist), mi.Vector3f(0, 0, 1))
+        ds = seen_from(si, source, active)
         cosine = dr.maximum(dr.abs(dr.dot(si.n, ds.d)), 1e-6)
         direct = self.lights.pdf_direct(si, ds, active)
         near, far = theory.light_start(cosine * self.lights.emission_ratio(si, ds, active), direct * dr.rcp(cosine))

@@ -26,6 +26,6 @@ def events(session, segments, last_vertex, gathered):
     return camera * session.integrator.camera_paths, light, gathered * session.integrator.camera_paths, 1.0
 
 
-def cost(plugin, counted):
+def cost(plugin, counted, prices=PRICES):
     """Cost of an iteration of `plugin` with these events a pixel, in segments of `path`."""
-    return sum(PRICES[plugin][name] * count for name, count in zip(EVENTS, counted))
+    return sum(prices[plugin][name] * count for name, count in zip(EVENTS, counted))

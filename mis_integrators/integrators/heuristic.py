@@ -29,6 +29,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..transport.camera_pass import STATE
+from ..transport.light_starts import seen_from
 from ..transport.packing import bits_float, float_bits
 from ..weights.heuristics import add_ratio, bounded_power, weight
 
@@ -144,10 +145,7 @@ class Notebook:
         """State at a vertex that the light of `source` reaches on the lanes `straight`: there next-event estimation competes, elsewhere caustic
         photons do."""
         weights = self.weights
-        ds = dr.copy(source)
-        ds.d = ds.p - si.p
-        ds.dist = dr.norm(ds.d)
-        ds.d = dr.select(straight, ds.d * dr.rcp(ds.dist), mi.Vector3f(0, 0, 1))
+        ds = seen_from(si, source, straight)
         return [dr.select(straight, weights.expected_photons(si, ds, straight), weights.caustic_share), *state[1:]]
 
     def scattered(self, state, si, bsdf, wo, mask):

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from ..transport.cache_points import CacheGrid
-from ..transport.camera_pass import film_sample_count
 from ..transport.camera_vertices import STEP, hit_layout, sum_before, trace_camera_vertices
 from ..transport.connections import join_sensor
 from ..transport.film import as_camera_weights, colour_channels, expected_weight, shared_wavelengths, splat_channels, splat_samples, with_colour
-from ..transport.guide import EnvironmentGuide, infinite_emitters
 from ..transport.junctions import scattered_mean
 from ..transport.lenses import Lens
 from ..transport.light_ends import END, LightEnds, list_ends
@@ -68,11 +68,8 @@ class ResampledSession(IterativeSession):
     def __init__(self, integrator, scene, sensor, seed, iterations):
         super().__init__(integrator, scene, sensor, seed, iterations)
         self.traits = SceneTraits(scene)
-        guide = EnvironmentGuide(scene, sensor) if infinite_emitters(scene) else None
-        self.lights = Lights(scene, integrator.plugin, guide)
-        self.path_count = film_sample_count(sensor) * integrator.camera_paths
-        self.chunks = -(-self.path_count // CHUNK)
-        self.chunk = -(-self.path_count // self.chunks)
+        self.lights = Lights.seen_by(scene, sensor, integrator.plugin)
+        self.split_paths(CHUNK)
         self.light_chunk = max(self.chunk, integrator.light_paths)
         width, height = sensor.film().crop_size()
         self.pixel_paths = width * height * integrator.camera_paths
@@ -306,9 +303,8 @@ class ResampledSession(IterativeSession):
             if not self._grown("ends", result[4]):
                 return result
 
-    def _chunk(self, iteration, chunk, spectral):
+    def _chunk(self, iteration, spectral, chunk, first):
         """Blocks of one part of the paths: of camera paths, and of light that met the sensor (or None)."""
-        first = dr.opaque(mi.UInt32, chunk * self.chunk)
         radiance, alpha, position, camera, count, hits, hit_count = self._camera(iteration, first, spectral)
         block = None
         if self.lit:
@@ -321,10 +317,9 @@ class ResampledSession(IterativeSession):
             dr.eval(radiance)                              # else its sums may still wait when the film's are made
             if self.lens:
                 block = self._sensor_pass(self.scene, self.sensor, self._tables, *light[:2], self._seed(iteration, APERTURE, chunk), spectral)
-        active = dr.arange(mi.UInt32, self.chunk) + first < self.path_count
         if self.integrator.hide_emitters:
             radiance = dr.select(alpha > 0, radiance, 0)       # as `path` does: what is behind nothing but null surfaces is hidden
-        return splat_samples(self.sensor.film(), position, radiance, alpha, spectral["matrix"], active), block
+        return splat_samples(self.sensor.film(), position, radiance, alpha, spectral["matrix"], self.in_chunk(first)), block
 
     def start(self):
         if self.cache is None and self.lit:
@@ -333,8 +328,7 @@ class ResampledSession(IterativeSession):
     def _iteration(self, iteration):
         self.start()
         spectral = shared_wavelengths(self.sensor, mix(self.seed, iteration, WAVELENGTH))
-        parts = [self._chunk(iteration, chunk, spectral) for chunk in range(self.chunks)]
-        block, light = (None if blocks[0] is None else sum(blocks[1:], blocks[0]) for blocks in zip(*parts))
+        block, light = self.sum_of_chunks(partial(self._chunk, iteration, spectral))
         return block if light is None else with_colour(block, as_camera_weights(light, block, self.expected_weight))
 
 

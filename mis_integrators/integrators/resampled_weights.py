@@ -20,6 +20,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..transport.light_ends import END
+from ..transport.light_starts import seen_from
 from ..transport.proposals import BLIND_SHARE, uniform_share
 from ..transport.spectra import channel_mean
 from ..weights import bidirectional as theory
@@ -76,11 +77,9 @@ class ResampledWeights:
         return [dr.zeros(mi.Float, width) for _ in range(3)]
 
     def lit(self, si, source, reachable, active, flux):
-        ds = dr.copy(source)
-        ds.d = ds.p - si.p
-        ds.dist = dr.norm(ds.d)
+        ds = seen_from(si, source, active)
         infinite = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
-        ds.d = dr.select(active, dr.select(infinite, si.to_world(si.wi), ds.d * dr.rcp(ds.dist)), mi.Vector3f(0, 0, 1))
+        ds.d = dr.select(active & infinite, si.to_world(si.wi), ds.d)
         start = self.lights.start_density(si, ds, active)
         across = self.lights.forward_density(si, ds, active)
         made = across * dr.abs(dr.dot(si.n, ds.d))

@@ -7,6 +7,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..transport.irradiance_cache import colours
+from ..transport.packing import gather_words
 from ..transport.random import next_2d, streams
 from ..transport.spectra import channel_mean
 
@@ -78,9 +79,7 @@ class Surroundings:
 
     def lookup(self, slot, active=True):
         """Pairs (radiance by direct light, by other light) of the typical neighbours of cell `slot`, in the order of `SHARES`."""
-        words = []
-        for part in range(self.words // 4):
-            words += list(dr.gather(mi.Vector4f, self.table, self.words // 4 * slot + part, active))
+        words = gather_words(self.table, self.words, slot, active)
         channels = colours()
         spectra = [mi.Spectrum(words[i]) if channels == 1 else mi.Spectrum(words[i:i + channels])
                    for i in range(0, len(words), channels)]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from ..transport.camera_pass import film_sample_count, start_camera_paths
+from ..transport.camera_pass import start_camera_paths
 from ..transport.film import shared_wavelengths, splat_samples
 from ..transport.random import mix
 from .common import IterativeSession
@@ -24,9 +24,7 @@ class PathSession(IterativeSession):
         self.path_integrator = mi.load_dict({"type": "path", "max_depth": integrator.max_depth, "rr_depth": integrator.rr_depth,
                                   "hide_emitters": integrator.hide_emitters})
         self.sampler = mi.load_dict({"type": "independent"})
-        self.path_count = film_sample_count(sensor) * integrator.camera_paths
-        self.chunks = -(-self.path_count // CHUNK)
-        self.chunk = -(-self.path_count // self.chunks)
+        self.split_paths(CHUNK)
 
     @property
     def settings(self):
@@ -47,12 +45,13 @@ class PathSession(IterativeSession):
         return shared_wavelengths(self.sensor, mix(self.seed, iteration, WAVELENGTH))
 
     def _iteration(self, iteration):
-        spectral, total = self._spectral(iteration), None
-        for chunk in range(self.chunks):
-            first = dr.opaque(mi.UInt32, chunk * self.chunk)
+        spectral = self._spectral(iteration)
+
+        def render(chunk, first):
             radiance, alpha, position, active = self.trace(iteration, chunk, first, 1, self.chunk, spectral)
-            block = splat_samples(self.sensor.film(), position, radiance, alpha, spectral["matrix"], active)
-            total = block if total is None else total + block
+            return (splat_samples(self.sensor.film(), position, radiance, alpha, spectral["matrix"], active),)
+
+        (block,) = self.sum_of_chunks(render)
         # Else the sampler's unused final state would be computed with the next iteration, by tracing these paths again.
         self.sampler.seed(0, 1)
-        return total
+        return block

@@ -12,6 +12,7 @@ from ..transport.recording import lanes
 from ..transport.subpaths import read_vertices
 from .bdpt import BDPT, BDPTSession
 from .connection_weights import ConnectionWeights
+from .schedule import read_radius, shrunk
 
 RADIUS_SHARE = 0.004
 """The automatic radius, in units of the spread of what the camera sees."""
@@ -68,9 +69,7 @@ class VCM(BDPT):
     def read_parameters(self, parameters):
         self.read_heuristic(parameters)
         self.photon_count = parameters.integer("photon_count", 0, 0, "at least 0 (0: as many as camera paths)", high=2 ** 31)
-        self.initial_radius = parameters.number("initial_radius", 0.0, lambda r: 0 <= r < float("inf"),
-                                                "finite and at least 0 (0: automatic)")
-        self.alpha = parameters.number("alpha", 1.0, lambda a: 0 < a <= 1, "in (0, 1]")
+        self.initial_radius, self.alpha = read_radius(parameters)
 
     def settings(self):
         settings = super().settings()
@@ -103,8 +102,8 @@ class VCMSession(BDPTSession):
         self._merge_pass = self.recorded(self._merge_vertices)
 
     def radius_at(self, iteration):
-        """R_i^2 = R_0^2 (i + 1)^(alpha - 1), a schedule of the iteration's index alone."""
-        return self.radius * (iteration + 1) ** (0.5 * (self.integrator.alpha - 1))
+        """The merge radius."""
+        return shrunk(self.radius, self.integrator.alpha, iteration)
 
     def _spectral(self, iteration):
         spectral = super()._spectral(iteration)

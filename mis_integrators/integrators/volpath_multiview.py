@@ -202,7 +202,7 @@ class MultiViewSession(IterativeSession):
         common = dr.zeros(mi.Float, self.paths)
         if self.integrator.add_nulls and not self.integrator.shift.endswith("copy"):
             common = common_nulls(lines, sights, pivots["view"], self.views.count, active)
-        log_density, tint, _, _ = follow_nulls(self.traits, None, pivots, lines, lines, common, numbers, seed, self.slots, active)
+        log_density, tint, _, _ = follow_nulls(None, pivots, lines, lines, common, numbers, seed, self.slots, active)
         return common, log_density, dr.select(active, tint, pivots["tint"])
 
     def _connect(self, scene, tables, pivots, lines, sights, common, numbers, seed):
@@ -217,9 +217,9 @@ class MultiViewSession(IterativeSession):
                               self.views.count, integrator.max_depth, integrator.rr_depth, number < self.views.paths)
 
     def _splat(self, scene, tables, pivots, radiance, connections, suffixes, value, numbers, spectral):
-        views, weights, matrix = self.views, self.integrator.weights, spectral["matrix"]
+        views, matrix = self.views, spectral["matrix"]
         active = numbers < views.paths
-        own = own_values(radiance, pivots["visible"], value, gain(weights, mi.Float(1), suffixes["total"]), suffixes["alone"], matrix)
+        own = own_values(radiance, pivots["visible"], value, gain(mi.Float(1), suffixes["total"]), suffixes["alone"], matrix)
         image = splat(views, [(pivots["view"], pivots["position"], own)], SHARED + OWN, [active])
         if views.count == 1:
             return image[:, :, :SHARED], image[:, :, SHARED:]
@@ -229,7 +229,7 @@ class MultiViewSession(IterativeSession):
         reached = (connections["ratio"] > 0) & ~suffix["alone"]
         surface = pivot_surface(pivot, reached & (pivot["kind"] == ON_SURFACE))
         brought = scattered_to(suffix, pivot, surface, connections["d"], reached) * connections["tint"]
-        weight = gain(weights, connections["ratio"], suffix["total"])
+        weight = gain(connections["ratio"], suffix["total"])
         colour = colour_channels(brought * weight, matrix)
         shared = splat(views, [(view, connections["position"], [*colour, weight])], SHARED, [reached])
         return image[:, :, :SHARED] + shared, image[:, :, SHARED:]
@@ -319,9 +319,7 @@ class MultiViewSession(IterativeSession):
 
     def _fill(self, film, pictures):
         """Writes pictures side by side into a film."""
-        film.clear()
-        film.prepare(self.integrator.aov_names())
-        write_film(film, pictures[0] if len(pictures) == 1 else dr.concat(pictures, axis=1))
+        write_film(self._emptied(film), pictures[0] if len(pictures) == 1 else dr.concat(pictures, axis=1))
         return film
 
     def fill_film(self):

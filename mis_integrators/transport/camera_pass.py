@@ -8,6 +8,7 @@ import mitsuba as mi
 from .lights import mis_power
 from .packing import Store
 from .random import next_2d, streams
+from .roulette import russian_roulette
 
 
 def film_samples(sensor, index, camera_paths: int, rng):
@@ -35,6 +36,14 @@ def film_sample_count(sensor):
     size = film.crop_size()
     border = 2 * film.rfilter().border_size() if film.sample_border() else 0
     return (int(size[0]) + border) * (int(size[1]) + border)
+
+
+def within_crop(film, splat):
+    """Whether positions for splatting lie in the crop window, and not in a border that the film samples besides."""
+    if not film.sample_border():
+        return mi.Bool(True)
+    offset, size = mi.ScalarVector2f(film.crop_offset()), mi.ScalarVector2f(film.crop_size())
+    return dr.all((splat >= offset) & (splat < offset + size))
 
 
 def start_camera_paths(sensor, seed, first, stride: int, n_paths: int, camera_paths: int, wavelength_sample):
@@ -227,12 +236,7 @@ def trace_camera_paths(scene, sensor, integrator, lights, traits, seed, first, s
         scatter_pdf[scattered] = bs.pdf
         vertex[scattered] = dr.select(ends, mi.UInt32(bdd), vertex) + 1
         behind_delta = mi.Bool(delta)
-        strength = dr.max(throughput)
-        active &= strength > 0
-        survival = dr.minimum(strength * dr.square(eta), 0.95)
-        roulette = active & (depth >= rr_depth)
-        active &= ~roulette | (rng.next_float32(roulette) < survival)
-        throughput = dr.select(roulette, throughput * dr.rcp(survival), throughput)
+        throughput, active = russian_roulette(rng, throughput, dr.max(throughput), eta, depth >= rr_depth, active)
         hit = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
 
     alpha = dr.select(visible, mi.Float(1), mi.Float(0))

@@ -8,12 +8,13 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from .camera_pass import behind_emitters, start_camera_paths
+from .camera_pass import behind_emitters, start_camera_paths, within_crop
 from .junctions import Junction, scattered_mean
 from .lenses import Lens
 from .packing import Store
 from .random import next_2d
 from .records import Layout
+from .roulette import russian_roulette
 from .spectra import channel_mean
 from .subpaths import NO_PARENT, keep_vertex, new_vertices, vertex_layout
 
@@ -79,11 +80,7 @@ def trace_camera_vertices(scene, sensor, integrator, lights, traits, soften, see
     """
     path, active, rng, ray, sensor_weight, splat, aperture = start_camera_paths(sensor, seed, first, 1, n_paths, camera_paths, wavelength_sample)
     lens = Lens(sensor)
-    film = sensor.film()
-    offset, size = mi.ScalarVector2f(film.crop_offset()), mi.ScalarVector2f(film.crop_size())
-    inside = mi.Bool(True)
-    if dr.hint(film.sample_border(), mode='scalar'):
-        inside = dr.all((splat >= offset) & (splat < offset + size))
+    inside = within_crop(sensor.film(), splat)
     throughput = mi.Spectrum(sensor_weight)
     radiance = mi.Spectrum(0)
     depth = mi.UInt32(0)
@@ -157,12 +154,7 @@ def trace_camera_vertices(scene, sensor, integrator, lights, traits, soften, see
         throughput *= weight
         eta *= bs.eta
         ray = si.spawn_ray(wo)
-        strength = dr.max(throughput)
-        active &= strength > 0
-        survival = dr.minimum(strength * dr.square(eta), 0.95)
-        roulette = active & (depth >= rr_depth)
-        active &= ~roulette | (rng.next_float32(roulette) < survival)
-        throughput = dr.select(roulette, throughput * dr.rcp(survival), throughput)
+        throughput, active = russian_roulette(rng, throughput, dr.max(throughput), eta, depth >= rr_depth, active)
         hit = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
 
     alpha = dr.select(visible, mi.Float(1), mi.Float(0))

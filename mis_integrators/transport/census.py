@@ -9,6 +9,7 @@ import numpy as np
 from .camera_pass import start_camera_paths
 from .packing import Store
 from .random import next_2d
+from .roulette import russian_roulette
 
 SMOOTH_VERTICES = 4
 """Smooth vertices that are told apart; later ones count with the last."""
@@ -38,12 +39,7 @@ def count_segments(scene, sensor, seed, stride: int, paths: int, max_depth: int,
         eta *= bs.eta
         vertex += dr.select(mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta), mi.UInt32(0), mi.UInt32(1))
         ray = si.spawn_ray(si.to_world(bs.wo))
-        strength = dr.max(throughput)
-        active &= strength > 0
-        survival = dr.minimum(strength * dr.square(eta), 0.95)
-        roulette = active & (depth >= rr_depth)
-        active &= ~roulette | (rng.next_float32(roulette) < survival)
-        throughput = dr.select(roulette, throughput * dr.rcp(survival), throughput)
+        throughput, active = russian_roulette(rng, throughput, dr.max(throughput), eta, depth >= rr_depth, active)
     return store.counts
 
 

@@ -87,6 +87,19 @@ def with_colour(block, colour):
     return dr.concat([block[:, :, :3] + colour, block[:, :, 3:]], axis=2)
 
 
+def add_squares(sums, colour, weight):
+    """Adds to the sums what `spread` needs, from the summed colours A_i and weights W_i of an iteration."""
+    colour, weight = mi.TensorXd(colour), mi.TensorXd(weight)
+    sums.add("square", colour * colour)
+    sums.add("cross", colour * weight)
+    sums.add("weight_square", weight * weight)
+
+
+def spread(sums, mean):
+    """Sum over the iterations of (A_i - m W_i)^2 for a given `mean` m."""
+    return sums["square"] - 2 * mean * sums["cross"] + mean * mean * sums["weight_square"]
+
+
 class Accumulator:
     """Sums of the iterations' blocks and, for the variance, of their squares. Its size does not grow with iterations.
 
@@ -106,10 +119,7 @@ class Accumulator:
         """Adds the block tensor of an iteration."""
         self.sums.add("total", block)
         if self.with_variance:
-            colour, weight = (mi.TensorXd(channels) for channels in (block[:, :, :3], block[:, :, -1:]))
-            self.sums.add("square", colour * colour)
-            self.sums.add("cross", colour * weight)
-            self.sums.add("weight_square", weight * weight)
+            add_squares(self.sums, block[:, :, :3], block[:, :, -1:])
         self.sums.done.add(iteration)
         dr.schedule(self.sums.tensors)
 
@@ -123,10 +133,9 @@ class Accumulator:
     def variance_of_mean(self):
         """Estimated variance of each pixel's mean (height, width, 3) from the iterations, by the ratio estimator's
         delta method: sum (A_i - m W_i)^2 / (n (n - 1) mean(W)^2), A_i and W_i the weighted colour and weight of iteration i."""
-        n, sums = self.iterations, self.sums
+        n = self.iterations
         mean, weight = self.mean()
-        spread = sums["square"] - 2 * mean * sums["cross"] + mean * mean * sums["weight_square"]
-        return dr.maximum(spread, 0) * (n / ((n - 1) * weight * weight))
+        return dr.maximum(spread(self.sums, mean), 0) * (n / ((n - 1) * weight * weight))
 
     def estimate(self, film):
         """Mean colour and its estimated variance, float64 (height, width, 3) each, without the block's border."""

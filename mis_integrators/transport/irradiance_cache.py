@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from .gather import SAME_SURFACE_COSINE
-from .packing import bits_float, float_bits, rounded_up, unpack_caustic, unpack_depth, unpack_direction, unpack_normal
+from .packing import bits_float, float_bits, gather_words, rounded_up, unpack_caustic, unpack_depth, unpack_direction, unpack_normal
 from .photon_map import build_photon_map, for_each_photon, read_power, smallest_cell
 from .random import streams
 from .spectra import channel_mean
@@ -207,9 +207,7 @@ class IrradianceCache:
     def lookup(self, p, n, active=True):
         """The `Irradiance` at point `p` on the side to which the unit normal `n` points."""
         slot = self.slot(p, n, active)
-        words = []
-        for part in range(self.words // 4):
-            words += list(dr.gather(mi.Vector4f, self.table, self.words // 4 * slot + part, active))
+        words = gather_words(self.table, self.words, slot, active)
         channels = colours()
         spectra = [mi.Spectrum(words[i * channels]) if channels == 1 else mi.Spectrum(words[i * channels:(i + 1) * channels])
                    for i in range(3)]

@@ -8,6 +8,8 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from .camera_pass import behind_emitters
+
 CONNECTED = ("PerspectiveCamera", "ThinLensCamera", "OrthographicCamera")
 
 SAME_POINT = 1e-4
@@ -73,9 +75,6 @@ def unblocked_by_visible(scene, integrator, p, d, distance, active):
     point. It does not where the point lies on such a shape itself."""
     ray = mi.Ray3f(p + d * distance, -d)
     hit = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
-    on_light = active & hit.is_valid() & (hit.shape.emitter() != None)  # noqa: E711 (array comparison)
-    behind = hit.compute_surface_interaction(ray, mi.RayFlags.Minimal, on_light).spawn_ray(ray.d)
-    hit[on_light] = integrator.skip_area_emitters(scene, behind, True, on_light)
-    start = dr.select(on_light, behind.o, ray.o)
-    expected = dr.norm(p - start)
+    hit, ray = behind_emitters(scene, integrator, hit, ray, active)
+    expected = dr.norm(p - ray.o)
     return active & hit.is_valid() & (dr.abs(hit.t - expected) < SAME_POINT * distance)

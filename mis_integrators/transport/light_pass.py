@@ -7,6 +7,7 @@ import mitsuba as mi
 
 from .packing import Store, float_bits, pack_direction, pack_surface
 from .random import next_2d, streams
+from .roulette import russian_roulette
 from .traits import lookup
 
 
@@ -20,6 +21,11 @@ def photon_words():
 PATHS_PER_LANE = 8
 """Light sub-paths that a SIMD lane of a CPU traces one after the other: a lane whose path has ended starts the next at once, instead
 of waiting for the longest path beside it. (A GPU needs the paths side by side.)"""
+
+
+def lane_count(n_paths):
+    """Lanes that trace so many light sub-paths."""
+    return -(-n_paths // PATHS_PER_LANE) if dr.backend_v(mi.Float) == dr.JitBackend.LLVM else n_paths
 
 
 def delta_adjoint(wi, wo, eta):
@@ -99,9 +105,7 @@ def trace_light_paths(scene, lights, traits, seed, n_paths: int, capacity: int, 
     next-event estimation could bring the same light there, from the point `source` (a `DirectionSample3f` as `sample_emission` makes it). The
     result then has a fourth array, these words.
     """
-    lanes = n_paths
-    if dr.hint(dr.backend_v(mi.Float) == dr.JitBackend.LLVM, mode='scalar'):
-        lanes = -(-n_paths // PATHS_PER_LANE)
+    lanes = lane_count(n_paths)
     lane = dr.arange(mi.UInt32, lanes)
     rng = streams(lane, seed)
     words = photon_words()
@@ -183,13 +187,7 @@ def trace_light_paths(scene, lights, traits, seed, n_paths: int, capacity: int, 
         eta *= bs.eta
         ray = si.spawn_ray(wo)
 
-        # ---- Russian roulette
-        relative = dr.max(flux) * strength
-        active &= relative > 0
-        survival = dr.minimum(relative * dr.square(eta), 0.95)
-        roulette = active & (depth >= rr_depth)
-        active &= ~roulette | (rng.next_float32(roulette) < survival)
-        flux = dr.select(roulette, flux * dr.rcp(survival), flux)
+        flux, active = russian_roulette(rng, flux, dr.max(flux) * strength, eta, depth >= rr_depth, active)
 
     if dr.hint(notebook is not None, mode='scalar'):
         return store.surface, store.power, store.count, store.notes

@@ -1,4 +1,4 @@
-"""Where light sub-paths start: light sub-paths of length one, which camera vertices can be joined with."""
+"""Where light sub-paths start: light sub-paths of length one, which camera vertices can be joined with, and what a second vertex sees of them."""
 
 from __future__ import annotations
 
@@ -24,3 +24,12 @@ def sample_light_starts(lights, seed, count: int, wavelengths, time):
 def read_starts(starts, index, active):
     """The starts at places `index`; zero (a null pointer) on inactive lanes."""
     return {name: dr.gather(type(values), values, index, active) for name, values in starts.items()}
+
+
+def seen_from(si, source, active):
+    """The point of a light where a sub-path starts, as `sample_emission` tells of it, as a direction sample at the sub-path's first vertex `si`."""
+    ds = dr.copy(source)
+    ds.d = ds.p - si.p
+    ds.dist = dr.norm(ds.d)
+    ds.d = dr.select(active, ds.d * dr.rcp(ds.dist), mi.Vector3f(0, 0, 1))
+    return ds

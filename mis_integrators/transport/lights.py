@@ -12,7 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .guide import direction_cell
+from .guide import EnvironmentGuide, direction_cell, infinite_emitters
 from .random import next_2d, streams
 from .spectra import channel_mean
 from .traits import UnsupportedScene, lookup, registry_table
@@ -99,6 +99,11 @@ class Lights:
         self.kind_table = mi.UInt32([_KINDS.index(k) for k in self.kinds])
         self._spot_tables(self.emitters)
         self._sphere_tables(self.emitters)
+
+    @classmethod
+    def seen_by(cls, scene, sensor, plugin):
+        """The lights of a scene; its environments, if any, send their light sub-paths where `sensor` will see something of them."""
+        return cls(scene, plugin, EnvironmentGuide(scene, sensor) if infinite_emitters(scene) else None)
 
     @property
     def dark(self):
@@ -260,7 +265,7 @@ class Lights:
 
     # ------------------------------------------------------------------ light sub-paths
 
-    def sample_emission(self, rng, time, wavelengths, active=True):
+    def sample_emission(self, rng, time, wavelengths):
         """Starts a light sub-path.
 
         Returns `(ray, flux, unreachable, source)`: the ray, the flux it carries (emitted radiance times cosine over all densities,
@@ -291,7 +296,7 @@ class Lights:
             flux = dr.select(chosen, value, flux)
             if name == "directionalarea":
                 unreachable |= chosen
-        flux = dr.select(active, flux * dr.rcp(probability), 0)
+        flux *= dr.rcp(probability)
         return ray, dr.select(dr.isfinite(channel_mean(flux)), flux, 0), unreachable, source
 
     def emission_ratio(self, ref, ds, active):

@@ -82,6 +82,11 @@ def unpack_caustic(word):
     return (word >> 31) != 0
 
 
+def gather_words(table, count, index, active):
+    """Row `index` of a table of floats with `count` of them a row, a multiple of four: a list of arrays."""
+    return [word for part in range(count // 4) for word in dr.gather(mi.Vector4f, table, count // 4 * index + part, active)]
+
+
 def rounded_up(count):
     """The next of 4, 5, 6, 7, 8, 10, 12, ...: few different buffer sizes, for they are literals of cached kernels."""
     step = 1 << max(count.bit_length() - 3, 0)

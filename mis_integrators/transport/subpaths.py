@@ -25,13 +25,14 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from .camera_pass import behind_emitters, start_camera_paths
+from .camera_pass import behind_emitters, start_camera_paths, within_crop
 from .junctions import Junction, scattered_mean
 from .lenses import Lens
-from .light_pass import PATHS_PER_LANE, scatter_light
+from .light_pass import lane_count, scatter_light
 from .packing import Store
 from .random import next_2d, streams
 from .records import Layout
+from .roulette import russian_roulette
 
 NO_PARENT = 0xffffffff
 STATES = ("near", "far")
@@ -104,9 +105,7 @@ def trace_light_subpaths(scene, lights, traits, weights, seed, n_paths: int, cap
     Returns `(vertices, count, lengths)`: the kept vertices, how many there were (width one; more than `capacity`: the surplus is missing), and the
     number of kept vertices of each path. `throughput` is flux through the surface, for one sub-path.
     """
-    lanes = n_paths
-    if dr.hint(dr.backend_v(mi.Float) == dr.JitBackend.LLVM, mode='scalar'):
-        lanes = -(-n_paths // PATHS_PER_LANE)
+    lanes = lane_count(n_paths)
     lane = dr.arange(mi.UInt32, lanes)
     rng = streams(lane, seed)
     store = Store(vertices=new_vertices(traits, capacity, weights.states), count=dr.zeros(mi.UInt32, 1), lengths=dr.zeros(mi.UInt32, n_paths))
@@ -174,13 +173,7 @@ def trace_light_subpaths(scene, lights, traits, weights, seed, n_paths: int, cap
         eta *= bs.eta
         ray = si.spawn_ray(wo)
 
-        # ---- Russian roulette
-        relative = dr.max(flux) * strength
-        active &= relative > 0
-        survival = dr.minimum(relative * dr.square(eta), 0.95)
-        roulette = active & (depth >= rr_depth)
-        active &= ~roulette | (rng.next_float32(roulette) < survival)
-        flux = dr.select(roulette, flux * dr.rcp(survival), flux)
+        flux, active = russian_roulette(rng, flux, dr.max(flux) * strength, eta, depth >= rr_depth, active)
 
     return store.vertices, store.count, store.lengths
 
@@ -197,11 +190,7 @@ def trace_camera_subpaths(scene, sensor, integrator, lights, traits, weights, se
     """
     path, active, rng, ray, sensor_weight, splat, aperture = start_camera_paths(sensor, seed, first, 1, n_paths, camera_paths, wavelength_sample)
     lens = Lens(sensor)
-    film = sensor.film()
-    offset, size = mi.ScalarVector2f(film.crop_offset()), mi.ScalarVector2f(film.crop_size())
-    inside = mi.Bool(True)
-    if dr.hint(film.sample_border(), mode='scalar'):
-        inside = dr.all((splat >= offset) & (splat < offset + size))
+    inside = within_crop(sensor.film(), splat)
     throughput = mi.Spectrum(sensor_weight)
     radiance = mi.Spectrum(0)
     depth = mi.UInt32(0)
@@ -291,12 +280,7 @@ def trace_camera_subpaths(scene, sensor, integrator, lights, traits, weights, se
         throughput *= weight
         eta *= bs.eta
         ray = si.spawn_ray(wo)
-        strength = dr.max(throughput)
-        active &= strength > 0
-        survival = dr.minimum(strength * dr.square(eta), 0.95)
-        roulette = active & (depth >= rr_depth)
-        active &= ~roulette | (rng.next_float32(roulette) < survival)
-        throughput = dr.select(roulette, throughput * dr.rcp(survival), throughput)
+        throughput, active = russian_roulette(rng, throughput, dr.max(throughput), eta, depth >= rr_depth, active)
         hit = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
 
     return radiance, dr.select(visible, mi.Float(1), mi.Float(0)), splat, store.vertices, store.count

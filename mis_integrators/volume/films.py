@@ -13,7 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..sums import Sums
-from ..transport.film import colour_channels
+from ..transport.film import add_squares, colour_channels, spread
 
 SHARED = 4
 """Channels of what all paths bring: colour, weight."""
@@ -83,13 +83,12 @@ class ViewAccumulator:
     def add(self, shared, own, iteration):
         """Adds the layers of an iteration, tensors (height, width, `SHARED`) and (height, width, `OWN`)."""
         self.sums.add("own", own)
-        for parity in range(2):
-            self.sums.add(f"shared{parity}", shared if iteration % 2 == parity else dr.zeros(mi.TensorXd, shared.shape))
+        same, other = (f"shared{(iteration + step) % 2}" for step in range(2))
+        self.sums.add(same, shared)
+        if other not in self.sums.tensors:
+            self.sums.add(other, dr.zeros(mi.TensorXd, shared.shape))
         if self.with_variance:
-            colour, weight = (mi.TensorXd(channels) for channels in (shared[:, :, :3], shared[:, :, 3:]))
-            self.sums.add("square", colour * colour)
-            self.sums.add("cross", colour * weight)
-            self.sums.add("weight_square", weight * weight)
+            add_squares(self.sums, shared[:, :, :3], shared[:, :, 3:])
         self.sums.done.add(iteration)
         dr.schedule(self.sums.tensors)
 
@@ -119,12 +118,11 @@ class ViewAccumulator:
     def variance(self):
         """Estimated variance of each pixel's mean (height, width, 3) from the iterations: that of Y - m D over W, or over the mean of D (delta
         method). The noise of emitters seen directly, if any, is not in it."""
-        n, total, sums = self.iterations, self.sums["shared0"] + self.sums["shared1"], self.sums
+        n, total = self.iterations, self.sums["shared0"] + self.sums["shared1"]
         mean = self._mean(total)
         rest = total[:, :, :3] - mean * total[:, :, 3:]
-        spread = sums["square"] - 2 * mean * sums["cross"] + mean * mean * sums["weight_square"] - rest * rest / n
         divisor = total[:, :, 3:] / n if self.ratio else self.expected
-        return dr.maximum(spread, 0) / (n * (n - 1) * dr.square(dr.select(divisor > 0, divisor, 1)))
+        return dr.maximum(spread(self.sums, mean) - rest * rest / n, 0) / (n * (n - 1) * dr.square(dr.select(divisor > 0, divisor, 1)))
 
     def pictures(self, variance):
         """Each view's picture (height, width, channels): colour, alpha, weight one, then those of the `variance` if asked for."""

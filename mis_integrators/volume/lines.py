@@ -172,7 +172,7 @@ def added_nulls(line, common):
 
 
 @dr.syntax
-def follow_nulls(traits, shift, pivot, own, line, common, number, seed, slots: int, active):
+def follow_nulls(shift, pivot, own, line, common, number, seed, slots: int, active):
     """Shifts the null interactions of paths, added ones included, from their `own` line to another `line`, or leaves them where they are if `shift`
     is ``None``.
 
@@ -240,7 +240,7 @@ def connect(traits, shift, pivot, own, line, common, number, seed, slots, active
     active = active & (line["density"] > 0) & (own["density"] > 0)
     log_density, tint, lost, empty = line["log_survival"], line["tint"], mi.Bool(False), mi.Bool(False)
     if traits.has_null_media:
-        log_density, tint, lost, empty = follow_nulls(traits, shift, pivot, own, line, common, number, seed, slots, active)
+        log_density, tint, lost, empty = follow_nulls(shift, pivot, own, line, common, number, seed, slots, active)
     log_ratio = log_density - own["log_density"]
     ratio = dr.minimum(line["density"] * dr.rcp(dr.maximum(own["density"], 1e-30)) * dr.exp(dr.minimum(log_ratio, 60)), LARGEST)
     ratio = dr.select(active & ~empty, dr.select(lost, SHIFT_INVALID, ratio), BLOCKED)

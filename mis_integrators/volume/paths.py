@@ -7,6 +7,7 @@ import mitsuba as mi
 
 from ..transport.lights import mis_power
 from ..transport.random import next_2d
+from ..transport.roulette import russian_roulette
 from .media import collision, section, transmittance
 
 
@@ -135,11 +136,9 @@ def incident_radiance(scene, lights, traits, ray, medium, origin, scatter_pdf, s
         specular[vertex] = delta
         depth[vertex] += 1
         medium[met & surface.is_medium_transition()] = surface.target_medium(ray.d)
-        active &= (passes | vertex | crosses) & (dr.max(throughput) > 0)
+        active &= passes | vertex | crosses
         if dr.hint(max_depth > 0, mode='scalar'):
             active &= depth < max_depth
-        survival = dr.minimum(dr.max(throughput) * strength * dr.square(eta), 0.95)
-        roulette = active & vertex & (depth >= rr_depth)
-        active &= ~roulette | (rng.next_float32(roulette) < survival)
-        throughput = dr.select(roulette, throughput * dr.rcp(survival), throughput)
+        begun = vertex & (depth >= rr_depth)
+        throughput, active = russian_roulette(rng, throughput, dr.max(throughput) * strength, eta, begun, active)
     return radiance

@@ -132,7 +132,6 @@ class Views:
         dr.make_opaque(self.table)
         self.needs_aperture = any(s.needs_aperture_sample() for s in sensors)
         self.needs_time = any(s.shutter_open_time() > 0 for s in sensors)
-        self.needs_border = any(self.borders)
 
     @staticmethod
     def check_sensor(group, plugin):

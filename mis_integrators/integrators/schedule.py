@@ -1,0 +1,12 @@
+"""The merge radius of progressive photon mapping: its parameters, and how it shrinks."""
+
+
+def read_radius(parameters):
+    """The parameters `initial_radius` and `alpha`."""
+    return (parameters.number("initial_radius", 0.0, lambda r: 0 <= r < float("inf"), "finite and at least 0 (0: automatic)"),
+            parameters.number("alpha", 1.0, lambda a: 0 < a <= 1, "in (0, 1]"))
+
+
+def shrunk(radius, alpha, iteration):
+    """R_i, R_i^2 = R_0^2 (i + 1)^(alpha - 1): a schedule of the iteration's index alone."""
+    return radius * (iteration + 1) ** (0.5 * (alpha - 1))
