@@ -13,6 +13,10 @@ import mitsuba as mi
 from .light_pass import photon_words
 from .packing import bits_float, unpack_caustic
 
+RUN = 32
+"""Photons of a row that a query tests before it visits those within its radius: one bit of a word each."""
+
+
 def table_size(capacity):
     """Table entries (a power of two) for `capacity` photons: two or more each, so that small grids fit."""
     return 1 << max(10, min(24, (2 * max(capacity, 2) - 1).bit_length()))
@@ -123,58 +127,68 @@ def read_power(power, index, active):
 
 
 def for_each_photon(photon_map, p, radius, active, visit, state):
-    """Calls `visit(index, record, offset, distance_squared, hit, state) -> state` for photons near `p`.
+    """Calls `visit(index, record, offset, distance_squared, hit, state) -> state` for photons within `radius` of `p`.
 
-    One flat loop over (row, photon) pairs, so that lanes need not agree on their rows. `hit` marks the lanes whose photon lies
-    within `radius` of `p` and belongs to the row that is being read; `record` holds the photon's surface words, `offset` is its
-    position minus `p`. `state` is a tuple of Dr.Jit arrays.
+    Row by row of the cells that the sphere reaches, in runs of `RUN` photons: a first loop over a run only tests distances and notes what is
+    within reach as a bit each, a second visits these. Lanes of a CPU's SIMD unit wait for one another in every loop: most photons of the
+    cells miss, so what is dear to do with a hit is not done in step with the misses, nor what is to be found out once a row.
+    `hit` marks the lanes whose photon belongs to the row that is being read (another one may share its place); `record` holds the photon's
+    surface words, `offset` is its position minus `p`. `state` is a tuple of Dr.Jit arrays.
     """
     grid = photon_map.grid
     inverse = dr.rcp(grid.cell)
     local = (p - grid.origin) * inverse
     reach = radius * inverse * 1.0001
-    first_y = mi.Int32(dr.floor(local.y - reach)) + 2
-    first_z = mi.Int32(dr.floor(local.z - reach)) + 2
-    # At least one: idle lanes divide by it, too, and an integer division by zero kills the process.
-    rows_y = dr.maximum(mi.UInt32(mi.Int32(dr.floor(local.y + reach)) + 3 - first_y), 1)
-    rows_z = mi.UInt32(mi.Int32(dr.floor(local.z + reach)) + 3 - first_z)
-    rows = dr.select(active, rows_y * rows_z, 0)
+    first_y, last_y = mi.Int32(dr.floor(local.y - reach)) + 2, mi.Int32(dr.floor(local.y + reach)) + 2
+    first_z, last_z = mi.Int32(dr.floor(local.z - reach)) + 2, mi.Int32(dr.floor(local.z + reach)) + 2
+    last_z = dr.select(active, last_z, first_z - 1)
     radius_squared = dr.square(radius)
-    longest = longest_row(grid.size)
 
-    def enter_row(row, index, end, y, z):
-        y, z = first_y + mi.Int32(row % rows_y), first_z + mi.Int32(row // rows_y)
-        low_y, low_z = mi.Float(y - 2), mi.Float(z - 2)
-        distance_y = dr.maximum(dr.maximum(low_y - local.y, local.y - low_y - 1), 0)
-        distance_z = dr.maximum(dr.maximum(low_z - local.z, local.z - low_z - 1), 0)
-        left = dr.square(reach) - dr.square(distance_y) - dr.square(distance_z)
-        half = dr.safe_sqrt(left) + 1e-3
-        first_x = dr.clip(mi.Int32(dr.floor(local.x - half)) + 2, 0, longest - 4)
-        last_x = dr.clip(mi.Int32(dr.floor(local.x + half)) + 2, -1, longest - 4)
-        base = grid.row(y, z)
-        near = (left > -1e-3) & (last_x >= first_x)
-        index = dr.gather(mi.UInt32, photon_map.start, base + mi.UInt32(first_x), near)
-        end = dr.gather(mi.UInt32, photon_map.start, base + mi.UInt32(last_x) + 1, near)
-        return row + 1, index, end, y, z
-
-    def step(row, index, end, y, z, state):
-        row, index, end, y, z = dr.if_stmt((row, index, end, y, z), index >= end, enter_row, lambda *same: same,
-                                           label="next row")
-        inside = index < end
-        record = dr.gather(mi.Vector4u, photon_map.surface, index, inside)
+    def read(index):
+        record = dr.gather(mi.Vector4u, photon_map.surface, index)
         position = mi.Point3f(bits_float(record.x), bits_float(record.y), bits_float(record.z))
-        offset = position - p
-        distance_squared = dr.squared_norm(offset)
-        hit = inside & (distance_squared < radius_squared)
+        return record, position, position - p
 
-        def met(index, record, offset, distance_squared, position, y, z, state):
-            own = grid.coordinates(position)
-            return visit(index, record, offset, distance_squared, (own.y == y) & (own.z == z), state)
+    def test(index, bit, hits):
+        _, _, offset = read(index)
+        return index + 1, bit << 1, hits | dr.select(dr.squared_norm(offset) < radius_squared, bit, 0)
 
-        state = dr.if_stmt((index, record, offset, distance_squared, position, y, z, state), hit, met,
-                           lambda index, record, offset, distance_squared, position, y, z, state: state, label="photon")
-        index = dr.select(inside, index + 1, index)
-        return row, index, end, y, z, state
+    def read_row(y, z, state):
+        start, end = _photons_of_row(photon_map, y, z, local, reach)
 
-    start = (mi.UInt32(0), mi.UInt32(0), mi.UInt32(0), mi.Int32(0), mi.Int32(0), state)
-    return dr.while_loop(start, lambda row, index, end, *_: (index < end) | (row < rows), step, label="photons")[-1]
+        def read_run(start, state):
+            until = dr.minimum(end, start + RUN)
+            *_, hits = dr.while_loop((mi.UInt32(start), mi.UInt32(1), mi.UInt32(0)), lambda index, bit, hits: index < until, test,
+                                     label="photons tested")
+
+            def meet(hits, state):
+                index = start + dr.tzcnt(hits)
+                record, position, offset = read(index)
+                own = grid.coordinates(position)
+                return hits & (hits - 1), visit(index, record, offset, dr.squared_norm(offset), (own.y == y) & (own.z == z), state)
+
+            _, state = dr.while_loop((hits, state), lambda hits, state: hits != 0, meet, label="photons met")
+            return until, state
+
+        _, state = dr.while_loop((start, state), lambda start, state: start < end, read_run, label="runs of photons")
+        wrap = y >= last_y
+        return dr.select(wrap, first_y, y + 1), dr.select(wrap, z + 1, z), state
+
+    return dr.while_loop((mi.Int32(first_y), mi.Int32(first_z), state), lambda y, z, state: z <= last_z, read_row, label="rows")[-1]
+
+
+def _photons_of_row(photon_map, y, z, local, reach):
+    """First photon, and the one after the last, of the cells of row (y, z) within `reach` of `local` (both in cells)."""
+    grid = photon_map.grid
+    longest = longest_row(grid.size)
+    low_y, low_z = mi.Float(y - 2), mi.Float(z - 2)
+    distance_y = dr.maximum(dr.maximum(low_y - local.y, local.y - low_y - 1), 0)
+    distance_z = dr.maximum(dr.maximum(low_z - local.z, local.z - low_z - 1), 0)
+    left = dr.square(reach) - dr.square(distance_y) - dr.square(distance_z)
+    half = dr.safe_sqrt(left) + 1e-3
+    first_x = dr.clip(mi.Int32(dr.floor(local.x - half)) + 2, 0, longest - 4)
+    last_x = dr.clip(mi.Int32(dr.floor(local.x + half)) + 2, -1, longest - 4)
+    base = grid.row(y, z)
+    near = (left > -1e-3) & (last_x >= first_x)
+    return (dr.gather(mi.UInt32, photon_map.start, base + mi.UInt32(first_x), near),
+            dr.gather(mi.UInt32, photon_map.start, base + mi.UInt32(last_x) + 1, near))
