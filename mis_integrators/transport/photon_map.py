@@ -14,7 +14,9 @@ from .light_pass import photon_words
 from .packing import bits_float, unpack_caustic
 
 RUN = 32
-"""Photons of a row that a query tests before it visits those within its radius: one bit of a word each."""
+"""Photons of a row that a query tests at once: one bit of a word each."""
+KEPT_RUNS = 4
+"""Runs with hits that a query keeps before it visits these."""
 
 
 def table_size(capacity):
@@ -49,9 +51,13 @@ class Grid:
         """Integer cell coordinates of points `p`."""
         return mi.Vector3i(dr.floor((p - self.origin) / self.cell)) + 2
 
+    def row_number(self, y, z):
+        """A number that tells row (y, z) from all others of the box, and rows near one another in any."""
+        return mi.UInt32(z) * self.lines + mi.UInt32(y)
+
     def row(self, y, z):
         """Table entry of the cell x = 0 of row (y, z); x counts up from there."""
-        return ((mi.UInt32(z) * self.lines + mi.UInt32(y)) * self.columns) & (self.size - 1)
+        return (self.row_number(y, z) * self.columns) & (self.size - 1)
 
 
 class PhotonMap:
@@ -129,10 +135,10 @@ def read_power(power, index, active):
 def for_each_photon(photon_map, p, radius, active, visit, state):
     """Calls `visit(index, record, offset, distance_squared, hit, state) -> state` for photons within `radius` of `p`.
 
-    Row by row of the cells that the sphere reaches, in runs of `RUN` photons: a first loop over a run only tests distances and notes what is
-    within reach as a bit each, a second visits these. Lanes of a CPU's SIMD unit wait for one another in every loop: most photons of the
-    cells miss, so what is dear to do with a hit is not done in step with the misses, nor what is to be found out once a row.
-    `hit` marks the lanes whose photon belongs to the row that is being read (another one may share its place); `record` holds the photon's
+    Lanes of a CPU's SIMD unit wait for one another in every loop, and two photons in three of the cells around `p` miss, so what is dear to do with
+    a hit must not go in step with the misses. Row by row of cells, runs of up to `RUN` photons are tested for distance only; the hits of a run
+    are kept as a word of bits. Once a lane keeps `KEPT_RUNS` runs with hits, or has seen all rows, the hits of all of these are visited.
+    `hit` marks the lanes whose photon belongs to the row that has been read (another one may share its place); `record` holds the photon's
     surface words, `offset` is its position minus `p`. `state` is a tuple of Dr.Jit arrays.
     """
     grid = photon_map.grid
@@ -153,28 +159,46 @@ def for_each_photon(photon_map, p, radius, active, visit, state):
         _, _, offset = read(index)
         return index + 1, bit << 1, hits | dr.select(dr.squared_norm(offset) < radius_squared, bit, 0)
 
-    def read_row(y, z, state):
-        start, end = _photons_of_row(photon_map, y, z, local, reach)
+    def search(y, z, start, end, runs):
+        first, last = _photons_of_row(photon_map, y, z, local, reach)
+        on = start < end                                      # still in a row that is longer than a run
+        start, end = dr.select(on, start, first), dr.select(on, end, last)
+        until = dr.minimum(start + RUN, end)
+        *_, hits = dr.while_loop((mi.UInt32(start), mi.UInt32(1), mi.UInt32(0)), lambda index, bit, hits: index < until, test,
+                                 label="photons tested")
+        runs = _chosen(hits != 0, [(start, hits, grid.row_number(y, z)), *runs[:-1]], runs)
+        done, wrap = until >= end, y >= last_y
+        y, z = dr.select(done, dr.select(wrap, first_y, y + 1), y), dr.select(done & wrap, z + 1, z)
+        return y, z, dr.select(done, 0, until), dr.select(done, 0, end), runs
 
-        def read_run(start, state):
-            until = dr.minimum(end, start + RUN)
-            *_, hits = dr.while_loop((mi.UInt32(start), mi.UInt32(1), mi.UInt32(0)), lambda index, bit, hits: index < until, test,
-                                     label="photons tested")
+    def meet(runs, state):
+        start, hits, row = runs[0]
+        index = start + dr.tzcnt(hits)
+        record, position, offset = read(index)
+        own = grid.coordinates(position)
+        state = visit(index, record, offset, dr.squared_norm(offset), grid.row_number(own.y, own.z) == row, state)
+        hits &= hits - 1
+        return _chosen(hits == 0, [*runs[1:], _no_run()], [(start, hits, row), *runs[1:]]), state
 
-            def meet(hits, state):
-                index = start + dr.tzcnt(hits)
-                record, position, offset = read(index)
-                own = grid.coordinates(position)
-                return hits & (hits - 1), visit(index, record, offset, dr.squared_norm(offset), (own.y == y) & (own.z == z), state)
+    def search_and_meet(y, z, start, end, state):
+        runs = [_no_run() for _ in range(KEPT_RUNS)]
+        y, z, start, end, runs = dr.while_loop((y, z, start, end, runs), lambda y, z, start, end, runs: (z <= last_z) & (runs[-1][1] == 0), search,
+                                               label="rows")
+        _, state = dr.while_loop((runs, state), lambda runs, state: runs[0][1] != 0, meet, label="photons met")
+        return y, z, start, end, state
 
-            _, state = dr.while_loop((hits, state), lambda hits, state: hits != 0, meet, label="photons met")
-            return until, state
+    begin = mi.Int32(first_y), mi.Int32(first_z), mi.UInt32(0), mi.UInt32(0), state
+    return dr.while_loop(begin, lambda y, z, *_: z <= last_z, search_and_meet, label="photons")[-1]
 
-        _, state = dr.while_loop((start, state), lambda start, state: start < end, read_run, label="runs of photons")
-        wrap = y >= last_y
-        return dr.select(wrap, first_y, y + 1), dr.select(wrap, z + 1, z), state
 
-    return dr.while_loop((mi.Int32(first_y), mi.Int32(first_z), state), lambda y, z, state: z <= last_z, read_row, label="rows")[-1]
+def _no_run():
+    """A run without hits: its first photon, its hits (a bit each), the number of its row."""
+    return mi.UInt32(0), mi.UInt32(0), mi.UInt32(0)
+
+
+def _chosen(condition, these, others):
+    """`dr.select` for lists of runs."""
+    return [tuple(dr.select(condition, a, b) for a, b in zip(this, other)) for this, other in zip(these, others)]
 
 
 def _photons_of_row(photon_map, y, z, local, reach):
