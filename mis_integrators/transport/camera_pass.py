@@ -11,7 +11,7 @@ from .random import next_2d, streams
 
 
 def film_samples(sensor, index, camera_paths: int, rng):
-    """Film positions of camera paths `index` (in pixels, crop offset included), in the order pixel by pixel, as `pixel_of`.
+    """Film positions of camera paths `index` (in pixels, crop offset included), in the order pixel by pixel, row by row.
 
     Returns `(position in [0, 1]^2 of the crop window, position for splatting)`; with a film that samples its border the
     grid covers the border too, as in Mitsuba's own integrators.
@@ -20,28 +20,13 @@ def film_samples(sensor, index, camera_paths: int, rng):
     size = mi.ScalarVector2i(film.crop_size())
     border = film.rfilter().border_size() if film.sample_border() else 0
     width = size.x + 2 * border
-    corner = pixel_of(index // camera_paths, width, size.y + 2 * border) - border + mi.Vector2i(film.crop_offset())
+    pixel = index // camera_paths
+    corner = mi.Vector2i(mi.Int32(pixel % width), mi.Int32(pixel // width)) - border + mi.Vector2i(film.crop_offset())
     position = mi.Vector2f(corner) + mi.Vector2f(next_2d(rng))
     scale = dr.rcp(mi.ScalarVector2f(film.crop_size()))
     unit = (position - mi.ScalarVector2f(film.crop_offset())) * scale
     splat = mi.Vector2f(corner) if film.rfilter().is_box_filter() else position
     return mi.Point2f(unit), mi.Point2f(splat)
-
-
-STRIP = 4
-"""Rows of pixels that are walked through together."""
-
-
-def pixel_of(number, width: int, height: int):
-    """The pixel of that number (array of integers below width x height) as a `Vector2i`: strip by strip of `STRIP` rows, each column by column,
-    so that the lanes of a SIMD unit hold a square of pixels, which meet the same surfaces and the same photons."""
-    strip = number // (STRIP * width)
-    place = number - strip * (STRIP * width)
-    whole = strip < height // STRIP                             # the last strip may have fewer rows
-    rest = max(height % STRIP, 1)
-    column = dr.select(whole, place // STRIP, place // rest)
-    row = dr.select(whole, place % STRIP, place % rest)
-    return mi.Vector2i(mi.Int32(column), mi.Int32(strip * STRIP + row))
 
 
 def film_sample_count(sensor):
