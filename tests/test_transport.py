@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from comparing import assert_frequencies
-from mis_integrators.transport import camera_pass, packing, photon_map
+from mis_integrators.transport import packing, photon_map
 from mis_integrators.transport.guide import EnvironmentGuide, cell_direction, direction_cell
 from mis_integrators.transport.lights import Lights, mis_power
 from mis_integrators.transport.random import mix, next_2d, streams
@@ -153,21 +153,6 @@ def test_map_finds_everything(seed, n, radius, offset):
     distances = np.sqrt(((queries[:, None] - photons[None]) ** 2).sum(-1))
     assert (number >= (distances < radius * (1 - 1e-4)).sum(axis=1)).all()
     assert (number <= (distances < radius * (1 + 1e-4)).sum(axis=1)).all()
-
-
-# --- Order of the camera paths -----------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("width, height", [(1, 1), (5, 3), (3, 4), (7, 9), (16, 8)])
-def test_every_pixel_has_its_number(width, height):
-    x, y = np.array(camera_pass.pixel_of(dr.arange(mi.UInt32, width * height), width, height))
-    np.testing.assert_array_equal(np.sort(y * width + x), np.arange(width * height))
-    assert x.min() == 0 and x.max() == width - 1
-
-
-def test_a_packet_holds_a_square():
-    x, y = np.array(camera_pass.pixel_of(dr.arange(mi.UInt32, 16), 64, 64))
-    assert np.ptp(x) == np.ptp(y) == 3
 
 
 # --- Packing ------------------------------------------------------------------------------------------------
