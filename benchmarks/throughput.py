@@ -59,9 +59,9 @@ class Parts:
 
     def __init__(self, session):
         self._session = session
-        self._light_kernels: list[dict] = []
-        self._light_pass = session._photons
-        session._photons = self._photons
+        self._kernels: dict[str, list[dict]] = {"light": [], "grid": []}
+        self._light_pass, self._map_pass = session._photons, session._map_pass
+        session._photons, session._map_pass = self._photons, self._maps
         self.rows: list[dict[str, float]] = []
 
     def __getitem__(self, part: str) -> float:
@@ -70,23 +70,25 @@ class Parts:
         return median(row[part] for row in self.rows)
 
     def observe(self, kernels: list[dict], seconds: float) -> None:
-        """Sort one iteration's kernels. Of those after the light pass, the first that is as wide as the film
-        is the camera pass; the others as wide as the film or as the list of camera vertices gather, and so
-        does what follows the last of them; what lies between builds the grids."""
-        widths = (self._session.chunk, self._session.vertex_capacity)
+        """Sort one iteration's kernels: those of the light pass and of the maps are set aside when these are done; of the rest, those up to the
+        first one as wide as the film are the camera pass, the others gather."""
         compiled = [i for i, kernel in enumerate(kernels) if kernel["type"] == dr.KernelType.JIT]
-        wide = [i for i in compiled if kernels[i]["size"] in widths]
-        row = dict.fromkeys(("camera", "grid", "gather"), 0.0)
-        for i, kernel in enumerate(kernels):
-            part = "camera" if i <= wide[0] else "gather" if i in wide or i > wide[-1] else "grid"
-            row[part] += kernel["execution_time"]
-        row["light"] = sum(kernel["execution_time"] for kernel in self._light_kernels)
+        camera = next(i for i in compiled if kernels[i]["size"] == self._session.chunk) + 1
+        parts = {**self._kernels, "camera": kernels[:camera], "gather": kernels[camera:]}
+        row = {part: sum(kernel["execution_time"] for kernel in mine) for part, mine in parts.items()}
         self.rows.append({**row, "idle": 1 - sum(row.values()) / 1000 / seconds})
 
     def _photons(self, *args):
         photons = self._light_pass(*args)
-        self._light_kernels = dr.kernel_history()
+        self._kernels["light"] = dr.kernel_history()
+        if self._session._map_pass != self._maps:              # recorded anew, with more room
+            self._map_pass, self._session._map_pass = self._session._map_pass, self._maps
         return photons
+
+    def _maps(self, *args):
+        maps = self._map_pass(*args)
+        self._kernels["grid"] = dr.kernel_history()
+        return maps
 
 
 def measure(path: Path, size: int, light_paths: int, photons_a_gather: float, seconds: float) -> Row:

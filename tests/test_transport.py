@@ -77,6 +77,12 @@ def test_map_away_from_the_origin(offset):
     assert_map_is_right(photons, queries, 0.2, 0.2)
 
 
+def test_queries_that_hit_in_more_rows_than_they_keep():
+    rng = np.random.default_rng(2)
+    photons, queries = rng.uniform(0, 1, (3000, 3)), rng.uniform(0.3, 0.7, (99, 3))
+    assert_map_is_right(photons, queries, np.linspace(0.05, 0.3, 99), 0.05)
+
+
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_map_of_a_plane(axis):
     """Photons and queries on one plane that is also a cell's border."""

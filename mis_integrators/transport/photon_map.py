@@ -13,6 +13,12 @@ import mitsuba as mi
 from .light_pass import photon_words
 from .packing import bits_float, unpack_caustic
 
+RUN = 32
+"""Photons of a row that a query tests at once: one bit of a word each."""
+KEPT_RUNS = 4
+"""Runs with hits that a query keeps before it visits these."""
+
+
 def table_size(capacity):
     """Table entries (a power of two) for `capacity` photons: two or more each, so that small grids fit."""
     return 1 << max(10, min(24, (2 * max(capacity, 2) - 1).bit_length()))
@@ -45,9 +51,13 @@ class Grid:
         """Integer cell coordinates of points `p`."""
         return mi.Vector3i(dr.floor((p - self.origin) / self.cell)) + 2
 
+    def row_number(self, y, z):
+        """A number that tells row (y, z) from all others of the box, and rows near one another in any."""
+        return mi.UInt32(z) * self.lines + mi.UInt32(y)
+
     def row(self, y, z):
         """Table entry of the cell x = 0 of row (y, z); x counts up from there."""
-        return ((mi.UInt32(z) * self.lines + mi.UInt32(y)) * self.columns) & (self.size - 1)
+        return (self.row_number(y, z) * self.columns) & (self.size - 1)
 
 
 class PhotonMap:
@@ -123,58 +133,86 @@ def read_power(power, index, active):
 
 
 def for_each_photon(photon_map, p, radius, active, visit, state):
-    """Calls `visit(index, record, offset, distance_squared, hit, state) -> state` for photons near `p`.
+    """Calls `visit(index, record, offset, distance_squared, hit, state) -> state` for photons within `radius` of `p`.
 
-    One flat loop over (row, photon) pairs, so that lanes need not agree on their rows. `hit` marks the lanes whose photon lies
-    within `radius` of `p` and belongs to the row that is being read; `record` holds the photon's surface words, `offset` is its
-    position minus `p`. `state` is a tuple of Dr.Jit arrays.
+    Lanes of a CPU's SIMD unit wait for one another in every loop, and two photons in three of the cells around `p` miss, so what is dear to do with
+    a hit must not go in step with the misses. Row by row of cells, runs of up to `RUN` photons are tested for distance only; the hits of a run
+    are kept as a word of bits. Once a lane keeps `KEPT_RUNS` runs with hits, or has seen all rows, the hits of all of these are visited.
+    `hit` marks the lanes whose photon belongs to the row that has been read (another one may share its place); `record` holds the photon's
+    surface words, `offset` is its position minus `p`. `state` is a tuple of Dr.Jit arrays.
     """
     grid = photon_map.grid
     inverse = dr.rcp(grid.cell)
     local = (p - grid.origin) * inverse
     reach = radius * inverse * 1.0001
-    first_y = mi.Int32(dr.floor(local.y - reach)) + 2
-    first_z = mi.Int32(dr.floor(local.z - reach)) + 2
-    # At least one: idle lanes divide by it, too, and an integer division by zero kills the process.
-    rows_y = dr.maximum(mi.UInt32(mi.Int32(dr.floor(local.y + reach)) + 3 - first_y), 1)
-    rows_z = mi.UInt32(mi.Int32(dr.floor(local.z + reach)) + 3 - first_z)
-    rows = dr.select(active, rows_y * rows_z, 0)
+    first_y, last_y = mi.Int32(dr.floor(local.y - reach)) + 2, mi.Int32(dr.floor(local.y + reach)) + 2
+    first_z, last_z = mi.Int32(dr.floor(local.z - reach)) + 2, mi.Int32(dr.floor(local.z + reach)) + 2
+    last_z = dr.select(active, last_z, first_z - 1)
     radius_squared = dr.square(radius)
-    longest = longest_row(grid.size)
 
-    def enter_row(row, index, end, y, z):
-        y, z = first_y + mi.Int32(row % rows_y), first_z + mi.Int32(row // rows_y)
-        low_y, low_z = mi.Float(y - 2), mi.Float(z - 2)
-        distance_y = dr.maximum(dr.maximum(low_y - local.y, local.y - low_y - 1), 0)
-        distance_z = dr.maximum(dr.maximum(low_z - local.z, local.z - low_z - 1), 0)
-        left = dr.square(reach) - dr.square(distance_y) - dr.square(distance_z)
-        half = dr.safe_sqrt(left) + 1e-3
-        first_x = dr.clip(mi.Int32(dr.floor(local.x - half)) + 2, 0, longest - 4)
-        last_x = dr.clip(mi.Int32(dr.floor(local.x + half)) + 2, -1, longest - 4)
-        base = grid.row(y, z)
-        near = (left > -1e-3) & (last_x >= first_x)
-        index = dr.gather(mi.UInt32, photon_map.start, base + mi.UInt32(first_x), near)
-        end = dr.gather(mi.UInt32, photon_map.start, base + mi.UInt32(last_x) + 1, near)
-        return row + 1, index, end, y, z
-
-    def step(row, index, end, y, z, state):
-        row, index, end, y, z = dr.if_stmt((row, index, end, y, z), index >= end, enter_row, lambda *same: same,
-                                           label="next row")
-        inside = index < end
-        record = dr.gather(mi.Vector4u, photon_map.surface, index, inside)
+    def read(index):
+        record = dr.gather(mi.Vector4u, photon_map.surface, index)
         position = mi.Point3f(bits_float(record.x), bits_float(record.y), bits_float(record.z))
-        offset = position - p
-        distance_squared = dr.squared_norm(offset)
-        hit = inside & (distance_squared < radius_squared)
+        return record, position, position - p
 
-        def met(index, record, offset, distance_squared, position, y, z, state):
-            own = grid.coordinates(position)
-            return visit(index, record, offset, distance_squared, (own.y == y) & (own.z == z), state)
+    def test(index, bit, hits):
+        _, _, offset = read(index)
+        return index + 1, bit << 1, hits | dr.select(dr.squared_norm(offset) < radius_squared, bit, 0)
 
-        state = dr.if_stmt((index, record, offset, distance_squared, position, y, z, state), hit, met,
-                           lambda index, record, offset, distance_squared, position, y, z, state: state, label="photon")
-        index = dr.select(inside, index + 1, index)
-        return row, index, end, y, z, state
+    def search(y, z, start, end, runs):
+        first, last = _photons_of_row(photon_map, y, z, local, reach)
+        on = start < end                                      # still in a row that is longer than a run
+        start, end = dr.select(on, start, first), dr.select(on, end, last)
+        until = dr.minimum(start + RUN, end)
+        *_, hits = dr.while_loop((mi.UInt32(start), mi.UInt32(1), mi.UInt32(0)), lambda index, bit, hits: index < until, test,
+                                 label="photons tested")
+        runs = _chosen(hits != 0, [(start, hits, grid.row_number(y, z)), *runs[:-1]], runs)
+        done, wrap = until >= end, y >= last_y
+        y, z = dr.select(done, dr.select(wrap, first_y, y + 1), y), dr.select(done & wrap, z + 1, z)
+        return y, z, dr.select(done, 0, until), dr.select(done, 0, end), runs
 
-    start = (mi.UInt32(0), mi.UInt32(0), mi.UInt32(0), mi.Int32(0), mi.Int32(0), state)
-    return dr.while_loop(start, lambda row, index, end, *_: (index < end) | (row < rows), step, label="photons")[-1]
+    def meet(runs, state):
+        start, hits, row = runs[0]
+        index = start + dr.tzcnt(hits)
+        record, position, offset = read(index)
+        own = grid.coordinates(position)
+        state = visit(index, record, offset, dr.squared_norm(offset), grid.row_number(own.y, own.z) == row, state)
+        hits &= hits - 1
+        return _chosen(hits == 0, [*runs[1:], _no_run()], [(start, hits, row), *runs[1:]]), state
+
+    def search_and_meet(y, z, start, end, state):
+        runs = [_no_run() for _ in range(KEPT_RUNS)]
+        y, z, start, end, runs = dr.while_loop((y, z, start, end, runs), lambda y, z, start, end, runs: (z <= last_z) & (runs[-1][1] == 0), search,
+                                               label="rows")
+        _, state = dr.while_loop((runs, state), lambda runs, state: runs[0][1] != 0, meet, label="photons met")
+        return y, z, start, end, state
+
+    begin = mi.Int32(first_y), mi.Int32(first_z), mi.UInt32(0), mi.UInt32(0), state
+    return dr.while_loop(begin, lambda y, z, *_: z <= last_z, search_and_meet, label="photons")[-1]
+
+
+def _no_run():
+    """A run without hits: its first photon, its hits (a bit each), the number of its row."""
+    return mi.UInt32(0), mi.UInt32(0), mi.UInt32(0)
+
+
+def _chosen(condition, these, others):
+    """`dr.select` for lists of runs."""
+    return [tuple(dr.select(condition, a, b) for a, b in zip(this, other)) for this, other in zip(these, others)]
+
+
+def _photons_of_row(photon_map, y, z, local, reach):
+    """First photon, and the one after the last, of the cells of row (y, z) within `reach` of `local` (both in cells)."""
+    grid = photon_map.grid
+    longest = longest_row(grid.size)
+    low_y, low_z = mi.Float(y - 2), mi.Float(z - 2)
+    distance_y = dr.maximum(dr.maximum(low_y - local.y, local.y - low_y - 1), 0)
+    distance_z = dr.maximum(dr.maximum(low_z - local.z, local.z - low_z - 1), 0)
+    left = dr.square(reach) - dr.square(distance_y) - dr.square(distance_z)
+    half = dr.safe_sqrt(left) + 1e-3
+    first_x = dr.clip(mi.Int32(dr.floor(local.x - half)) + 2, 0, longest - 4)
+    last_x = dr.clip(mi.Int32(dr.floor(local.x + half)) + 2, -1, longest - 4)
+    base = grid.row(y, z)
+    near = (left > -1e-3) & (last_x >= first_x)
+    return (dr.gather(mi.UInt32, photon_map.start, base + mi.UInt32(first_x), near),
+            dr.gather(mi.UInt32, photon_map.start, base + mi.UInt32(last_x) + 1, near))
