@@ -126,9 +126,9 @@ def trace_camera_vertices(scene, sensor, integrator, lights, traits, soften, see
             hit_layout().write(store.hits, values, slot, met)
 
         active &= si.is_valid()
+        met = mi.Bool(active)                        # a surface, perhaps the last one
         bsdf = si.bsdf(ray)
         if dr.hint(max_depth > 0, mode='scalar'):
-            visible |= active & (depth >= max_depth) & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
             active &= depth < max_depth
         smooth = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
 
@@ -145,9 +145,9 @@ def trace_camera_vertices(scene, sensor, integrator, lights, traits, soften, see
         number = dr.select(wanted, number + 1, number)
 
         # ---- Go on
-        bs, weight = bsdf.sample(context, si, rng.next_float32(active), next_2d(rng, active), active)
+        bs, weight = bsdf.sample(context, si, rng.next_float32(met), next_2d(rng, met), met)
         delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-        visible |= active & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
+        visible |= met & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
         wo = si.to_world(bs.wo)
         value, p_forward, p_back = junction.between(towards, wo, active & ~delta)
         parent = dr.select(active & ~delta, slot, parent)

@@ -241,9 +241,9 @@ def trace_camera_subpaths(scene, sensor, integrator, lights, traits, weights, se
                 ledger.met(path, depth, light, share, shown)
 
         active &= si.is_valid()
+        met = mi.Bool(active)                        # a surface, perhaps the last one
         bsdf = si.bsdf(ray)
         if dr.hint(max_depth > 0, mode='scalar'):
-            visible |= active & (depth >= max_depth) & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
             active &= depth < max_depth
         smooth = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
 
@@ -280,9 +280,9 @@ def trace_camera_subpaths(scene, sensor, integrator, lights, traits, weights, se
         parent = dr.select(wanted, slot, parent)
 
         # ---- Go on
-        bs, weight = bsdf.sample(context, si, rng.next_float32(active), next_2d(rng, active), active)
+        bs, weight = bsdf.sample(context, si, rng.next_float32(met), next_2d(rng, met), met)
         delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-        visible |= active & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
+        visible |= met & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
         wo = si.to_world(bs.wo)
         value, p_forward, p_back = junction.between(towards, wo, active & ~delta)
         state = _either(active, weights.left(state, p_forward, p_back, delta, scattered_mean(value, si.n, wo)), state)
