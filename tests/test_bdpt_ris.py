@@ -356,7 +356,8 @@ def test_kernels_know_neither_seed_nor_room(rgb, name):
         dr.kernel_history_clear()
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
             session.iterate()
-        compiled.append({kernel["hash"] for kernel in dr.kernel_history() if kernel["type"] == dr.KernelType.JIT and kernel["operation_count"] > 500})
+        compiled.append({kernel["hash"] for kernel in dr.kernel_history()
+                         if kernel["type"] == dr.KernelType.JIT and kernel["operation_count"] > 500})
         grids.add(tuple(session.grid.resolution) if name == "bdpt_ris" else seed)
     assert len(grids) > 1 and len(compiled[0]) >= 4
     assert compiled[1] <= compiled[0] and compiled[2] <= compiled[0]

@@ -139,7 +139,7 @@ class BDPTSession(IterativeSession):
         self._freeze()
 
     def _freeze(self, grown=None):
-        """Records the passes anew, or those that use the buffer that has `grown`; from the second iteration on, their kernels run without their Python."""
+        """Records the passes anew, or those that use the buffer that has `grown`; from the second iteration on, kernels run without their Python."""
         self._tables = [self.traits.lambertian, self.traits.perturbed, *self.lights.tables()]
         for name, (function, buffers) in self.PASSES.items():
             if grown is None or grown in buffers:

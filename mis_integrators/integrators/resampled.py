@@ -99,7 +99,7 @@ class ResampledSession(IterativeSession):
     """Recorded passes: the method of each, and the buffers that it uses."""
 
     def _freeze(self, grown=None):
-        """Records the passes anew, or those that use the buffer that has `grown`; from the second iteration on, their kernels run without their Python."""
+        """Records the passes anew, or those that use the buffer that has `grown`; from the second iteration on, kernels run without their Python."""
         dr.make_opaque(self.records, self.shares)                 # else their first values, all ones, would be literals of kernels
         self._tables = [self.traits.lambertian, self.traits.perturbed, self.records, self.shares, *self.grid.tables(), *self.lights.tables()]
         for name, (function, buffers) in self.PASSES.items():

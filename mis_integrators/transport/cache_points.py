@@ -48,7 +48,7 @@ class CacheGrid:
         self.resolution = [int(n) for n in np.maximum(np.ceil(size / edge), 1)]
         self._low = dr.opaque(mi.Point3f, [float(x) for x in low])
         self._scale = dr.opaque(mi.Float, 1 / edge)
-        self._cells = dr.opaque(mi.Point3u, self.resolution)         # no literals: path kernels would be compiled anew for each seed's cache points
+        self._cells = dr.opaque(mi.Point3u, self.resolution)         # as literals they would have path kernels compiled anew for each seed
         self.rows = FACINGS * int(np.prod(self.resolution))
         self.table, self.spread = _nearest(self, mi.Point3f(points), mi.Normal3f(normals), len(p), dr.opaque(mi.Float, edge))
         dr.eval(self.table, self.spread)
