@@ -130,7 +130,8 @@ class ResampledSession(IterativeSession):
 
     def _ends(self, starts, light, places, found):
         M = self.integrator.light_paths
-        return LightEnds(self.traits, self.lights, starts, M, light, places, dr.minimum(found, dr.opaque(mi.UInt32, self.capacity["ends"])) + M, self.reach)
+        kept = dr.minimum(found, dr.opaque(mi.UInt32, self.capacity["ends"]))
+        return LightEnds(self.traits, self.lights, starts, M, light, places, kept + M, self.reach)
 
     def _targets(self, scene, sensor, tables, seed, light, count, lengths, first, cache, spectral, target):
         """q*/p of every light vertex of M sub-paths (from the number `first` on) at every cache point if nothing stood between, row by row; whether nothing

@@ -90,8 +90,8 @@ def rounded_up(count):
 
 
 def from_numpy(dtype, values):
-    """The numbers `values` (NumPy, flat) as a Dr.Jit array of type `dtype` in memory of its own. Without the copy Dr.Jit goes on using NumPy's memory,
-    and kernels that read it are compiled anew whenever that happens to be aligned in another way."""
+    """The numbers `values` (NumPy, flat) as a Dr.Jit array of type `dtype` in memory of its own. Without the copy Dr.Jit goes on using NumPy's
+    memory, and kernels that read it are compiled anew whenever that happens to be aligned in another way."""
     array = dtype(np.asarray(values, np.float32 if dr.is_float_v(dtype) else np.uint32))
     array = array + dr.opaque(dtype, 0)              # (a gather of all would be the array itself)
     dr.eval(array)

@@ -55,7 +55,8 @@ class Proposals:
         start = point * self.width
         uniform = rng.next_float32(active) < dr.gather(mi.Float, self.uniform, point, active)
         u = rng.next_float32(active)
-        chosen = dr.binary_search(0, 1 << self.steps, lambda i: dr.gather(mi.Float, self.cumulative, start + dr.minimum(i, self.width - 1), active) <= u)
+        end = start + (self.width - 1)
+        chosen = dr.binary_search(0, 1 << self.steps, lambda i: dr.gather(mi.Float, self.cumulative, dr.minimum(start + i, end), active) <= u)
         anywhere = mi.UInt32(u * mi.Float(self.count))
         last = dr.maximum(self.count, 1) - 1
         return dr.minimum(dr.select(uniform, anywhere, chosen), last)
