@@ -13,7 +13,7 @@ import pytest
 from comparing import Estimate, SessionBatches, agree, assert_same, collect_until
 from test_against_path import MONO, RGB, SPECTRAL, caustic_scene
 from test_analytic import inside_sphere, series
-from test_bdpm import last_words
+from test_bdpm import glossy_box, last_words
 from test_bdpt import JointPaths, room
 from worlds import EMITTERS, POINT_LIKE, T, diffuse, film, has_delta, look, path, ptracer, tray
 from mis_integrators.transport.camera_vertices import STEP, leave, not_left, step_to_hit, step_to_vertex, sum_before
@@ -343,6 +343,24 @@ def test_memory_is_bounded(rgb, monkeypatch):
     width = 50 + session.capacity["ends"]
     assert 1 <= dr.width(session.cache["depth"]) <= 6000 // width < resampled.FEWEST_CACHE_POINTS
     agree(plugin("bdpt_ris", light_paths=50), path(), scene, blocks=1, whole=0.05, block=0.05, most=600)
+
+
+@pytest.mark.parametrize("name", ["bdpt", "vcm", "bdpt_ris"])
+def test_kernels_know_neither_seed_nor_room(rgb, name):
+    """Another seed, with other cache points and a grid of other cells about them, and buffers of other sizes, one of which grows: no path kernel is
+    compiled anew. (Merging knows the size of its table, which goes with the light buffer's.)"""
+    scene, compiled, grids = glossy_box(size=16), [], set()
+    for seed in range(3):
+        session = mi.load_dict({"type": name, "max_depth": 4, "camera_paths": 1}).session(scene, 0, seed, 0)
+        session.capacity.update(camera=2048 >> seed, light=session.capacity["light"] if name == "vcm" else (1024, 64, 2048)[seed])
+        dr.kernel_history_clear()
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+            session.iterate()
+        compiled.append({kernel["hash"] for kernel in dr.kernel_history()
+                         if kernel["type"] == dr.KernelType.JIT and kernel["operation_count"] > 500})
+        grids.add(tuple(session.grid.resolution) if name == "bdpt_ris" else seed)
+    assert len(grids) > 1 and len(compiled[0]) >= 4
+    assert compiled[1] <= compiled[0] and compiled[2] <= compiled[0]
 
 
 @pytest.mark.parametrize("parameters, words", [

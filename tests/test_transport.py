@@ -22,6 +22,20 @@ def _rgb(rgb):
 # --- Photon map -------------------------------------------------------------------------------------------
 
 
+def test_kernels_do_not_know_where_numpy_keeps_numbers():
+    """Arrays that begin at other addresses, modulo the alignment that vector loads want, are read by one kernel."""
+    numbers, kernels = np.arange(1000, dtype=np.float32), set()
+    for offset in range(16):
+        array = packing.from_numpy(mi.Float, numbers[offset:offset + 400])
+        dr.kernel_history_clear()
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+            records = dr.gather(mi.Vector4f, array, dr.arange(mi.UInt32, 100)) + 1
+            dr.eval(records)
+        kernels |= {kernel["hash"] for kernel in dr.kernel_history() if kernel["type"] == dr.KernelType.JIT}
+        np.testing.assert_array_equal(packing.to_numpy(records).T.ravel(), numbers[offset:offset + 400] + 1)
+    assert len(kernels) == 1
+
+
 def query_counts(photons, queries, radii, cell, capacity=None, low=None, high=None):
     """Photons that the map finds within the radius of each query: their number, and the sum of their (fake) powers."""
     photons, queries = np.asarray(photons, np.float32).reshape(-1, 3), np.asarray(queries, np.float32).reshape(-1, 3)

@@ -113,6 +113,10 @@ class BDPTSession(IterativeSession):
 
     shortest = 2
     """Segments that a light sub-path adds at least to a camera path with which it is joined."""
+    PASSES = {"_light_pass": ("_trace_light", ("light",)), "_camera_pass": ("_trace_camera", ("camera",)),
+              "_pair_pass": ("_list_pairs", ("light", "camera", "pairs")), "_connection_pass": ("_connect", ("light", "camera", "pairs")),
+              "_sensor_pass": ("_join_sensor", ("light",))}
+    """Recorded passes: the method of each, and the buffers that it uses."""
 
     def __init__(self, integrator, scene, sensor, seed, iterations):
         super().__init__(integrator, scene, sensor, seed, iterations)
@@ -131,14 +135,12 @@ class BDPTSession(IterativeSession):
         self.recorded = recorder()
         self._freeze()
 
-    def _freeze(self):
-        """Records the passes anew; from the second iteration on, their kernels run without their Python."""
+    def _freeze(self, grown=None):
+        """Records the passes anew, or those that use the buffer that has `grown`; from the second iteration on, kernels run without their Python."""
         self._tables = [self.traits.lambertian, self.traits.perturbed, *self.lights.tables()]
-        self._light_pass = self.recorded(self._trace_light)
-        self._camera_pass = self.recorded(self._trace_camera)
-        self._pair_pass = self.recorded(self._list_pairs)
-        self._connection_pass = self.recorded(self._connect)
-        self._sensor_pass = self.recorded(self._join_sensor)
+        for name, (function, buffers) in self.PASSES.items():
+            if grown is None or grown in buffers:
+                setattr(self, name, self.recorded(getattr(self, function)))
 
     def light_count(self):
         """Light sub-paths with each part of the camera paths."""

@@ -61,7 +61,7 @@ class BDPTRIS(ResampledIntegrator):
          BSDF there. (Default: ``f_y_rho_g_v``)
      * - camera_paths
        - |int|
-       - Camera paths per pixel and iteration. (Default: 1)
+       - Camera paths per pixel and iteration, which share its light sub-paths and pmfs. (Default: 4)
      * - variance
        - |bool|
        - Adds the channels ``var.R``, ``var.G``, ``var.B`` (mono: ``var.Y``): the estimated variance of the pixel mean over the

@@ -211,12 +211,12 @@ class IterativeSession:
 
     def _grown(self, name, count):
         """Whether the `count` (an array of width one) found more than there is room for in the buffer of that name; then there
-        will be more room. For sessions with a dictionary `capacity` and a method `_freeze`, which records the passes anew."""
+        will be more room. For sessions with a dictionary `capacity` and a method `_freeze`, which records anew the passes that use that buffer."""
         found = int(count[0])
         if found <= self.capacity[name]:
             return False
         self.capacity[name] = rounded_up(found + found // 8)
-        self._freeze()
+        self._freeze(name)
         return True
 
     def fill_film(self):

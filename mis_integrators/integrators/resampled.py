@@ -17,7 +17,7 @@ from ..transport.lenses import Lens
 from ..transport.light_ends import END, LightEnds, list_ends
 from ..transport.light_starts import sample_light_starts
 from ..transport.lights import Lights
-from ..transport.packing import rounded_up
+from ..transport.packing import from_numpy, rounded_up, to_numpy
 from ..transport.proposals import Proposals, cumulative_sums
 from ..transport.random import mix, next_2d, vertex_streams
 from ..transport.recording import lanes, recorder
@@ -33,13 +33,14 @@ CACHE_SHARE, FEWEST_CACHE_POINTS = 1 / 300, 256
 """Cache points: this share of a part's camera vertices, but at least so many. More of them cost shadow rays."""
 MOST_PAIRS = 1 << 24
 """Pairs of a cache point and a light vertex at most, four bytes each (and some more while they are made); beyond that there are fewer cache points."""
-PILOT_SETS = 8
-"""Sets of M light sub-paths from which Q and Q_s are estimated before the first iteration, if as many are traced."""
+PILOT_PATHS, MOST_PILOT_SETS = 400, 8
+"""Light sub-paths from which Q and Q_s are estimated before the first iteration, in sets of M; at most so many sets."""
 
 
 class ResampledIntegrator(IterativeIntegrator):
     """Parameters of both plugins; `aware` tells them apart."""
 
+    CAMERA_PATHS = 4, 1, "at least 1"
     aware = True
 
     def read_parameters(self, parameters):
@@ -88,16 +89,19 @@ class ResampledSession(IterativeSession):
         self.cache = None
         self._freeze()
 
-    def _freeze(self):
-        """Records the passes anew; from the second iteration on, their kernels run without their Python."""
-        dr.eval(self.records, self.shares)
+    PASSES = {"_light_pass": ("_trace_light", ("light",)), "_camera_pass": ("_trace_camera", ("camera", "hits")),
+              "_pilot_pass": ("_pilot_targets", ("light", "ends")), "_target_pass": ("_own_targets", ("light", "ends")),
+              "_connection_pass": ("_connect", ("light", "camera", "ends")), "_hit_pass": ("_meet", ("camera", "hits")),
+              "_sensor_pass": ("_join_sensor", ("light",))}
+    """Recorded passes: the method of each, and the buffers that it uses."""
+
+    def _freeze(self, grown=None):
+        """Records the passes anew, or those that use the buffer that has `grown`; from the second iteration on, kernels run without their Python."""
+        dr.make_opaque(self.records, self.shares)                 # else their first values, all ones, would be literals of kernels
         self._tables = [self.traits.lambertian, self.traits.perturbed, self.records, self.shares, *self.grid.tables(), *self.lights.tables()]
-        self._light_pass = self.recorded(self._trace_light)
-        self._pilot_pass, self._target_pass = self.recorded(self._pilot_targets), self.recorded(self._own_targets)
-        self._camera_pass = self.recorded(self._trace_camera)
-        self._connection_pass = self.recorded(self._connect)
-        self._hit_pass = self.recorded(self._meet)
-        self._sensor_pass = self.recorded(self._join_sensor)
+        for name, (function, buffers) in self.PASSES.items():
+            if grown is None or grown in buffers:
+                setattr(self, name, self.recorded(getattr(self, function)))
 
     def weights(self):
         """The weights of this session."""
@@ -123,7 +127,8 @@ class ResampledSession(IterativeSession):
 
     def _ends(self, starts, light, places, found):
         M = self.integrator.light_paths
-        return LightEnds(self.traits, self.lights, starts, M, light, places, dr.minimum(found, self.capacity["ends"]) + M, self.reach)
+        kept = dr.minimum(found, dr.opaque(mi.UInt32, self.capacity["ends"]))
+        return LightEnds(self.traits, self.lights, starts, M, light, places, kept + M, self.reach)
 
     def _targets(self, scene, sensor, tables, seed, light, count, lengths, first, cache, spectral, target):
         """q*/p of every light vertex of M sub-paths (from the number `first` on) at every cache point if nothing stood between, row by row; whether nothing
@@ -132,9 +137,8 @@ class ResampledSession(IterativeSession):
         places, found = list_ends(light, count, lengths, first, M, self.capacity["light"], room)
         starts = self._starts(sensor, seed, spectral)
         ends = self._ends(starts, light, places, found)
-        width = M + room
-        points = dr.width(cache["depth"])
-        index = lanes(points * width)
+        index = lanes(dr.width(cache["depth"]) * (M + room))
+        width = dr.opaque(mi.UInt32, M + room)
         point, end = index // width, index % width
         active = end < dr.gather(mi.UInt32, ends.count, 0)
         z = {name: dr.gather(type(values), values, point, active) for name, values in cache.items()}
@@ -233,7 +237,7 @@ class ResampledSession(IterativeSession):
     def _prepare(self):
         """Draws the cache points, and estimates Q and Q_s there."""
         spectral = shared_wavelengths(self.sensor, mix(self.seed, PILOT, WAVELENGTH))
-        traced = self._camera(PILOT, mi.UInt32(0), spectral)
+        traced = self._camera(PILOT, dr.opaque(mi.UInt32, 0), spectral)
         light = self._light(PILOT, 0, spectral)
         vertices, M = min(int(traced[4][0]), self.capacity["camera"]), self.integrator.light_paths
         wanted = min(max(FEWEST_CACHE_POINTS, int(vertices * CACHE_SHARE)), max(vertices, 1))
@@ -251,7 +255,7 @@ class ResampledSession(IterativeSession):
         order = read_vertices(camera, dr.arange(mi.UInt32, max(vertices, 1)), active, ("path", "number"), STEP)
         order = np.lexsort((np.array(order["number"]), np.array(order["path"])))        # places in the buffer are accidental
         chosen = np.random.default_rng(mix(self.seed, PILOT, CAMERA)).choice(order, count, replace=False)
-        cache = read_vertices(camera, mi.UInt32(chosen.astype(np.uint32)), active, states=STEP)
+        cache = read_vertices(camera, from_numpy(mi.UInt32, chosen), active, states=STEP)
         cache = {name: cache[name] for name in ("p", "n", "ns", "towards", "value", "density", "depth", "hit", "near") if name in cache}
         cache["through"] = dr.full(mi.Bool, False, count)
         if "hit" in cache:
@@ -263,9 +267,9 @@ class ResampledSession(IterativeSession):
     def _integrals(self, light, spectral):
         """`Q_s`, `Q_blind`, `doubts` and `ends_s` as `tabulate` takes them."""
         M, points, cache = self.integrator.light_paths, dr.width(self.cache["depth"]), self.cache
-        sets = max(min(PILOT_SETS, self.light_chunk // M), 1)
-        normals = np.array(dr.mulsign(cache["n"], dr.dot(cache["n"], cache["towards"]))).T
-        near = around(np.array(cache["p"]).T, normals, self.integrator.cache_neighbors, self.grid.normal_cost)
+        sets = max(min(-(-PILOT_PATHS // M), MOST_PILOT_SETS, self.light_chunk // M), 1)
+        normals = to_numpy(dr.mulsign(cache["n"], dr.dot(cache["n"], cache["towards"]))).T
+        near = around(to_numpy(cache["p"]).T, normals, self.integrator.cache_neighbors, self.grid.normal_cost)
         Q_s, Q_blind, doubts, ends_s = np.zeros((points, LENGTHS)), np.zeros(points), np.zeros(points), np.zeros(LENGTHS)
         for k in range(sets):
             r, seen, _, _, found, vertices, _ = self._ends_fit(lambda: self._pilot_pass(

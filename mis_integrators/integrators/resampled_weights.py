@@ -21,6 +21,7 @@ import numpy as np
 
 from ..transport.light_ends import END
 from ..transport.light_starts import seen_from
+from ..transport.packing import from_numpy
 from ..transport.proposals import BLIND_SHARE, uniform_share
 from ..transport.spectra import channel_mean
 from ..weights import bidirectional as theory
@@ -160,4 +161,4 @@ def tabulate(grid, Q_s, Q_blind, doubts, ends_s):
     e = np.clip(doubts[near].mean(axis=1), LEAST_DOUBT, 1)
     shares = (Q_s * inverse(Q)[:, None])[near].mean(axis=1) + (~(Q > 0))[near].mean(axis=1)[:, None] * (ends_s / ends)
     records = np.stack([a, uniform / ends, c, e], axis=1)
-    return mi.Float(records.ravel().astype(np.float32)), mi.Float(shares.ravel().astype(np.float32))
+    return tuple(from_numpy(mi.Float, values.ravel()) for values in (records, shares))

@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..transport.irradiance_cache import colours
-from ..transport.packing import gather_words
+from ..transport.packing import from_numpy, gather_words
 from ..transport.random import next_2d, streams
 from ..transport.spectra import channel_mean
 
@@ -49,7 +49,7 @@ class Surroundings:
                 value = np.take_along_axis(value, order, axis=1)
                 for group, (a, b) in enumerate(zip(ends[:-1], ends[1:])):
                     table[1:, group, number, channel] = value[:, a:b].mean(axis=1)
-        self.table = mi.Float(table.ravel())
+        self.table = from_numpy(mi.Float, table.ravel())
 
     @staticmethod
     def _neighbours(scene, cache, cells):

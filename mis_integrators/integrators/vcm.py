@@ -7,6 +7,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..transport.merging import merge, vertex_map
+from ..transport.packing import to_numpy
 from ..transport.photon_map import smallest_cell
 from ..transport.recording import lanes
 from ..transport.subpaths import read_vertices
@@ -84,6 +85,7 @@ class VCMSession(BDPTSession):
     """Iterations of `vcm`: those of `bdpt`, and merging. Films that are rendered in parts have their light sub-paths in parts, too."""
 
     shortest = 1
+    PASSES = {**BDPTSession.PASSES, "_merge_pass": ("_merge_vertices", ("light", "camera"))}
 
     def __init__(self, integrator, scene, sensor, seed, iterations):
         self.radius = integrator.initial_radius or None
@@ -96,10 +98,6 @@ class VCMSession(BDPTSession):
 
     def light_count(self):
         return -(-self.integrator.photon_count // self.chunks) or self.chunk
-
-    def _freeze(self):
-        super()._freeze()
-        self._merge_pass = self.recorded(self._merge_vertices)
 
     def radius_at(self, iteration):
         """The merge radius."""
@@ -135,7 +133,7 @@ class VCMSession(BDPTSession):
             if not self._grown("camera", count):
                 break
         vertices = read_vertices(camera, dr.arange(mi.UInt32, int(count[0])), True, ("p", "number"))
-        points = np.array(vertices["p"])[:, np.array(vertices["number"]) == 0]
+        points = to_numpy(vertices["p"])[:, np.array(vertices["number"]) == 0]
         if points.shape[1]:
             low, high = np.percentile(points, [2, 98], axis=1)
             self.radius = max(RADIUS_SHARE * float(np.linalg.norm(high - low)) / 3 ** 0.5, 1e-3 * self.radius)
@@ -147,7 +145,7 @@ class VCMSession(BDPTSession):
 
     def _merge_vertices(self, tables, radiance, camera, count, light, spectral):
         vertices, light_count, _ = light
-        cell = dr.maximum(spectral["radius"], smallest_cell(self.traits.bounds, self.capacity["light"]))
+        cell = dr.maximum(spectral["radius"], dr.opaque(mi.Float, smallest_cell(self.traits.bounds, self.capacity["light"])))
         photon_map = vertex_map(vertices, light_count, self.capacity["light"], self.traits.bounds, cell)
         index = lanes(self.capacity["camera"])
         active = index < dr.gather(mi.UInt32, count, 0)

@@ -11,6 +11,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .packing import to_numpy
+
 CELLS = 1 << 14
 """Cells of the grid at most; times six facings and the number of neighbours, four bytes each."""
 FINENESS = 0.75
@@ -33,7 +35,7 @@ class CacheGrid:
 
     def __init__(self, points, normals, neighbors):
         self.neighbors = neighbors
-        p = np.array(points, dtype=np.float64).reshape(3, -1).T
+        p = to_numpy(points).astype(np.float64).T
         low, high = p.min(axis=0), p.max(axis=0)
         size = np.maximum(high - low, 1e-4 * max(np.max(high - low), 1e-12))
         # Surfaces: C points cover about the box's faces, each an equal share.
@@ -46,19 +48,19 @@ class CacheGrid:
         self.resolution = [int(n) for n in np.maximum(np.ceil(size / edge), 1)]
         self._low = dr.opaque(mi.Point3f, [float(x) for x in low])
         self._scale = dr.opaque(mi.Float, 1 / edge)
+        self._cells = dr.opaque(mi.Point3u, self.resolution)         # as literals they would have path kernels compiled anew for each seed
         self.rows = FACINGS * int(np.prod(self.resolution))
-        self.table, self.spread = _nearest(self, mi.Point3f(points), mi.Normal3f(normals), len(p), edge)
+        self.table, self.spread = _nearest(self, mi.Point3f(points), mi.Normal3f(normals), len(p), dr.opaque(mi.Float, edge))
         dr.eval(self.table, self.spread)
 
     def tables(self):
         """Every evaluated array that `row` and its users read, for `dr.freeze` to track."""
-        return [self.table, self.spread, self._low, self._scale]
+        return [self.table, self.spread, self._low, self._scale, self._cells]
 
     def row(self, p, n):
         """Row of a point on a surface with normal `n`, on the side at hand; places outside the grid belong to its border."""
-        nx, ny, nz = self.resolution
-        at = (p - self._low) * self._scale
-        x, y, z = (mi.UInt32(dr.clip(a, 0, count - 1)) for a, count in zip(at, (nx, ny, nz)))
+        nx, ny, _ = self._cells
+        x, y, z = mi.Point3u(dr.clip((p - self._low) * self._scale, 0, mi.Point3f(self._cells - 1)))
         return ((z * ny + y) * nx + x) * FACINGS + facing(n)
 
     def neighbor(self, row, number, active=True):
@@ -75,21 +77,22 @@ def facing(n):
 
 
 @dr.syntax
-def _nearest(grid, points, normals, count: int, edge: float):
-    """Neighbour table and spread of all rows, by trying every cache point for each."""
+def _nearest(grid, points, normals, count: int, edge):
+    """Neighbour table and spread of all rows, by trying every cache point for each; `edge`: opaque."""
     rows = dr.arange(mi.UInt32, grid.rows)
     cell = rows // FACINGS
     direction = rows % FACINGS
-    nx, ny, _ = grid.resolution
+    nx, ny, _ = grid._cells
     centre = mi.Point3f(mi.Float(cell % nx) + 0.5, mi.Float((cell // nx) % ny) + 0.5, mi.Float(cell // (nx * ny)) + 0.5) * edge + grid._low
     sign = dr.select(direction % 2 == 1, mi.Float(-1), mi.Float(1))
     axis = mi.Vector3f(dr.select(direction // 2 == 0, sign, 0), dr.select(direction // 2 == 1, sign, 0),
                        dr.select(direction // 2 == 2, sign, 0))
-    cost_unit = mi.Float(grid.normal_cost)
+    cost_unit = dr.opaque(mi.Float, grid.normal_cost)
+    last = dr.opaque(mi.UInt32, count)
     best = [mi.Float(dr.inf) for _ in range(grid.neighbors)]
     found = [mi.UInt32(0) for _ in range(grid.neighbors)]
     index = mi.UInt32(0)
-    while index < count:
+    while index < last:
         p = dr.gather(mi.Point3f, points, index)
         n = dr.gather(mi.Normal3f, normals, index)
         cost = dr.squared_norm(p - centre) + cost_unit * (1 - dr.dot(n, axis))

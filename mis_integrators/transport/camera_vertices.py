@@ -91,8 +91,8 @@ def trace_camera_vertices(scene, sensor, integrator, lights, traits, soften, see
     left = not_left(n_paths)                         # of the parent
     origin = dr.zeros(mi.Interaction3f)              # the last vertex, of whichever kind
     context = mi.BSDFContext()
-    store = Store(vertices=new_vertices(traits, capacity, STEP), count=dr.zeros(mi.UInt32, 1), hits=hit_layout().room(hit_capacity),
-                  hit_count=dr.zeros(mi.UInt32, 1))
+    store = Store(vertices=new_vertices(traits, capacity, STEP), room=dr.opaque(mi.UInt32, capacity), count=dr.zeros(mi.UInt32, 1),
+                  hits=hit_layout().room(hit_capacity), hit_room=dr.opaque(mi.UInt32, hit_capacity), hit_count=dr.zeros(mi.UInt32, 1))
     visible = mi.Bool((scene.environment() is not None) and not hide_emitters)
     if dr.hint(max_depth == 0, mode='scalar'):
         active &= False
@@ -117,15 +117,15 @@ def trace_camera_vertices(scene, sensor, integrator, lights, traits, soften, see
             radiance[shown & (depth == 1)] += throughput * light
             met = shown & (depth > 1) & (dr.max(light * throughput) > 0)
             slot = dr.scatter_inc(store.hit_count, mi.UInt32(0), met)
-            met &= slot < hit_capacity
+            met &= slot < store.hit_room
             values = step_to_hit(lights, soften, left, density, origin, ds, light, dr.select(si.is_valid(), squared, dr.inf), met)
             values |= {"value": throughput * light, "path": path, "depth": depth, "parent": parent}
             hit_layout().write(store.hits, values, slot, met)
 
         active &= si.is_valid()
+        met = mi.Bool(active)                        # a surface, perhaps the last one
         bsdf = si.bsdf(ray)
         if dr.hint(max_depth > 0, mode='scalar'):
-            visible |= active & (depth >= max_depth) & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
             active &= depth < max_depth
         smooth = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
 
@@ -138,13 +138,13 @@ def trace_camera_vertices(scene, sensor, integrator, lights, traits, soften, see
             step[0] = dr.select(begin, dr.select(of_rays > 0, ratio * dr.rcp(dr.maximum(of_rays, 1e-20)), 0), step[0])
         junction = Junction.at(traits, si, bsdf, smooth)
         wanted = smooth & (dr.max(throughput) > 0)
-        slot = keep_vertex(store, junction, si, hit, towards, throughput, path, depth, number, parent, step, STEP, capacity, wanted)
+        slot = keep_vertex(store, junction, si, hit, towards, throughput, path, depth, number, parent, step, STEP, wanted)
         number = dr.select(wanted, number + 1, number)
 
         # ---- Go on
-        bs, weight = bsdf.sample(context, si, rng.next_float32(active), next_2d(rng, active), active)
+        bs, weight = bsdf.sample(context, si, rng.next_float32(met), next_2d(rng, met), met)
         delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-        visible |= active & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
+        visible |= met & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
         wo = si.to_world(bs.wo)
         value, p_forward, p_back = junction.between(towards, wo, active & ~delta)
         parent = dr.select(active & ~delta, slot, parent)

@@ -80,7 +80,7 @@ def list_pairs(traits, weights, camera, camera_count, camera_capacity: int, ligh
     places, one over that probability, count)`.
     """
     store = Store(camera=dr.empty(mi.UInt32, capacity), light=dr.empty(mi.UInt32, capacity), factor=dr.empty(mi.Float, capacity),
-                  count=dr.zeros(mi.UInt32, 1))
+                  room=dr.opaque(mi.UInt32, capacity), count=dr.zeros(mi.UInt32, 1))
     index = dr.arange(mi.UInt32, camera_capacity)
     active = index < dr.gather(mi.UInt32, camera_count, 0)
     z = read_vertices(camera, index, active, LAMBERTIAN)
@@ -104,7 +104,7 @@ def list_pairs(traits, weights, camera, camera_count, camera_capacity: int, ligh
             chance = dr.select(simple, dr.minimum(worth * dr.rcp(dr.maximum(level, 1e-30)), 1), 1)
             keep &= rng.next_float32() < chance
         slot = dr.scatter_inc(store.count, mi.UInt32(0), keep)
-        keep &= slot < capacity
+        keep &= slot < store.room
         dr.scatter(store.camera, index, slot, keep)
         dr.scatter(store.light, vertex, slot, keep)
         dr.scatter(store.factor, dr.rcp(chance), slot, keep)

@@ -7,6 +7,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..sums import Sums
+from .packing import from_numpy
 
 
 def colour_matrix(wavelengths):
@@ -73,7 +74,8 @@ def expected_weight(film, camera_paths):
             np.interp(low, np.linspace(-radius, radius, steps + 1), cumulative)
 
     width, height = film.crop_size()
-    return mi.TensorXf((camera_paths * np.outer(along(height), along(width)))[:, :, None].astype(np.float32))
+    weight = camera_paths * np.outer(along(height), along(width))
+    return mi.TensorXf(from_numpy(mi.Float, weight.ravel()), (*weight.shape, 1))
 
 
 def as_camera_weights(light, block, expected):

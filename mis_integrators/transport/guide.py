@@ -12,6 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .packing import from_numpy
 from .random import next_2d, streams
 from .spectra import channel_mean
 from .traits import scene_bounds
@@ -159,9 +160,9 @@ class EnvironmentGuide:
         total = pmf.sum(axis=1)
         self._learn_directions(row, tested, reached)
         pmf /= np.maximum(total, 1e-300)[:, None]
-        self._pmf = mi.Float(pmf.astype(np.float32).ravel())
-        self._cdf = mi.Float(np.cumsum(pmf, axis=1).astype(np.float32).ravel())
-        self._guided = mi.Float(np.where(total > 0, 1 - DEFENSIVE_SHARE, 0.0))
+        self._pmf = from_numpy(mi.Float, pmf.ravel())
+        self._cdf = from_numpy(mi.Float, np.cumsum(pmf, axis=1).ravel())
+        self._guided = from_numpy(mi.Float, np.where(total > 0, 1 - DEFENSIVE_SHARE, 0.0))
 
     def _learn_directions(self, row, tested, reached):
         """Direction cells by (radiance without its sharp peaks) x (share of the tests that saw the sky)."""
@@ -187,8 +188,8 @@ class EnvironmentGuide:
             return
         self.direction_share = float(np.clip(1 - smooth_power.sum() / max((total_power * reach).sum(), 1e-30), 0.25, 0.9))
         pmf = smooth_power / smooth_power.sum()
-        self._direction_pmf = mi.Float(pmf)
-        self._direction_cdf = mi.Float(np.cumsum(pmf))
+        self._direction_pmf = from_numpy(mi.Float, pmf)
+        self._direction_cdf = from_numpy(mi.Float, np.cumsum(pmf))
 
     @staticmethod
     def _numpy(record):

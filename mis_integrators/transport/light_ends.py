@@ -98,5 +98,5 @@ def list_ends(vertices, count, lengths, first, paths: int, capacity: int, room: 
     active &= (vertex["path"] >= first) & (vertex["path"] < first + paths)
     rank = dr.gather(mi.UInt32, start, vertex["path"], active) + vertex["number"] - before
     places = dr.zeros(mi.UInt32, room)
-    dr.scatter(places, index, rank, active & (rank < room))
+    dr.scatter(places, index, rank, active & (rank < dr.opaque(mi.UInt32, room)))
     return places, dr.gather(mi.UInt32, start, last) + dr.gather(mi.UInt32, lengths, last) - before

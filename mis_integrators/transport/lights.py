@@ -13,6 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 from .guide import EnvironmentGuide, direction_cell, infinite_emitters
+from .packing import from_numpy
 from .random import next_2d, streams
 from .spectra import channel_mean
 from .traits import UnsupportedScene, lookup, registry_table
@@ -37,8 +38,8 @@ class Choice:
         total = weights.sum()
         self.pmf = weights / total if total > 0 else np.zeros_like(weights)
         if self.count > 1:
-            self._pmf = mi.Float(self.pmf)
-            self._cdf = mi.Float(np.cumsum(self.pmf)[:-1])
+            self._pmf = from_numpy(mi.Float, self.pmf)
+            self._cdf = from_numpy(mi.Float, np.cumsum(self.pmf)[:-1])
 
     def sample(self, u):
         """Index of the chosen emitter and its probability, from uniform numbers `u`."""
@@ -149,7 +150,7 @@ class Lights:
             axes.append(axis)
             cosines.append(cosine)
         if "spot" in self.kinds:
-            self._spot_axis = mi.Float(np.array(axes, dtype=np.float64).ravel())
+            self._spot_axis = from_numpy(mi.Float, np.ravel(axes))
             self._spot_cosine = mi.Float(cosines)
 
     def _sphere_tables(self, emitters):
@@ -159,7 +160,7 @@ class Lights:
         if self._has_spheres:
             centers = [np.array(s.bbox().center()).ravel() if sphere else np.zeros(3) for s, sphere in zip(shapes, spheres)]
             signs = [(-1.0 if s.has_flipped_normals() else 1.0) if sphere else 0.0 for s, sphere in zip(shapes, spheres)]
-            self._sphere_center = mi.Float(np.array(centers, dtype=np.float64).ravel())
+            self._sphere_center = from_numpy(mi.Float, np.ravel(centers))
             self._sphere_sign = mi.Float(signs)
 
     def _sample_surface(self, emitter, index, time, sample, active):

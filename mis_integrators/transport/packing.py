@@ -1,8 +1,9 @@
 """Unit vectors and small integers in 32 bits, so that a photon's position and what its distance test needs next to it
-share one 16-byte record; and the sizes and targets of buffers."""
+share one 16-byte record; sizes and targets of buffers; and arrays that come from NumPy or go there."""
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 DEPTH_BITS = 9
 MAX_DEPTH = (1 << DEPTH_BITS) - 1
@@ -91,6 +92,20 @@ def rounded_up(count):
     """The next of 4, 5, 6, 7, 8, 10, 12, ...: few different buffer sizes, for they are literals of cached kernels."""
     step = 1 << max(count.bit_length() - 3, 0)
     return -(-count // step) * step
+
+
+def from_numpy(dtype, values):
+    """The numbers `values` (NumPy, flat) as a Dr.Jit array of type `dtype` in memory of its own. Without the copy Dr.Jit goes on using NumPy's
+    memory, and kernels that read it are compiled anew whenever that happens to be aligned in another way."""
+    array = dtype(np.asarray(values, np.float32 if dr.is_float_v(dtype) else np.uint32))
+    array = array + dr.opaque(dtype, 0)              # (a gather of all would be the array itself)
+    dr.eval(array)
+    return array
+
+
+def to_numpy(vectors):
+    """Dr.Jit vectors as a NumPy array, one row a component. (`np.array` would write their number into a kernel, to be compiled anew for each.)"""
+    return np.stack([np.array(component) for component in vectors])
 
 
 class Store:

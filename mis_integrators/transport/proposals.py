@@ -45,7 +45,8 @@ class Proposals:
     """
 
     def __init__(self, grid, cumulative, uniform, count, width):
-        self.grid, self.cumulative, self.uniform, self.count, self.width = grid, cumulative, uniform, count, width
+        self.grid, self.cumulative, self.uniform, self.count = grid, cumulative, uniform, count
+        self.width, self.steps = dr.opaque(mi.UInt32, width), width.bit_length()
 
     def draw(self, row, rng, active=True):
         """Light vertex for each row: one of the row's cache points at random, then a light vertex from its pmf, or any at the uniform share."""
@@ -54,7 +55,8 @@ class Proposals:
         start = point * self.width
         uniform = rng.next_float32(active) < dr.gather(mi.Float, self.uniform, point, active)
         u = rng.next_float32(active)
-        chosen = dr.binary_search(0, self.width, lambda i: dr.gather(mi.Float, self.cumulative, start + dr.minimum(i, self.width - 1), active) <= u)
+        end = start + (self.width - 1)
+        chosen = dr.binary_search(0, 1 << self.steps, lambda i: dr.gather(mi.Float, self.cumulative, dr.minimum(start + i, end), active) <= u)
         anywhere = mi.UInt32(u * mi.Float(self.count))
         last = dr.maximum(self.count, 1) - 1
         return dr.minimum(dr.select(uniform, anywhere, chosen), last)

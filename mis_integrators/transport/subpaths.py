@@ -57,10 +57,10 @@ def new_vertices(traits, capacity, states=STATES):
     return buffer
 
 
-def keep_vertex(store, junction, si, hit, towards, throughput, path, depth, number, parent, state, states, capacity, keep):
-    """Writes a vertex into the buffer; returns the place (valid if below the capacity)."""
+def keep_vertex(store, junction, si, hit, towards, throughput, path, depth, number, parent, state, states, keep):
+    """Writes a vertex into the buffer; returns the place (valid if there was room for it)."""
     slot = dr.scatter_inc(store.count, mi.UInt32(0), keep)
-    keep = keep & (slot < capacity)
+    keep = keep & (slot < store.room)
     values = {"p": si.p, "n": junction.n, "ns": junction.ns, "towards": towards, "throughput": throughput, "value": junction.value,
               "density": junction.density, "path": path, "depth": depth, "number": number, **dict(zip(states, state))}
     vertex_layout(states).write(store.vertices["words"], values, slot, keep)
@@ -108,7 +108,8 @@ def trace_light_subpaths(scene, lights, traits, weights, seed, n_paths: int, cap
     lanes = lane_count(n_paths)
     lane = dr.arange(mi.UInt32, lanes)
     rng = streams(lane, seed)
-    store = Store(vertices=new_vertices(traits, capacity, weights.states), count=dr.zeros(mi.UInt32, 1), lengths=dr.zeros(mi.UInt32, n_paths))
+    store = Store(vertices=new_vertices(traits, capacity, weights.states), room=dr.opaque(mi.UInt32, capacity), count=dr.zeros(mi.UInt32, 1),
+                  lengths=dr.zeros(mi.UInt32, n_paths))
     next_path = mi.UInt32(lane)
     path = mi.UInt32(lane)
     ray = dr.zeros(mi.Ray3f, lanes)
@@ -156,7 +157,7 @@ def trace_light_subpaths(scene, lights, traits, weights, seed, n_paths: int, cap
         state = _either(first, weights.lit(si, source, ~unreachable, first, flux), weights.arrived(state, arrival, si, squared, depth))
         smooth = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
         junction = Junction.at(traits, si, bsdf, smooth)
-        slot = keep_vertex(store, junction, si, hit, towards, flux, path, depth, number, parent, state, weights.states, capacity, smooth)
+        slot = keep_vertex(store, junction, si, hit, towards, flux, path, depth, number, parent, state, weights.states, smooth)
         number = dr.select(smooth, number + 1, number)
         parent = dr.select(smooth, slot, parent)
         dr.scatter(store.lengths, number, path, smooth)
@@ -201,7 +202,7 @@ def trace_camera_subpaths(scene, sensor, integrator, lights, traits, weights, se
     density = mi.Float(0)                            # with which the direction was sampled, per solid angle; zero after a delta function
     origin = dr.zeros(mi.Interaction3f)              # the last vertex, of whichever kind
     context = mi.BSDFContext()
-    store = Store(vertices=new_vertices(traits, capacity, weights.states), count=dr.zeros(mi.UInt32, 1))
+    store = Store(vertices=new_vertices(traits, capacity, weights.states), room=dr.opaque(mi.UInt32, capacity), count=dr.zeros(mi.UInt32, 1))
     visible = mi.Bool((scene.environment() is not None) and not hide_emitters)
     if dr.hint(max_depth == 0, mode='scalar'):
         active &= False
@@ -230,9 +231,9 @@ def trace_camera_subpaths(scene, sensor, integrator, lights, traits, weights, se
                 ledger.met(path, depth, light, share, shown)
 
         active &= si.is_valid()
+        met = mi.Bool(active)                        # a surface, perhaps the last one
         bsdf = si.bsdf(ray)
         if dr.hint(max_depth > 0, mode='scalar'):
-            visible |= active & (depth >= max_depth) & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
             active &= depth < max_depth
         smooth = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
 
@@ -264,14 +265,14 @@ def trace_camera_subpaths(scene, sensor, integrator, lights, traits, weights, se
         wanted = smooth & (dr.max(throughput) > 0)
         if dr.hint(max_depth > 0, mode='scalar'):
             wanted &= depth + shortest <= max_depth
-        slot = keep_vertex(store, junction, si, hit, towards, throughput, path, depth, number, parent, state, weights.states, capacity, wanted)
+        slot = keep_vertex(store, junction, si, hit, towards, throughput, path, depth, number, parent, state, weights.states, wanted)
         number = dr.select(wanted, number + 1, number)
         parent = dr.select(wanted, slot, parent)
 
         # ---- Go on
-        bs, weight = bsdf.sample(context, si, rng.next_float32(active), next_2d(rng, active), active)
+        bs, weight = bsdf.sample(context, si, rng.next_float32(met), next_2d(rng, met), met)
         delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-        visible |= active & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
+        visible |= met & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
         wo = si.to_world(bs.wo)
         value, p_forward, p_back = junction.between(towards, wo, active & ~delta)
         state = _either(active, weights.left(state, p_forward, p_back, delta, scattered_mean(value, si.n, wo)), state)
