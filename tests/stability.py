@@ -12,7 +12,7 @@ import numpy as np
 SIZE, DEPTH = 40, 7
 WORST, KEPT = 1e-4, 2e-3
 """Shares of the largest deviations: those beyond the percentile that is compared, and those that are looked at for it."""
-RESAMPLED = 200
+RESAMPLED, NOISIEST = 200, 0.02
 DARK = 0.1
 """Deviations are relative to a pixel's brightness, but at least to this share of the picture's."""
 SINGLE = tuple(f"bdpm:{bdd}" for bdd in (0, 1, 2))
@@ -107,8 +107,10 @@ class Measured:
         return means.mean(), means.std(ddof=1) / len(means) ** 0.5
 
     def noise(self, brightness):
-        """Logarithm of the mean relative variance of an iteration, and its standard error (over iterations)."""
-        values = (((self.pictures - self.mean) / brightness) ** 2).mean(axis=1)
+        """Logarithm of the mean relative variance of an iteration without the noisiest pixels, and its standard error (over iterations)."""
+        squares = ((self.pictures - self.mean) / brightness) ** 2
+        variances = squares.mean(axis=0)
+        values = squares[:, variances <= np.quantile(variances, 1 - NOISIEST)].mean(axis=1)
         return math.log(values.mean()), values.std(ddof=1) / values.mean() / len(values) ** 0.5
 
     def tail(self, brightness):
@@ -128,7 +130,7 @@ class Measured:
 class Truth:
     """The picture by `path`: `brightness`, what deviations are relative to, (pixels,); mean over the picture and its standard error."""
 
-    def __init__(self, scene, batches=16, spp=32):
+    def __init__(self, scene, batches=8, spp=32):
         path = mi.load_dict({"type": "path", "max_depth": DEPTH})
         pictures = np.array([np.array(mi.render(scene, integrator=path, spp=spp, seed=seed)).mean(axis=-1).ravel() for seed in range(batches)])
         self.mean, self.error = pictures.mean(), pictures.mean(axis=1).std(ddof=1) / batches ** 0.5
