@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 from functools import cached_property
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -50,19 +51,16 @@ class Room:
         """`alpha`: roughness of the metal; `albedo` of the walls; `lamp`: half its edge, its power stays; `dim`: the point light's
         intensity, where the lamp has one of 4; `gap` between screen and floor. Returns the scene."""
         T, own = mi.ScalarTransform4f, self.parameters
-        for key in own.keys():
-            value = None
-            if key.endswith("alpha.value"):
-                value = alpha
-            elif key.endswith("reflectance.value") and not key.startswith(("lamp", "screen")):
-                value = mi.Color3f(albedo)
-            if value is not None:
-                own[key] = value
-        own["lamp.to_world"] = mi.Transform4f(self.scale @ T().translate([0.2, -0.2, 1.7]).rotate([1, 0, 0], 180).scale([lamp, lamp, 1]))
-        own["lamp.emitter.radiance.value"] = mi.Color3f(1 / lamp ** 2)
-        own["screen.to_world"] = mi.Transform4f(
+        new = {key: mi.Float(alpha) for key in own.keys() if key.endswith("alpha.value")}
+        new |= {key: mi.Color3f(albedo) for key in own.keys() if key.endswith("reflectance.value") and not key.startswith(("lamp", "screen"))}
+        new["lamp.to_world"] = mi.Transform4f(self.scale @ T().translate([0.2, -0.2, 1.7]).rotate([1, 0, 0], 180).scale([lamp, lamp, 1]))
+        new["lamp.emitter.radiance.value"] = mi.Color3f(1 / lamp ** 2)
+        new["screen.to_world"] = mi.Transform4f(
             self.scale @ T().translate([-0.4, 0, 1 + gap / 2]).rotate([0, 1, 0], 90).scale([1 - gap / 2, 1, 1]))
-        own["dim.intensity.value"] = mi.Color3f(dim * self.size ** 2)
+        new["dim.intensity.value"] = mi.Color3f(dim * self.size ** 2)
+        dr.make_opaque(new)
+        for key, value in new.items():
+            own[key] = value
         own.update()
         return self.scene
 

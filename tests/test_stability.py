@@ -68,10 +68,10 @@ POINTS = {
     "million": {"dim": 4e-6},
     "frozen map of one": {"frozen_photons": 1, "seeds": range(4)},
     **{name: {"size": size, "initial_radius": USUAL["initial_radius"] * size} for name, size in SIZES.items()},
-    # Several at once, for the default run.
+    # Several at once.
     "corner": {"lamp": 1e-3, "dim": 4e-6, "gap": 0.01, "frozen_photons": 64},
 }
-DEFAULT = ("corner",)
+DEFAULT = ("roughness 1",)
 
 
 @pytest.fixture(scope="module")
