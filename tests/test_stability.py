@@ -5,11 +5,12 @@ One small room (`stability.py`); what is varied are its numbers and the methods'
 - every pixel of every iteration is a number;
 - no light is lost or made: the mean is that of `path`, up to `SLACK` and up to what a single strategy at that radius is off by, significantly;
 - the 99.99th percentile of the deviations of an iteration's pixels is at most `TAIL` times that of each single strategy;
+- the mean relative variance is at most `NOISE` times that of each strategy that is mixed;
 - along a ladder in steps of two, the mean relative variances of neighbours (without the noisiest 2 % of the pixels: rare events are the
   percentile's) differ by less than a factor `JUMP`.
 
-False alarms: `FALSE_ALARM` for each of the (fewer than 400) comparisons, by normal errors of means and of logarithms (percentiles: bootstrap over
-iterations), so below 0.4 % for the whole module, `full` included, and 2e-4 for the default run; as seeds are fixed, always or never.
+False alarms: `FALSE_ALARM` for each of the (fewer than 500) comparisons, by normal errors of means and of logarithms (percentiles: bootstrap over
+iterations), so below 0.5 % for the whole module, `full` included, and 2e-4 for the default run; as seeds are fixed, always or never.
 Power: where the intervals do not exclude a percentile `LONGEST` times that of the best single strategy, or a jump by `LARGEST`, a test
 fails as too weak. Limits: nearly a mirror, the lamp's image is an event so rare that neither `path` nor any strategy has its light in so
 few iterations, and means are compared up to what single strategies miss; at 1e-3 units Mitsuba's ray offset is a twentieth of the room, for
@@ -26,7 +27,7 @@ import pytest
 from stability import MIXED, SINGLE, SIZE, Measured, Room, Truth, integrator
 
 FALSE_ALARM = 1e-5
-TAIL, JUMP = 1.5, 3.0
+TAIL, JUMP, NOISE = 1.5, 3.0, 1.05
 LONGEST, LARGEST = 4.0, 6.0
 SLACK = 0.04
 """Relative to `path`: what the blur of the disks takes from edges."""
@@ -101,6 +102,14 @@ def tail_too_long(mixed, singles):
     return ", ".join(found)
 
 
+def too_noisy(mixed, singles):
+    """In words, where a logarithm of a variance (with its standard error) is beyond `NOISE` times that of a strategy that is mixed."""
+    for bdd, single in enumerate(singles):
+        if mixed[0] - single[0] - threshold() * math.hypot(mixed[1], single[1]) > math.log(NOISE):
+            return f"variance {math.exp(mixed[0] - single[0]):.2f} times that of bdd={bdd}"
+    return None
+
+
 def lost_light(mixed, singles, truth):
     """In words, where a mean is further from `path` than the slack and what single strategies are off by."""
     z = threshold(two_sided=True)
@@ -140,6 +149,10 @@ def test_no_fireflies_and_no_loss(rooms, point, request):
     wrong = [f"{mixed}: {words}" for mixed in MIXED if (words := tail_too_long(tails[mixed], [tails[single] for single in SINGLE]))]
     wrong += [f"{mixed}: {words}" for mixed in MIXED
               if (words := lost_light(found[mixed].light(), [found[s].light() for s in SINGLE], truth))]
+    noise = {method: m.noise(truth.brightness) for method, m in found.items()}
+    wrong += [f"{mixed}: {words}" for mixed, strategies in zip(MIXED, (2, 3))
+              if (words := too_noisy(noise[mixed], [noise[s] for s in SINGLE[:strategies]]))]
+    print(point, {m: f"tail {math.exp(tails[m][0]):.3g} +- {tails[m][1]:.0%}, variance {math.exp(noise[m][0]):.3g} +- {noise[m][1]:.0%}" for m in found})
     assert not wrong, wrong
 
 
