@@ -96,7 +96,8 @@ def threshold(two_sided=False):
 def tail_too_long(mixed, singles):
     """In words, where a logarithm of a percentile (with its standard error) is beyond `TAIL` times that of a single strategy."""
     ratios = [(mixed[0] - single[0], threshold() * math.hypot(mixed[1], single[1])) for single in singles]
-    found = [f"99.99th percentile {math.exp(log):.2f} times that of bdd={bdd}" for bdd, (log, error) in enumerate(ratios) if log - error > math.log(TAIL)]
+    found = [f"99.99th percentile {math.exp(log):.2f} times that of bdd={bdd}"
+             for bdd, (log, error) in enumerate(ratios) if log - error > math.log(TAIL)]
     log, error = max(ratios)
     assert found or log + error < math.log(LONGEST), f"too weak: {math.exp(log):.2f} times, but {math.exp(log + error):.1f} times not excluded"
     return ", ".join(found)
@@ -152,7 +153,8 @@ def test_no_fireflies_and_no_loss(rooms, point, request):
     noise = {method: m.noise(truth.brightness) for method, m in found.items()}
     wrong += [f"{mixed}: {words}" for mixed, strategies in zip(MIXED, (2, 3))
               if (words := too_noisy(noise[mixed], [noise[s] for s in SINGLE[:strategies]]))]
-    print(point, {m: f"tail {math.exp(tails[m][0]):.3g} +- {tails[m][1]:.0%}, variance {math.exp(noise[m][0]):.3g} +- {noise[m][1]:.0%}" for m in found})
+    print(point, {m: " ".join(f"{what} {math.exp(log):.3g} +- {error:.0%}" for what, (log, error) in (("tail", tails[m]), ("variance", noise[m])))
+                  for m in found})
     assert not wrong, wrong
 
 
