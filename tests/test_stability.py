@@ -1,0 +1,227 @@
+"""Where methods fail, optimal weights fail no worse: over ladders of a parameter, at equal radius and equal iterations, against single strategies.
+
+One small room (`stability.py`); what is varied are its numbers and the methods'. At each point, of `bdpm_opt2` and `bdpm_opt3` with full weights:
+
+- every pixel of every iteration is a number;
+- no light is lost or made: the mean is that of `path`, up to `SLACK` and up to what a single strategy at that radius is off by, significantly;
+- the 99.99th percentile of the deviations of an iteration's pixels is at most `TAIL` times that of each single strategy;
+- the mean relative variance is at most `NOISE` times that of each strategy that is mixed;
+- along a ladder in steps of two, the mean relative variances of neighbours (without the noisiest 2 % of the pixels: rare events are the
+  percentile's) differ by less than a factor `JUMP`.
+
+False alarms: `FALSE_ALARM` for each of the (fewer than 500) comparisons, by normal errors of means and of logarithms (percentiles: bootstrap over
+iterations), so below 0.5 % for the whole module, `full` included, and 2e-4 for the default run; as seeds are fixed, always or never.
+Power: where the intervals do not exclude a percentile `LONGEST` times that of the best single strategy, or a jump by `LARGEST`, a test
+fails as too weak. Limits: nearly a mirror, the lamp's image is an event so rare that neither `path` nor any strategy has its light in so
+few iterations, and means are compared up to what single strategies miss; at 1e-3 units Mitsuba's ray offset is a twentieth of the room, for
+`path` as for all.
+"""
+
+import math
+from pathlib import Path
+from statistics import NormalDist
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from stability import MIXED, SINGLE, SIZE, Measured, Room, Truth, integrator
+
+FALSE_ALARM = 1e-5
+TAIL, JUMP, NOISE = 1.5, 3.0, 1.05
+LONGEST, LARGEST = 4.0, 6.0
+SLACK = 0.04
+"""Relative to `path`: what the blur of the disks takes from edges."""
+USUAL = {"initial_radius": 0.06, "photon_count": 4000}
+ROOM = ("alpha", "albedo", "lamp", "dim", "gap")
+
+
+def disks(n_f):
+    """Parameters at merge area times light sub-paths `n_f`: the radius grows with it up to 0.1, then the sub-paths do."""
+    radius = min(0.1, math.sqrt(n_f / (math.pi * USUAL["photon_count"])))
+    return {"initial_radius": radius, "photon_count": max(round(n_f / (math.pi * radius ** 2)), 1)}
+
+
+def halved(high, low):
+    """Values from high to low, each half the one before."""
+    return [high / 2 ** step for step in range(math.floor(math.log2(high / low) + 0.5) + 1)]
+
+
+# name -> (what to change, at each value; the values, in steps of two)
+LADDERS = {
+    "photons": (disks, halved(1e4, 0.01)),
+    "roughness": (lambda x: {"alpha": x}, halved(1, 0.001)),
+    "absorption": (lambda x: {"albedo": 1 - x}, halved(1, 0.001)),
+    "lamp": (lambda x: {"lamp": x}, halved(0.2, 1e-4)),
+    "dim light": (lambda x: {"dim": x}, halved(4, 4e-6)),
+    "gap": (lambda x: {"gap": x}, halved(1, 1e-3)),
+    "frozen map": (lambda x: {"frozen_photons": round(x), "seeds": range(4)}, halved(16384, 1)),
+}
+SIZES = {"thousandth": 1e-3, "ten thousand": 1e4}
+
+# Where percentiles and means are compared.
+POINTS = {
+    **{f"n_F {x:g}": {**disks(x), "count": count} for x, count in ((0.01, 160), (1, 160), (100, 160), (1e4, 64))},
+    **{f"roughness {x:g}": {"alpha": x, "count": 256} for x in (1, 0.016, 0.004, 0.001)},
+    "albedo 0": {"albedo": 0.0},
+    "albedo 0.999": {"albedo": 0.999},
+    "unlit": {"dim": 0.0, "gap": 0.0},
+    "point lamp": {"lamp": 1e-4},
+    "million": {"dim": 4e-6},
+    "frozen map of one": {"frozen_photons": 1, "seeds": range(4)},
+    **{name: {"size": size, "initial_radius": USUAL["initial_radius"] * size} for name, size in SIZES.items()},
+    # Several at once.
+    "corner": {"lamp": 1e-3, "dim": 4e-6, "gap": 0.01, "frozen_photons": 64},
+}
+DEFAULT = ("roughness 1",)
+
+
+@pytest.fixture(scope="module")
+def rooms():
+    """Rooms by size; made when asked for."""
+    mi.set_variant("llvm_ad_rgb")
+    made = {}
+    return lambda size=1.0: made.setdefault(size, Room(size))
+
+
+def split(changes):
+    """What changes a room (its size, its numbers), and what changes a render."""
+    return changes.get("size", 1.0), {k: v for k, v in changes.items() if k in ROOM}, {
+        **USUAL, **{k: v for k, v in changes.items() if k not in (*ROOM, "size")}}
+
+
+def threshold(two_sided=False):
+    return NormalDist().inv_cdf(1 - FALSE_ALARM / (2 if two_sided else 1))
+
+
+def tail_too_long(mixed, singles):
+    """In words, where a logarithm of a percentile (with its standard error) is beyond `TAIL` times that of a single strategy."""
+    ratios = [(mixed[0] - single[0], threshold() * math.hypot(mixed[1], single[1])) for single in singles]
+    found = [f"99.99th percentile {math.exp(log):.2f} times that of bdd={bdd}"
+             for bdd, (log, error) in enumerate(ratios) if log - error > math.log(TAIL)]
+    log, error = max(ratios)
+    assert found or log + error < math.log(LONGEST), f"too weak: {math.exp(log):.2f} times, but {math.exp(log + error):.1f} times not excluded"
+    return ", ".join(found)
+
+
+def too_noisy(mixed, singles):
+    """In words, where a logarithm of a variance (with its standard error) is beyond `NOISE` times that of a strategy that is mixed."""
+    for bdd, single in enumerate(singles):
+        if mixed[0] - single[0] - threshold() * math.hypot(mixed[1], single[1]) > math.log(NOISE):
+            return f"variance {math.exp(mixed[0] - single[0]):.2f} times that of bdd={bdd}"
+    return None
+
+
+def lost_light(mixed, singles, truth):
+    """In words, where a mean is further from `path` than the slack and what single strategies are off by."""
+    z = threshold(two_sided=True)
+
+    def off(mean, error):
+        error = math.hypot(error, truth.error)
+        return math.copysign(max(abs(mean - truth.mean) - z * error, 0), mean - truth.mean)
+
+    low, high = (f([0.0, *(off(*single) for single in singles)]) for f in (min, max))
+    mine = off(*mixed)
+    slack = SLACK * truth.mean
+    return None if low - slack <= mine <= high + slack else f"mean {mixed[0] / truth.mean:.3f} of path's, +- {mixed[1] / truth.mean:.3f}"
+
+
+def jump(before, after):
+    """In words, where two logarithms of variances (with their standard errors) differ by more than `JUMP` allows."""
+    log, error = abs(after[0] - before[0]), threshold(True) * math.hypot(before[1], after[1])
+    words = f"variances {math.exp(before[0]):.3g}, {math.exp(after[0]):.3g}"
+    assert log - error > math.log(JUMP) or log + error < math.log(LARGEST), f"too weak: {words}, but {math.exp(log + error):.1f} times not excluded"
+    return words if log - error > math.log(JUMP) else None
+
+
+def measure(rooms, methods, changes, count):
+    """Truth and measurements by method."""
+    size, numbers, render = split(changes)
+    scene = rooms(size).set(**numbers)
+    count = render.pop("count", count)
+    return Truth(scene), {method: Measured.of(scene, method, count, **render) for method in methods}
+
+
+@pytest.mark.parametrize("point", [pytest.param(p, marks=[] if p in DEFAULT else [pytest.mark.full], id=p.replace(" ", "_")) for p in POINTS])
+def test_no_fireflies_and_no_loss(rooms, point, request):
+    truth, found = measure(rooms, SINGLE + MIXED, POINTS[point], 160)
+    assert all(np.isfinite(m.pictures).all() for m in found.values())
+    tails = {method: m.tail(truth.brightness) for method, m in found.items()}
+    draw(request.config.getoption("--maps"), point, found, truth, tails)
+    wrong = [f"{mixed}: {words}" for mixed in MIXED if (words := tail_too_long(tails[mixed], [tails[single] for single in SINGLE]))]
+    wrong += [f"{mixed}: {words}" for mixed in MIXED
+              if (words := lost_light(found[mixed].light(), [found[s].light() for s in SINGLE], truth))]
+    noise = {method: m.noise(truth.brightness) for method, m in found.items()}
+    wrong += [f"{mixed}: {words}" for mixed, strategies in zip(MIXED, (2, 3))
+              if (words := too_noisy(noise[mixed], [noise[s] for s in SINGLE[:strategies]]))]
+    print(point, {m: " ".join(f"{what} {math.exp(log):.3g} +- {error:.0%}" for what, (log, error) in (("tail", tails[m]), ("variance", noise[m])))
+                  for m in found})
+    assert not wrong, wrong
+
+
+def draw(folder, point, found, truth, tails):
+    """Pictures, variance maps and percentiles of all methods, as a PNG."""
+    from mis_integrators.analysis import charts
+
+    shape = (SIZE, SIZE)
+    charts.save(charts.variance_maps(
+        list(found), [np.repeat(m.mean.reshape(*shape, 1), 3, axis=2) for m in found.values()],
+        [(m.pictures.var(axis=0, ddof=1) / truth.brightness ** 2).reshape(shape) for m in found.values()],
+        [f"99.99th percentile {math.exp(tails[method][0]):.3g}" for method in found]), Path(folder) / f"stability_{point.replace(' ', '_')}.png")
+
+
+def jumps(rooms, method, ladder, values, count):
+    """All jumps along a ladder, in words."""
+    change, _ = LADDERS[ladder]
+    noise = []
+    for value in values:
+        truth, found = measure(rooms, [method], change(value), count)
+        assert np.isfinite(found[method].pictures).all(), (ladder, value)
+        noise.append(found[method].noise(truth.brightness))
+    print(ladder, method, [f"{value:.3g}: {math.exp(log):.3g} +- {error:.0%}" for value, (log, error) in zip(values, noise)])
+    return [f"{a:g} -> {b:g}: {words}" for a, b, before, after in zip(values, values[1:], noise, noise[1:]) if (words := jump(before, after))]
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("method", MIXED)
+@pytest.mark.parametrize("ladder", LADDERS)
+def test_no_jumps(rooms, ladder, method):
+    assert not jumps(rooms, method, ladder, LADDERS[ladder][1], 24)
+
+
+def test_no_jump_where_mixing_on_diffuse_surfaces_begins(rooms):
+    """`mix_diffuse` switches where a typical disk holds one photon."""
+    values = halved(20, 5)
+    mixes = []
+    for n_f in values:
+        session = integrator("bdpm_opt3", **disks(n_f)).session(rooms().set(), seed=5)
+        session.mixes()
+        mixes.append(session.mix_diffuse)
+    assert not mixes[0] and mixes[-1]
+    assert not jumps(rooms, "bdpm_opt3", "photons", values, 24)
+
+
+def photons_a_disk(rooms, n_f):
+    """Expected photons in a disk at a typical lit place."""
+    session = integrator("bdpm_opt3", **disks(n_f)).session(rooms().set(), seed=5)
+    session.mixes()
+    return session.light_paths * math.pi * max(session.radii.values()) ** 2 * session.cache.mean / session.cache.typical_flux
+
+
+def test_ladders_reach_what_they_promise(rooms):
+    """n_F from 0.01 to 1e4, from less than one photon a disk to a thousand; neighbours a factor two apart."""
+    for _, values in LADDERS.values():
+        assert np.allclose(np.array(values[:-1]) / values[1:], 2)
+    values = LADDERS["photons"][1]
+    assert photons_a_disk(rooms, values[-1]) < 1 and 1000 <= photons_a_disk(rooms, values[0])
+    made = [disks(x) for x in values]
+    assert np.allclose([math.pi * d["initial_radius"] ** 2 * d["photon_count"] for d in made], values, rtol=1e-2)
+
+
+def test_size_changes_nothing(rooms):
+    """The same seed, the same picture, ten thousand times as large: rounding sends single paths elsewhere, no more."""
+    pictures = []
+    for size in (1.0, 1e4):
+        scene = rooms(size).set()
+        pictures.append(Measured.of(scene, "bdpm_opt3", 8, **{**USUAL, "initial_radius": USUAL["initial_radius"] * size}).pictures)
+    assert np.corrcoef(*(p.ravel() for p in pictures))[0, 1] > 0.98
+    assert pictures[1].mean() == pytest.approx(pictures[0].mean(), rel=5e-3)
