@@ -114,6 +114,17 @@ def test_same_seed_same_image(rgb, bdd):
     np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-7)
 
 
+def test_same_seed_same_edges(rgb):
+    """The probes of the correction at edges belong to a path's vertices, not to their places in a buffer, which chance decides."""
+    images = []
+    for _ in range(2):
+        session = bdpm(bdd=0, initial_radius=0.0, photon_count=3000).session(glossy_box(), seed=5)
+        session.recall({"radii": dict.fromkeys(session.kinds(), 0.3), "corrected": {"caustic": False, "indirect": True}})
+        session.iterate()
+        images.append(session.image())
+    np.testing.assert_allclose(*images, rtol=1e-4, atol=1e-6)
+
+
 def test_iteration_depends_on_its_index_alone(rgb):
     """A render of 4 is the first half of a render of 8, and a session is the same as a render."""
     scene = glossy_box()

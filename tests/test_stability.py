@@ -1,6 +1,6 @@
 """Where methods fail, optimal weights fail no worse: over ladders of a parameter, at equal radius and equal iterations, against single strategies.
 
-One small room (`stability.py`); what is varied are its numbers and the methods'. At each point, of `bdpm_opt2` and `bdpm_opt3` with full weights:
+One small room (`extremes.py`); what is varied are its numbers and the methods'. At each point, of `bdpm_opt2` and `bdpm_opt3` with full weights:
 
 - every pixel of every iteration is a number;
 - no light is lost or made: the mean is that of `path`, up to `SLACK` and up to what a single strategy at that radius is off by, significantly;
@@ -24,7 +24,7 @@ from statistics import NormalDist
 import mitsuba as mi
 import numpy as np
 import pytest
-from stability import MIXED, SINGLE, SIZE, Measured, Room, Truth, integrator
+from extremes import MIXED, SINGLE, SIZE, Measured, Room, Truth, integrator
 
 FALSE_ALARM = 1e-5
 TAIL, JUMP, NOISE = 1.5, 3.0, 1.05

@@ -11,7 +11,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .gather import SAME_SURFACE_COSINE, SAME_SURFACE_OFFSET
-from .random import streams
+from .random import vertex_streams
 
 PROBES = 8
 HEIGHT = 0.25
@@ -32,7 +32,7 @@ def covered_share(scene, vertices, radius, seed, active):
     si = vertices["hit"].compute_surface_interaction(ray, mi.RayFlags.Minimal, active)
     normal = mi.Vector3f(dr.mulsign(si.n, -dr.dot(si.n, ray.d)))
     frame = mi.Frame3f(normal)
-    rng = streams(dr.arange(mi.UInt32, dr.width(vertices["depth"])), seed ^ OWN_STREAM)
+    rng = vertex_streams(vertices["path"], vertices["depth"], seed ^ OWN_STREAM)
     turn, shift = rng.next_float32() * dr.two_pi, rng.next_float32()
     start = si.p + normal * (HEIGHT * radius)
     covered = mi.Float(0)
