@@ -118,7 +118,7 @@ def test_same_seed_same_edges(rgb):
     """The probes of the correction at edges belong to a path's vertices, not to their places in a buffer, which chance decides."""
     images = []
     for _ in range(2):
-        session = bdpm(bdd=0, initial_radius=0.0, photon_count=3000).session(glossy_box(), seed=5)
+        session = bdpm(bdd=0, initial_radius=0.0, photon_count=3000).session(glossy_box(size=128), seed=5)
         session.recall({"radii": dict.fromkeys(session.kinds(), 0.3), "corrected": {"caustic": False, "indirect": True}})
         session.iterate()
         images.append(session.image())
