@@ -101,7 +101,7 @@ def measure(
         raise SystemExit(f"{opened.name}: no method can render it: {failures}")
     found = [Measured(maker.method, maker.warm_up_seconds) for maker in makers]
     for seed in range(seeds):
-        contenders = [Contender.begin(maker.method.label, maker.make, seed, marks) for maker in makers]
+        contenders = [Contender.begin(maker.method.label, maker.make, seed, marks, maker.iteration_seconds) for maker in makers]
         take_turns(contenders, seconds, lambda text: tell(f"{opened.name}, seed {seed + 1} of {seeds}: {text}"), spp)
         for measured, contender in zip(found, contenders):
             if not contender.snapshots or contender.snapshots[-1].iterations < contender.session.iterations:

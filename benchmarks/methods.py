@@ -68,7 +68,8 @@ class SessionMaker:
 
     def __init__(self, method: Method, opened: OpenScene, seconds: float, spp: int | None = None, warm_up: bool = True):
         """``seconds``: what each session will be given; a session may plan with it. ``spp``: or the samples per pixel that each will
-        take; a pass of one of Mitsuba's own integrators then divides them. ``warm_up``: compile now, with a session to throw away."""
+        take; a pass of one of Mitsuba's own integrators then divides them. ``warm_up``: compile now, with a session to throw away,
+        whose last iteration tells ``iteration_seconds``."""
         self.method, self.opened, self.seconds = method, opened, seconds
         self._integrator = method.integrator(opened)
         self._spp = 0
@@ -76,11 +77,14 @@ class SessionMaker:
             self._spp = self._samples_per_pass()
             if spp:
                 self._spp = max(n for n in range(1, min(self._spp, spp) + 1) if spp % n == 0)
+        self.iteration_seconds = 0.0
         start = time.perf_counter()
         if warm_up:
             throw_away = self.make(seed=2**31)
             for _ in range(3):
+                before = time.perf_counter()
                 throw_away.iterate()
+                self.iteration_seconds = time.perf_counter() - before
         self.warm_up_seconds = time.perf_counter() - start
 
     def make(self, seed: int) -> Session:

@@ -38,6 +38,8 @@ class Contender:
     setting_up: float = 0.0
     """Seconds that went before the first iteration."""
     compiling: float = 0.0
+    usual: float | None = None
+    """Seconds of an iteration, if known before: the first one of this rendering, with its pilots, does not tell."""
     observe: Callable[[list[dict], float], None] | None = None
     """Called after each iteration with its kernels (as in Dr.Jit's kernel history) and its seconds."""
     marks: list[float] = field(default_factory=list)
@@ -45,11 +47,13 @@ class Contender:
     snapshots: list[Snapshot] = field(default_factory=list)
 
     @classmethod
-    def begin(cls, label: str, make: Callable[[int], Session], seed: int, marks: Sequence[float] = ()) -> "Contender":
+    def begin(
+        cls, label: str, make: Callable[[int], Session], seed: int, marks: Sequence[float] = (), usual: float | None = None
+    ) -> "Contender":
         """Make a session; the time that it takes counts."""
         start = time.perf_counter()
         session = make(seed)
-        return cls(label, session, setting_up=time.perf_counter() - start, marks=list(marks))
+        return cls(label, session, setting_up=time.perf_counter() - start, usual=usual, marks=list(marks))
 
     @property
     def rendering(self) -> float:
@@ -87,7 +91,10 @@ class Contender:
         """Whether one more iteration brings the time used closer to ``seconds``, or is needed for ``spp`` samples per pixel."""
         if spp:
             return self.session.iterations * self.session.samples_per_iteration < spp
-        return not self.seconds or self.rendering + 0.5 * self.seconds[-1] < seconds
+        if not self.seconds:
+            return True
+        next_one = self.usual if len(self.seconds) == 1 and self.usual is not None else self.seconds[-1]
+        return self.rendering + 0.5 * next_one < seconds
 
 
 def compile_seconds(kernels: Sequence[dict]) -> float:

@@ -233,3 +233,13 @@ def test_ratios_of_resampling(module):
     method = module("methods").parse_method("bdpt_ris:target=f_y_f_yz")
     assert resampling.with_value(method, "resamples", 4).parameters == {"target": "f_y_f_yz", "resamples": 4}
     assert resampling.with_value(module("methods").parse_method("bdpt"), "resamples", 4).parameters == {}
+
+
+def test_a_slow_start_does_not_end_a_rendering(module):
+    """The first iteration, with its pilots, tells nothing of the second."""
+    Contender = module("turns").Contender
+    contender = Contender("any", None, seconds=[1.4], usual=0.2)
+    assert contender.wants(2.0) and contender.wants(1.51) and not contender.wants(1.49)
+    assert not Contender("any", None, seconds=[1.4]).wants(2.0)
+    contender.seconds.append(0.5)
+    assert contender.wants(2.2) and not contender.wants(2.1)
