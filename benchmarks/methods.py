@@ -77,7 +77,7 @@ class SessionMaker:
             self._spp = self._samples_per_pass()
             if spp:
                 self._spp = max(n for n in range(1, min(self._spp, spp) + 1) if spp % n == 0)
-        self.iteration_seconds = 0.0
+        self.iteration_seconds: float | None = None
         start = time.perf_counter()
         if warm_up:
             throw_away = self.make(seed=2**31)
