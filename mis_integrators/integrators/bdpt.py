@@ -116,7 +116,6 @@ class BDPTSession(IterativeSession):
     PASSES = {"_light_pass": ("_trace_light", ("light",)), "_camera_pass": ("_trace_camera", ("camera",)),
               "_pair_pass": ("_list_pairs", ("light", "camera", "pairs")), "_connection_pass": ("_connect", ("light", "camera", "pairs")),
               "_sensor_pass": ("_join_sensor", ("light",))}
-    """Recorded passes: the method of each, and the buffers that it uses."""
 
     def __init__(self, integrator, scene, sensor, seed, iterations):
         super().__init__(integrator, scene, sensor, seed, iterations)
@@ -136,11 +135,8 @@ class BDPTSession(IterativeSession):
         self._freeze()
 
     def _freeze(self, grown=None):
-        """Records the passes anew, or those that use the buffer that has `grown`; from the second iteration on, kernels run without their Python."""
         self._tables = [self.traits.lambertian, self.traits.perturbed, *self.lights.tables()]
-        for name, (function, buffers) in self.PASSES.items():
-            if grown is None or grown in buffers:
-                setattr(self, name, self.recorded(getattr(self, function)))
+        self._record(grown)
 
     def light_count(self):
         """Light sub-paths with each part of the camera paths."""

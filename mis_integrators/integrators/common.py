@@ -184,6 +184,15 @@ class IterativeSession:
             dr.eval(self.sums.tensors)
             dr.sync_thread()
 
+    PASSES = {}
+    """Recorded passes of sessions whose buffers grow one by one: the method of each, and the buffers that it uses."""
+
+    def _record(self, grown):
+        """Records the `PASSES` anew, or those that use the buffer that has `grown`; from the second iteration on, kernels run without their Python."""
+        for name, (function, buffers) in self.PASSES.items():
+            if grown is None or grown in buffers:
+                setattr(self, name, self.recorded(getattr(self, function)))
+
     def split_paths(self, largest):
         """Splits the `path_count` camera paths of an iteration into `chunks` parts of `chunk` paths, at most `largest` each: that bounds memory."""
         self.path_count = film_sample_count(self.sensor) * self.integrator.camera_paths
@@ -211,7 +220,7 @@ class IterativeSession:
 
     def _grown(self, name, count):
         """Whether the `count` (an array of width one) found more than there is room for in the buffer of that name; then there
-        will be more room. For sessions with a dictionary `capacity` and a method `_freeze`, which records anew the passes that use that buffer."""
+        will be more room. For sessions with a dictionary `capacity` and a method `_freeze`, which calls `_record`."""
         found = int(count[0])
         if found <= self.capacity[name]:
             return False

@@ -93,15 +93,11 @@ class ResampledSession(IterativeSession):
               "_pilot_pass": ("_pilot_targets", ("light", "ends")), "_target_pass": ("_own_targets", ("light", "ends")),
               "_connection_pass": ("_connect", ("light", "camera", "ends")), "_hit_pass": ("_meet", ("camera", "hits")),
               "_sensor_pass": ("_join_sensor", ("light",))}
-    """Recorded passes: the method of each, and the buffers that it uses."""
 
     def _freeze(self, grown=None):
-        """Records the passes anew, or those that use the buffer that has `grown`; from the second iteration on, kernels run without their Python."""
         dr.make_opaque(self.records, self.shares)                 # else their first values, all ones, would be literals of kernels
         self._tables = [self.traits.lambertian, self.traits.perturbed, self.records, self.shares, *self.grid.tables(), *self.lights.tables()]
-        for name, (function, buffers) in self.PASSES.items():
-            if grown is None or grown in buffers:
-                setattr(self, name, self.recorded(getattr(self, function)))
+        self._record(grown)
 
     def weights(self):
         """The weights of this session."""
