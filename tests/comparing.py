@@ -180,20 +180,33 @@ def _colour(image):
     return image[:, :, None] if image.ndim == 2 else image[:, :, :3] if image.shape[2] > 3 else image
 
 
+def pictures(session, count):
+    """Yields what each of the next `count` iterations of a session renders by itself, (H, W, channels); the session shows the mean of all."""
+    before = session.iterations * session.image().astype(np.float64) if session.iterations else 0.0
+    for _ in range(count):
+        session.iterate()
+        total = session.iterations * session.image().astype(np.float64)
+        yield total - before
+        before = total
+
+
+def kernels_of(run, operations=0):
+    """Hashes of the kernels, of more than so many operations, that `run()` launches."""
+    dr.kernel_history_clear()
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        run()
+    return {kernel["hash"] for kernel in dr.kernel_history() if kernel["type"] == dr.KernelType.JIT and kernel["operation_count"] > operations}
+
+
 class SessionBatches:
     """Region means of the iterations of a `bdpm` session, which are independent (`test_bdpm.py` checks it)."""
 
     def __init__(self, integrator, scene, blocks: int, seed: int = 1, sensor=0):
         self.session = integrator.session(scene, sensor, seed=seed, spp=0)
-        self.blocks, self.batches, self._sum = blocks, [], 0.0
+        self.blocks, self.batches = blocks, []
 
     def add(self, count: int):
-        for _ in range(count):
-            self.session.iterate()
-            n = self.session.iterations
-            total = n * block_means(_colour(self.session.image()), self.blocks)
-            self.batches.append(total - self._sum)
-            self._sum = total
+        self.batches += [block_means(_colour(picture), self.blocks) for picture in pictures(self.session, count)]
 
     def estimate(self) -> Estimate:
         return Estimate.of(self.batches)

@@ -9,6 +9,7 @@ from functools import cached_property
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from comparing import pictures
 
 SIZE, DEPTH = 40, 7
 WORST, KEPT = 1e-4, 2e-3
@@ -83,16 +84,8 @@ class Measured:
     @staticmethod
     def of(scene, method, count, seeds=(5,), **parameters):
         """`count` iterations in all, of as many renders as there are `seeds`."""
-        pictures = []
-        for seed in seeds:
-            session = integrator(method, **parameters).session(scene, seed=seed)
-            total = 0.0
-            for number in range(1, count // len(seeds) + 1):
-                session.iterate()
-                image = number * session.image()[..., :3].astype(np.float64).mean(-1).ravel()
-                pictures.append(image - total)
-                total = image
-        return Measured(np.array(pictures))
+        sessions = [integrator(method, **parameters).session(scene, seed=seed) for seed in seeds]
+        return Measured(np.array([picture[..., :3].mean(-1).ravel() for session in sessions for picture in pictures(session, count // len(seeds))]))
 
     @cached_property
     def mean(self):

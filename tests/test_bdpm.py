@@ -8,7 +8,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from comparing import (Estimate, PathBatches, SessionBatches, agree, assert_same, block_means, collect_until, differences, extrapolate)
+from comparing import (Estimate, PathBatches, SessionBatches, agree, assert_same, block_means, collect_until, differences, extrapolate,
+                       kernels_of, pictures)
 from worlds import T, bdpm, diffuse, film, grey, look, path, sensor, tray
 
 
@@ -143,11 +144,7 @@ def test_seeds_and_iterations_are_uncorrelated(rgb):
     mean = render(scene, 1000, 256).mean(axis=2)
     session = bdpm(camera_paths=1, photon_count=3000).session(scene, 0, 3, 0)
     images = [render(scene, seed, 1).mean(axis=2) for seed in (0, 1, 2, 3)]
-    total = 0
-    for count in range(1, 4):
-        session.iterate()
-        images.append(count * session.image().mean(axis=2) - total)
-        total = total + images[-1]
+    images += [picture.mean(axis=2) for picture in pictures(session, 3)]
     noise = [(i - mean).ravel() for i in images[:3]] + [(i - mean).ravel() for i in images[4:]]
     noise = [np.clip(n, *np.quantile(n, [0.02, 0.98])) for n in noise]       # a caustic's fireflies would be all that counts
     table = np.corrcoef(noise) - np.eye(len(noise))
@@ -628,10 +625,7 @@ def test_timed_iterations_are_of_the_radii_rendered_with(rgb, monkeypatch, chang
 def kernels(integrator, scene, seed):
     """What a short render launches: hashes of its kernels."""
     session = integrator.session(scene, seed=seed)
-    dr.kernel_history_clear()
-    for _ in range(2):
-        session.iterate()
-    return {entry["hash"] for entry in dr.kernel_history() if "hash" in entry}
+    return kernels_of(lambda: [session.iterate() for _ in range(2)])
 
 
 @pytest.mark.parametrize("plugin", ["bdpm", "bdpm_opt2"])
@@ -639,6 +633,5 @@ def test_no_seed_has_kernels_of_its_own(rgb, plugin):
     """Numbers that depend on chance are not literals: seconds of compiling would come again with each seed."""
     gc.collect()                                 # kernels know all the scenes that there are
     scene, integrator = glossy_box(), mi.load_dict({"type": plugin, "photon_count": 3000})
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-        first, second, third = (kernels(integrator, scene, seed) for seed in (1, 2, 3))
+    first, second, third = (kernels(integrator, scene, seed) for seed in (1, 2, 3))
     assert first and second <= first and third <= first

@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from comparing import Estimate, SessionBatches, agree, assert_same, block_means, collect_until, differences
+from comparing import Estimate, SessionBatches, agree, assert_same, block_means, collect_until, differences, pictures
 from test_against_path import MONO, RGB, SPECTRAL, caustic_scene
 from test_analytic import block_average, floor_from_above, inside_sphere, point_irradiance, series
 from test_bdpm import box_scene, glossy_box, last_words
@@ -253,12 +253,7 @@ def test_states_of_traced_subpaths(rgb, kind):
 def technique_estimates(scene, integrator, batches, blocks=1):
     """{(s, t): Estimate} of the block means of each technique's unweighted image."""
     session = integrator.session(scene, 0, seed=1, spp=0)
-    sums, images = 0, []
-    for count in range(1, batches + 1):
-        session.iterate()
-        total = count * session.image()
-        images.append(total - sums)
-        sums = total
+    images = list(pictures(session, batches))
     channels = session.channels
     result = {}
     for s, t in technique_names(integrator.techniques):
@@ -505,12 +500,8 @@ def test_seeds_and_iterations(thin_lens_box):
     """Same seed, same image, as a whole or as iterations; other seeds and iterations are uncorrelated."""
     scene = thin_lens_box
     session = bdpt(camera_paths=1).session(scene, 0, 7, 0)
-    images, total = [], 0
-    for count in range(1, 5):
-        session.iterate()
-        images.append(count * session.image() - total)
-        total = total + images[-1]
-    np.testing.assert_allclose(total / 4, render(scene, 7, 4), rtol=1e-4, atol=1e-5)
+    images = list(pictures(session, 4))
+    np.testing.assert_allclose(sum(images) / 4, render(scene, 7, 4), rtol=1e-4, atol=1e-5)
     mean = render(scene, 1000, 128).mean(axis=2)
     images = [i.mean(axis=2) for i in images] + [render(scene, seed, 1).mean(axis=2) for seed in (8, 9)]
     noise = [(i - mean).ravel() for i in images]

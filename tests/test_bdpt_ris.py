@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from comparing import Estimate, SessionBatches, agree, assert_same, collect_until
+from comparing import Estimate, SessionBatches, agree, assert_same, collect_until, kernels_of, pictures
 from test_against_path import MONO, RGB, SPECTRAL, caustic_scene
 from test_analytic import inside_sphere, series
 from test_bdpm import glossy_box, last_words
@@ -300,12 +300,7 @@ def test_same_seed_same_image(rgb):
     """Cache points, draws and ends do not depend on the order of threads; iterations, whose light sub-paths all pixels share, are uncorrelated."""
     scene = room("rough", "area")
     sessions = [plugin("bdpt_ris").session(scene, 0, seed, 0) for seed in (3, 3, 4)]
-    means = [[], [], []]
-    for session, mean in zip(sessions, means):
-        for _ in range(30):
-            before = session.image() * session.iterations if session.iterations else 0
-            session.iterate()
-            mean.append((session.image() * session.iterations - before).mean())
+    means = [[picture.mean() for picture in pictures(session, 30)] for session in sessions]
     np.testing.assert_allclose(sessions[0].image(), sessions[1].image(), rtol=1e-4, atol=1e-6)
     same, other = np.array(means[0]), np.array(means[2])
     assert abs(np.corrcoef(same, other)[0, 1]) < 0.75 and abs(np.corrcoef(same[1:], same[:-1])[0, 1]) < 0.75      # 1e-6 for 30 pairs
@@ -353,11 +348,7 @@ def test_kernels_know_neither_seed_nor_room(rgb, name):
     for seed in range(3):
         session = mi.load_dict({"type": name, "max_depth": 4, "camera_paths": 1}).session(scene, 0, seed, 0)
         session.capacity.update(camera=2048 >> seed, light=session.capacity["light"] if name == "vcm" else (1024, 64, 2048)[seed])
-        dr.kernel_history_clear()
-        with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
-            session.iterate()
-        compiled.append({kernel["hash"] for kernel in dr.kernel_history()
-                         if kernel["type"] == dr.KernelType.JIT and kernel["operation_count"] > 500})
+        compiled.append(kernels_of(session.iterate, 500))
         grids.add(tuple(session.grid.resolution) if name == "bdpt_ris" else seed)
     assert len(grids) > 1 and len(compiled[0]) >= 4
     assert compiled[1] <= compiled[0] and compiled[2] <= compiled[0]

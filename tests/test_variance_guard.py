@@ -17,6 +17,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from comparing import pictures
 from mis_integrators.analysis.confidence import t_quantile
 from mis_integrators.analysis.metrics import trimmed_mean
 from mis_integrators.analysis.variance_maps import relative_variance
@@ -45,13 +46,7 @@ def integrator(method, radius, mixture):
 def iterations(scene, method, radius, mixture):
     """Pictures of independent iterations, (ITERATIONS, H, W, 3)."""
     session = integrator(method, radius, mixture).session(scene, seed=5)
-    total, pictures = 0.0, []
-    for count in range(1, ITERATIONS + 1):
-        session.iterate()
-        image = count * session.image()[..., :3].astype(np.float64)
-        pictures.append(image - total)
-        total = image
-    return np.array(pictures)
+    return np.array([picture[..., :3] for picture in pictures(session, ITERATIONS)])
 
 
 @pytest.fixture(scope="module", params=SCENES)
