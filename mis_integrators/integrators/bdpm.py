@@ -259,6 +259,10 @@ class BDPMSession(IterativeSession):
 
     def start(self):
         self.begun = self.begun or time.perf_counter()
+        self.set_up()
+
+    def set_up(self):
+        """What `start` does when it has looked at the clock: chooses the radii, unless they are known."""
         if self.radii is None:
             self.forecast = choose_radii(self)
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import time
-
 import drjit as dr
 import mitsuba as mi
 
@@ -65,16 +63,15 @@ class WeightedSession(BDPMSession):
             return weights.merging(level, state, f, p, notebook.read(level, photon_map.notes, index, active))
         return weigh
 
-    def start(self):
-        self.begun = self.begun or time.perf_counter()
+    def set_up(self):
+        if not self.weighted_pilot:
+            super().set_up()                     # may render already, to measure time, and so come here
         if not self._weighted and self.kinds() and self.mixes():
-            if not self.weighted_pilot:
-                super().start()
             self.prepare(super()._spectral(0))
             self._weighted, self.one_vertex = True, False
             self.vertex_capacity = self._vertex_room(self.chunk)
             self._freeze()
-        super().start()
+        super().set_up()
 
     def _vertex_room(self, paths):
         return super()._vertex_room(paths) if not self._weighted else paths * (2 if self.traits.has_mixed else 1)
