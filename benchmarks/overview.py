@@ -16,11 +16,11 @@ from reports import Row, console, save, show
 from scene_files import open_scene, scaled_size
 from sweeps import SWEEPS
 
-COMPILING_SECONDS = 4.0
+COMPILING_SECONDS = 2.5
 """Rough guess of what kernels and set-up cost for a method and scene on an idle machine; only the plan depends on it."""
-SHORTEST = 2.0
+SHORTEST = 1.5
 """Least rendering seconds of a method, whatever the plan."""
-VARIANCE_SECONDS = 18.0
+VARIANCE_SECONDS = 12.0
 """Rough guess for the variance maps of a scene."""
 
 

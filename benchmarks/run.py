@@ -58,7 +58,7 @@ def _parser() -> argparse.ArgumentParser:
     command = _measuring(commands, "page", overview)
     _renders(command, None)
     _compares_with_references(command)
-    command.add_argument("--minutes", type=float, default=26, metavar="MINUTES", help="what all should take, if --time is not given (default: 26)")
+    command.add_argument("--minutes", type=float, default=28, metavar="MINUTES", help="what all should take, if --time is not given (default: 28)")
     command.add_argument("--snapshots", type=int, default=5, metavar="N", help="at times T, T/2, T/4, ... (default: 5)")
     command.add_argument("--varied", nargs="+", type=parse_method, default=registered(VARIED), metavar="PLUGIN[:...]",
                          help=f"methods of the variance maps (default: {' '.join(method.label for method in registered(VARIED))})")

@@ -30,8 +30,9 @@ LEAST_BIAS, MOST_BIAS = 0.003, 1.0
 corridor, rooms lit through a door or a window it is 0.002 to 0.04.)"""
 RARE_PIXELS = 0.001
 """Share of the pixels, the noisiest, without which noise is judged."""
-SHARES_STRAY = 0.3
-"""How far the share of what the correction at edges adds that plain estimates do lack strays from one, before anything was measured."""
+SHARES_STRAY, SHARES_RETURN = 0.3, 0.5
+"""The share of what the correction at edges adds that plain estimates do lack: how far it strays from one radius of the ladder to the next smaller
+one, and which part of its distance from one, where small disks have it, it makes up for on the way."""
 
 
 def ladder(points, weights):
@@ -96,20 +97,32 @@ def light_lost_at_edges(plain, corrected, weights):
 
     As a disk grows, what the correction adds grows by a pattern over the pixels. Plain estimates lose light by the same pattern if the edges
     are real (share one), and keep it where the correction takes clutter for edges (share zero). The share that each step of the ladder loses
-    is measured along that pattern, which has little noise, long before Q shows it; a disk lacks what all steps up to it have lost.
+    is measured along that pattern, which has little noise, long before Q shows it; a disk lacks what all steps up to it have lost. Where noise
+    hides the share of a small step, it is expected to be between one and that of the next larger step.
     `plain`, `corrected`: (iterations, radii, pixels) of the same photons.
     """
     added = corrected - plain
     squared = np.maximum(expected_products(added, added, weights), 0)
     lost, error = with_error(plain[:, :-1] - plain[:, 1:], added[:, 1:], weights)
     expected = np.maximum(expected_products(np.diff(added, axis=1), added[:, 1:], weights), 1e-12)
-    spread = error / expected
-    certainty = SHARES_STRAY ** 2 / (SHARES_STRAY ** 2 + spread ** 2)
-    share = np.concatenate([[1.0], 1 + certainty * (lost / expected - 1)])
-    variance = np.concatenate([[SHARES_STRAY ** 2], certainty * spread ** 2])
+    share, variance = shares_by_step(lost / expected, (error / expected) ** 2)
     step = np.concatenate([[max(squared[0], 1e-12)], expected])
     total = np.cumsum(step)
     return squared, np.cumsum(step * share) / total, np.sqrt(np.cumsum(step ** 2 * variance)) / total
+
+
+def shares_by_step(measured, variance):
+    """The shares of the ladder's steps from noisy ones, each seen in the light of those of the larger steps, and their variances; one value more than
+    is `measured`, for the smallest radius itself."""
+    shares, variances = [], []
+    expected, stray = 1.0, SHARES_STRAY ** 2
+    for value, noise in zip(measured[::-1], variance[::-1]):
+        trust = stray / (stray + noise)
+        share, left = expected + trust * (value - expected), (1 - trust) * stray
+        shares.append(share)
+        variances.append(left)
+        expected, stray = share + SHARES_RETURN * (1 - share), (1 - SHARES_RETURN) ** 2 * left + SHARES_STRAY ** 2
+    return np.array([expected, *shares[::-1]]), np.array([stray, *variances[::-1]])
 
 
 def squared_bias_over_difference(exponent):
@@ -119,20 +132,19 @@ def squared_bias_over_difference(exponent):
     return at_edges * (by_curvature / at_edges) ** ((exponent - low) / (high - low))
 
 
-def expected_squared_bias(radii, difference, error, wanted):
+def expected_squared_bias(radii, difference, error, iterations, wanted):
     """Squared bias at the radii `wanted`, from noisy Q at the ladder: the mean over power laws Q = a R^q, each weighted by how well it
     explains the values (flat in q between 1, edges, and 4, curvature, and in the logarithm of the squared bias at the largest radius).
 
-    Radii above the second that stands clearly out of its noise are left out: Q saturates, and small radii are what is asked for.
+    The `error` of Q is itself estimated from a few `iterations`, and often too small by far: misfits follow Student's distribution.
     """
-    clear = np.flatnonzero((difference > 3 * error) & (difference > 0))
-    used = slice(1, clear[1] + 1 if len(clear) > 1 else len(radii))
     slopes = np.linspace(AT_EDGES[0], BY_CURVATURE[0], 31)[:, None, None]
     ratio = squared_bias_over_difference(slopes)
     heights = np.geomspace(LEAST_BIAS, MOST_BIAS, 100)[None, :, None]     # squared bias at the largest radius
-    law = heights / ratio * (radii[used] / radii[-1]) ** slopes
-    spread = np.hypot(error[used], 0.15 * law) + 1e-12
-    misfit = np.sum(((difference[used] - law) / spread) ** 2 + 2 * np.log(spread), axis=-1)
+    law = heights / ratio * (radii[1:] / radii[-1]) ** slopes
+    spread = np.hypot(error[1:], 0.15 * law) + 1e-12
+    freedom = max(iterations - 1, 1)
+    misfit = np.sum((freedom + 1) * np.log1p(((difference[1:] - law) / spread) ** 2 / freedom) + 2 * np.log(spread), axis=-1)
     weight = np.exp(-0.5 * (misfit - misfit.min()))
     weight /= weight.sum()
     bias = heights * (wanted / radii[-1]) ** slopes
@@ -172,7 +184,7 @@ def best_radius(radii, plain, corrected, mean, iterations, at_first_vertex=True,
         ways = {way: (samples, between(fine, radii, added * wrong[way])) for way, samples in ((False, plain), (True, corrected))}
         best = plain + lacking[:, None] * (corrected - plain)
     _, difference, error = noise_and_difference(radii, best, weights, at_first_vertex)
-    blur = expected_squared_bias(radii, difference, error, fine)
+    blur = expected_squared_bias(radii, difference, error, len(plain), fine)
     choices = []
     for way, (samples, edges) in ways.items():
         variance = between(fine, radii, noise_and_difference(radii, samples, weights, at_first_vertex, alike)[0])
