@@ -136,6 +136,16 @@ def test_longer_renders_try_more(rgb):
     assert short <= 2 < long
 
 
+@pytest.mark.parametrize("seconds, tried", [(0.5, False), (1000.0, True)])
+def test_a_short_render_does_not_spend_its_time_on_trials(rgb, seconds, tried):
+    """What a trial takes is mostly set-up, which the clock knows and the costs of events do not."""
+    session = auto().session(glossy_box())
+    session.plan_time(seconds)
+    session.start()
+    assert ("bdpm_opt2" in session.decision.errors) == tried
+    assert "bdpm bdd=0" in session.decision.errors
+
+
 def test_prediction_is_checked(rgb):
     """The error that is predicted for `path` is what independent renders have: within a factor of two, the pilot's pixels being few."""
     scene = tray("lambertian", "rectangle")

@@ -7,6 +7,7 @@ some of the light are not tried.
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass, field
 
 import mitsuba as mi
@@ -24,6 +25,8 @@ PHOTON_MAPPERS = (("bdpm", {"bdd": 0}), ("bdpm_opt2", {}), ("bdpm", {"bdd": 1}),
 """In the order in which they are tried while the pilot's share of the time lasts: those first that are most often the best."""
 PILOT_SHARE = 0.05
 """Share of the planned time that the pilot may have; `path` and the first photon mapper are tried however long that takes."""
+LIKE_THE_FIRST = 2.5
+"""What trying another photon mapper takes, in the seconds that the first one took (optimal weights have to learn first): 1.6 to 3."""
 PATH_TRIALS = 12
 UNSEEN = 1e-3
 """Share of the light, brought by caustics, from which on a `path` that cannot see them is out of the question."""
@@ -80,6 +83,7 @@ def name_of(plugin, parameters):
 
 def choose(integrator, scene, sensor, seed, iterations, seconds):
     """The `Decision` for a render of so many iterations, or of so many seconds (either may be `None`)."""
+    began = time.perf_counter()
     path = PathSession(integrator, scene, sensor, seed, iterations)
     plugin, parameters = PHOTON_MAPPERS[0]
     first = new_session(plugin, parameters, integrator, scene, sensor, seed, iterations)
@@ -90,6 +94,7 @@ def choose(integrator, scene, sensor, seed, iterations, seconds):
     forecast = first.forecast
     if forecast is None:
         return Decision("path", {}, path, ["path: no camera path meets a surface that scatters smoothly"])
+    first_seconds = time.perf_counter() - began
 
     stride, pixels = pilot_pixels(path)
     segments = mean_segments(scene, sensor, seed, stride * integrator.camera_paths, pixels, integrator.max_depth, integrator.rr_depth)
@@ -109,7 +114,11 @@ def choose(integrator, scene, sensor, seed, iterations, seconds):
         if plugin == "bdpm_opt3" and not first.traits.has_mixed and trials[-1].name.endswith("bdd=1") and _worse(trials, budget):
             reasons.append(f"not {name}: merging at the second vertex does not pay, let alone at the third")
             continue
-        if spent + FEWEST_ITERATIONS * usual * 0.5 > PILOT_SHARE * budget:
+        if seconds is None:
+            left = PILOT_SHARE * budget - spent - FEWEST_ITERATIONS * usual * 0.5
+        else:
+            left = PILOT_SHARE * seconds - (time.perf_counter() - began) - LIKE_THE_FIRST * first_seconds
+        if left < 0:
             reasons.append(f"not {name}: trying it would take more than {PILOT_SHARE:.0%} of the time")
             continue
         session = new_session(plugin, parameters, integrator, scene, sensor, seed, max(int(budget / usual), 1), (first.traits, first.lights))
