@@ -2,7 +2,7 @@
 
 Iterations are independent and the radius does not change from one to the next, so the error after n of them is bias^2 + V / n. Each radius
 renders for a few seconds, in turns with the others; bias^2, the variance V of an iteration, and the seconds of an iteration and of what goes
-before the first then give the error at any time.
+before the first then give the error at any time. The automatic radius is a draw, since a pilot chooses it: several are judged.
 """
 
 from __future__ import annotations
@@ -30,19 +30,23 @@ COLUMNS = ("scene", "bdd", "time", "automatic", "best radius trimmed", "auto / b
 def run(options: argparse.Namespace) -> None:
     """The sub-command ``radius``."""
     sweeps: list[Row] = []
+    rows: list[Row] = []
     summary: list[Row] = []
     for path in options.scenes:
         opened = open_scene(path, scaled_size(path, options.scale))
         references = find_references(opened, options, tell)
         for bdd in options.bdd:
-            automatic, fixed = sweep(opened, references, bdd, options.time, options.rendering, options.radii)
+            automatic, fixed = sweep(opened, references, bdd, options.time, options.rendering, options.radii, options.pilots)
             place = {"scene": opened.name, "size": "{}x{}".format(*opened.size), "bdd": bdd, "references": references.origin}
-            sweeps += [{**place, **vars(law)} for law in fixed + automatic]
+            sweeps += [{**place, **vars(law)} for law in fixed + sum(automatic.values(), [])]
             if fixed:
-                summary += [{**place, **judge(seconds, law, fixed)} for seconds, law in zip(options.time, automatic)]
-                show("Automatic radius against the best of a sweep", summary, COLUMNS)
-                save(options.out, "radius", summary, vars(options))
-                save(options.out, "radius_sweep", sweeps, vars(options))
+                found = [{**place, **judge(seconds, law, fixed)} for seconds, laws in automatic.items() for law in laws]
+                rows += found
+                summary += [usual_and_worst([row for row in found if row["time"] == seconds]) for seconds in options.time]
+                show("Automatic radius against the best of a sweep, each pilot", rows, COLUMNS)
+                show("Automatic radius against the best of a sweep: geometric mean and worst of the pilots", summary)
+                for name, table in (("radius", rows), ("radius_pilots", summary), ("radius_sweep", sweeps)):
+                    save(options.out, name, table, vars(options))
 
 
 @dataclass(frozen=True)
@@ -69,29 +73,41 @@ class ErrorLaw:
         return bias + variance * self.seconds / max(rendering, self.seconds)
 
 
-def sweep(opened: OpenScene, references: References, bdd: int, times: list[float], rendering: float,
-          radii: int) -> tuple[list[ErrorLaw], list[ErrorLaw]]:
-    """Laws of the automatic radius, one for each of the `times` it is to plan for, and of ``radii`` radii around them; none if nothing
-    is gathered. Each renders for `rendering` seconds."""
-    pilots, chosen_for_free = [], []
+def sweep(opened: OpenScene, references: References, bdd: int, times: list[float], rendering: float, radii: int,
+          pilots: int) -> tuple[dict[float, list[ErrorLaw]], list[ErrorLaw]]:
+    """Laws of the automatic radius, one for each pilot and each of the `times` it is to plan for, and of ``radii`` radii around them; none if
+    nothing is gathered. Each renders for `rendering` seconds."""
+    tried: dict[float, list[Contender]] = {}
+    chosen_for_free: dict[float, list[Contender]] = {}
     for seconds in times:
         maker = SessionMaker(Method("automatic", "bdpm", {"bdd": bdd, "variance": True}), opened, seconds)
-        pilot = Contender.begin("pilot", maker.make, seed=0)
-        take_turns([pilot], 0)
-        if central_radius(pilot.session.settings) is None:
-            return [], []
-        pilots.append(pilot)
-        chosen_for_free.append(Contender.begin(f"automatic for {seconds:g} s", maker.make, seed=0))
-        adopt_choice(chosen_for_free[-1].session, pilot.session)
-    centre = float(np.exp(np.mean([np.log(central_radius(pilot.session.settings)) for pilot in pilots])))
+        tried[seconds] = [Contender.begin(f"automatic for {seconds:g} s", maker.make, seed) for seed in range(pilots)]
+        for pilot in tried[seconds]:
+            take_turns([pilot], 0)
+            if central_radius(pilot.session.settings) is None:
+                return {}, []
+        chosen_for_free[seconds] = [free_choice(pilot, maker) for pilot in tried[seconds]]
+    centre = float(np.exp(np.mean([np.log(central_radius(pilot.session.settings)) for group in tried.values() for pilot in group])))
     fixed = [Contender.begin(maker.method.label, maker.make, seed=0) for maker in sweep_around(centre, radii, bdd, opened, rendering)]
-    take_turns([*chosen_for_free, *fixed], rendering, tell)
-    take_turns([*chosen_for_free, *fixed], 0, tell, FEWEST_ITERATIONS)
-    automatic = [law(free, references) for free in chosen_for_free]
-    # A pilot keeps the iterations by which it has measured time: what is left of them after the first is no set-up either.
-    rendered = [1 + len(pilot.session.rehearsed) for pilot in pilots]
-    automatic = [replace(own, set_up=pilot.first - count * own.seconds) for own, pilot, count in zip(automatic, pilots, rendered)]
+    together = [*sum(chosen_for_free.values(), []), *fixed]
+    take_turns(together, rendering, tell)
+    take_turns(together, 0, tell, FEWEST_ITERATIONS)
+    automatic = {seconds: [with_set_up(law(free, references), pilot) for free, pilot in zip(chosen_for_free[seconds], tried[seconds])]
+                 for seconds in times}
     return automatic, [law(one, references) for one in fixed]
+
+
+def free_choice(pilot: Contender, maker: SessionMaker) -> Contender:
+    """A rendering with the radii that a pilot chose, which needs no pilot of its own."""
+    free = Contender.begin(pilot.label, maker.make, seed=0)
+    adopt_choice(free.session, pilot.session)
+    return free
+
+
+def with_set_up(law: ErrorLaw, pilot: Contender) -> ErrorLaw:
+    """The law with the set-up that its pilot took: a pilot keeps the iterations by which it has measured time, so that what is left of them after
+    the first is no set-up either."""
+    return replace(law, set_up=pilot.first - (1 + len(pilot.session.rehearsed)) * law.seconds)
 
 
 def adopt_choice(session, pilot) -> None:
@@ -142,3 +158,13 @@ def judge(seconds: float, automatic: ErrorLaw, fixed: list[ErrorLaw]) -> Row:
         }
     row["bias share"] = automatic.squared_bias_trimmed / row["auto relMSE trimmed"]
     return row
+
+
+def usual_and_worst(rows: list[Row]) -> Row:
+    """What the pilots of one scene and time have in common, the geometric mean of their ratios, and the worst."""
+    first = rows[0]
+    table: dict = {name: first[name] for name in ("scene", "bdd", "time")} | {"pilots": len(rows)}
+    for name in ("auto / best trimmed", "auto / best", "choice / best trimmed"):
+        ratios = [row[name] for row in rows]
+        table |= {name: float(np.exp(np.mean(np.log(ratios)))) if min(ratios) > 0 else float("nan"), f"{name}, worst": max(ratios)}
+    return table

@@ -107,6 +107,7 @@ def _parser() -> argparse.ArgumentParser:
                          help="seconds for which the automatic radius is chosen and judged (default: 5 60)")
     command.add_argument("--rendering", type=float, default=10, metavar="SECONDS",
                          help="what each radius renders; its error at other times follows (default: 10)")
+    command.add_argument("--pilots", type=int, default=1, help="how many choices of the automatic radius are judged (default: 1)")
     command.add_argument("--radii", type=int, default=11, help="how many, factor sqrt 2 (default: 11)")
     command.add_argument("--scale", type=float, default=1, help="film size, scene's own = 1 (default: 1)")
     references.add_options(command)
