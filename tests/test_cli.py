@@ -459,4 +459,5 @@ def test_help_documents_the_exit_codes(capsys):
         cli.main(["--help"])
     assert exit.value.code == 0
     text = capsys.readouterr().out
-    assert all(f"  {code} " in text for code in (0, 1, 2, 3, 130))
+    codes = [value for name, value in vars(cli).items() if name.startswith("EXIT_")]
+    assert len(codes) == 7 and all(f"\n  {code} " in text for code in codes)
