@@ -319,13 +319,14 @@ def test_power_decides_among_emitters():
 @pytest.mark.parametrize("emitter", ["rectangle", "sphere", "disk", "cylinder", "cube", "textured", "constant", "envmap",
                                      "envmap rotated", "sunsky", "several"])
 def test_density_of_direct_light(emitter):
-    """The density that `sample_direct` states is the one that `pdf_direct` gives for the same direction, and is that of the samples."""
+    """The density that `sample_direct` states is the one that `pdf_direct` gives for the same direction, and is that of the samples (5.3 standard
+    errors: 1e-7; an error of 5 % is seen with a probability of 0.95)."""
     scene = mi.load_dict({"type": "scene", "floor": {"type": "rectangle", "to_world": T().scale([0.01, 0.01, 1]), "bsdf": diffuse()},
                           "sensor": {"type": "perspective", "to_world": look((0, 0, 5), (0, 0, 0)), "film": film(16)},
                           **EMITTERS[emitter]("delta")})
     guide = EnvironmentGuide(scene, scene.sensors()[0]) if emitter in ("constant", "envmap", "envmap rotated", "sunsky", "several") else None
     lights = Lights(scene, guide=guide)
-    n = 1 << 17
+    n = 1 << 20
     si = dr.zeros(mi.SurfaceInteraction3f, n)
     si.p, si.n, si.sh_frame, si.t = mi.Point3f(0.1, 0.2, 0.3), mi.Normal3f(0, 0, 1), mi.Frame3f(mi.Normal3f(0, 0, 1)), 1.0
     rng = streams(dr.arange(mi.UInt32, n), mi.UInt32(5))
@@ -344,7 +345,9 @@ def test_density_of_direct_light(emitter):
     hit = scene.ray_intersect(si.spawn_ray(d))
     uniform = np.array(dr.mean(hit.emitter(scene).eval(hit)) * (4 * np.pi))
     expected, expected_error = mean_and_error(uniform)
-    assert abs(value - expected) < 5.3 * np.hypot(error, expected_error), f"{value} against {expected}"
+    error = np.hypot(error, expected_error)
+    assert abs(value - expected) < 5.3 * error, f"{value} against {expected}"
+    assert (5.3 + 1.65) * error < 0.05 * expected, "test too weak"
 
 
 @given(st.floats(0, 1e10, width=32), st.floats(0, 1e10, width=32))
@@ -388,8 +391,12 @@ def test_environment_directions(emitter):
     met = np.bincount(cells, minlength=512) > 200
     assert met.sum() > 100
     wrong = met & (np.abs(per_cell - 4 * np.pi / 512) > 5.5 * error + 0.02 * 4 * np.pi / 512)
-    edge = emitter == "sunsky"                                    # the sky ends inside the cells at the horizon
-    assert wrong.sum() <= (64 if edge else 0), np.flatnonzero(wrong)
+    assert not wrong.any(), np.flatnonzero(wrong)
+    # A cell alone says no more than that to a fifth; all of them together, to 2 %.
+    total, total_error = mean_and_error(np.where(met[cells], inverse, 0))
+    expected = met.sum() * 4 * np.pi / 512
+    assert abs(total - expected) < 5.3 * total_error, (total / expected, total_error / expected)
+    assert (5.3 + 1.65) * total_error < 0.02 * expected, "test too weak"
 
 
 @pytest.mark.parametrize("emitter", ["directional", "constant", "sunsky"])
