@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from comparing import agree
+from comparing import agree, pictures
 from foggy import even, view, volpath
 from foggy import grid as smoke
 from foggy import world as foggy_world
@@ -58,12 +58,17 @@ def test_path_in_parts(rgb, monkeypatch):
     whole = Unidirectional().session(scene, 0, 1, 0)
     monkeypatch.setattr("mis_integrators.integrators.unidirectional.CHUNK", 1000)
     parts = Unidirectional().session(scene, 0, 1, 0)
-    assert parts.chunks > 1
+    assert parts.chunks == 3 and parts.chunk == 48 * 16
     for _ in range(24):
-        whole.iterate(), parts.iterate()
+        whole.iterate()
+    noise = np.array([picture.mean(axis=-1) for picture in pictures(parts, 24)])
     a, b = whole.image(), parts.image()
     assert abs(a.mean() / b.mean() - 1) < 0.03
     assert np.corrcoef(a[0::2].ravel(), b[0::2].ravel())[0, 1] > 0.9
+    noise -= noise.mean(axis=0)
+    noise = (noise / np.maximum(noise.std(axis=0), 1e-6)).reshape(24, 3, -1)          # a part is 16 rows
+    for one, other in ((0, 1), (1, 2), (0, 2)):
+        assert abs(np.mean(noise[:, one] * noise[:, other])) < 5.3 / np.sqrt(noise[:, 0].size)      # 1e-7
 
 
 def test_census(rgb):

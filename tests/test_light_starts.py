@@ -42,9 +42,10 @@ def test_flux_is_light_over_densities(rgb, emitter):
 
 @pytest.mark.parametrize("emitter", ["rectangle", "textured", "sphere", "spot", "directional", "envmap rotated", "several", "projector"])
 def test_starts_light_the_scene(rgb, emitter):
-    """Light from all starts over their densities: its mean is the unoccluded light at a point, as next-event estimation finds it."""
+    """Light from all starts over their densities: its mean is the unoccluded light at a point, as next-event estimation finds it (5.3 standard errors:
+    1e-7; an error of 3 % is seen with a probability of 0.95)."""
     scene, lights = lights_of(emitter)
-    count = 1 << 17
+    count = 1 << 20
     starts = sample_light_starts(lights, mi.UInt32(3), count, [], mi.Float(0))
     starts = read_starts(starts, dr.arange(mi.UInt32, count), mi.Bool(True))
     si = dr.zeros(mi.SurfaceInteraction3f, count)
@@ -60,4 +61,4 @@ def test_starts_light_the_scene(rgb, emitter):
         total, error2 = total + b.mean(), error2 + b.var() / count
     error = np.sqrt(error2 + a.var() / count)
     assert abs(a.mean() - total) < 5.3 * error + 1e-4 * total, f"{a.mean()} against {total} ({error})"
-    assert error < 0.03 * total
+    assert (5.3 + 1.65) * error < 0.03 * total, "test too weak"
