@@ -54,3 +54,13 @@ def test_photons_make_the_light_of_path(rgb, scene, bdd):
     loaded, common = small(scene)
     assert_alike(SessionBatches(mi.load_dict({"type": "bdpm", "bdd": bdd, **common}), loaded, 2),
                  PathBatches(mi.load_dict({"type": "path", "max_depth": 10}), loaded, 2))
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("plugin", ["bdpt", "vcm", "bdpt_ris", "pcbpt"])
+@pytest.mark.parametrize("scene", [scene for scene in SCENES if scene not in BEYOND_PATH])
+def test_connections_make_the_light_of_path(rgb, scene, plugin):
+    loaded, common = small(scene)
+    own = {"initial_radius": common["initial_radius"]} if plugin == "vcm" else {}
+    assert_alike(SessionBatches(mi.load_dict({"type": plugin, "max_depth": 10, "camera_paths": 16, **own}), loaded, 2),
+                 PathBatches(mi.load_dict({"type": "path", "max_depth": 10}), loaded, 2))

@@ -1,4 +1,5 @@
-"""The documentation: its code runs, its tables are those of the docstrings, its links and pictures exist."""
+"""The documentation: its code runs, its commands are understood, its tables are those of the docstrings, and these say what plugins take; its links
+and pictures exist."""
 
 import json
 import os
@@ -10,10 +11,12 @@ from pathlib import Path
 import mitsuba as mi
 import pytest
 
-from mis_integrators import _plugins
+from mis_integrators import _plugins, options
+from test_benchmarks import module  # noqa: F401  (a fixture)
 
 ROOT = Path(__file__).parent.parent
 PAGES = sorted((ROOT / "docs").glob("*.md"))
+OTHERS = [ROOT / "README.md", ROOT / "benchmarks" / "README.md", ROOT / "scenes" / "README.md", ROOT / "notebooks" / "tutorial.ipynb"]
 OWN_PAGE = {"bdpm_opt2": "bdpm_opt", "bdpm_opt3": "bdpm_opt"}
 
 
@@ -53,6 +56,25 @@ def test_commands_of_the_tutorial_run(tmp_path):
     assert (tmp_path / "caustics.exr").exists() and (tmp_path / "final.png").exists()
 
 
+def commands(program: str) -> list[list[str]]:
+    """The arguments of all command lines of a program in the pages: in lines of their own, indented, or within a text."""
+    inline, own_line = rf"`{program} ([^`]+)`", rf"^    {program} (.*?)(?: {{3,}}#.*)?$"
+    texts = [page.read_text() for page in [*PAGES, *OTHERS]]
+    found = [match.split() for text in texts for pattern in (inline, own_line) for match in re.findall(pattern, text, re.MULTILINE)]
+    return [arguments for arguments in found if not {"SUB-COMMAND", "--help"} & set(arguments)]
+
+
+def test_commands_of_the_pages_are_understood(module):  # noqa: F811
+    """Every option is one that there is, with a value that it takes; nothing is run."""
+    benchmarks, renders = commands(r"python benchmarks/run\.py"), commands("mis-render")
+    assert len(benchmarks) > 12 and len(renders) > 8
+    parser = module("run")._parser()
+    for arguments in benchmarks:
+        parser.parse_args(["path" if argument == "..." else argument for argument in arguments])
+    for arguments in renders:
+        options.parse(arguments if any(argument.endswith(".xml") for argument in arguments) else ["scene.xml", *arguments])
+
+
 def test_strategy_of_the_documentation_works(tmp_path):
     """The page's integrator, its comparison with `path`, and its refusal."""
     code = "\n\n".join(blocks(ROOT / "docs" / "adding_a_strategy.md", "python"))
@@ -74,12 +96,33 @@ def test_every_plugin_has_a_page(rgb):
             assert name == "integrator" or f"`{name}`" in text, (plugin, name)
 
 
+@pytest.mark.parametrize("plugin", sorted(set(_plugins.PLUGINS) - set(OWN_PAGE)))
+def test_docstrings_say_what_plugins_take(rgb, monkeypatch, plugin):
+    """All parameters and no others, with the defaults that they have."""
+    monkeypatch.syspath_prepend(str(ROOT / "tools"))
+    from parameter_tables import parameters
+
+    made = mi.load_dict({"type": plugin})
+    rows = parameters(type(made).__doc__)
+    with pytest.raises(RuntimeError) as error:
+        mi.load_dict({"type": plugin, "nonsense": 1})
+    assert ", ".join(sorted(", ".join(name for name, *_ in rows).split(", "))) == str(error.value).strip().rpartition("allowed are: ")[2]
+    for name, kind, text in rows:
+        default = re.search(r"\(Default: (?:yes, i\.e\. |no, i\.e\. )?(.*)\)$", text)
+        assert default or not kind, name
+        if default and name != "mix_diffuse":                       # whose default depends on the scene
+            value = made.settings()[name]
+            shown = str(value).lower() if isinstance(value, bool) else f"{value:g}" if isinstance(value, float) else str(value)
+            assert default[1].strip("`") == shown, name
+            assert kind == {bool: "bool", int: "int", float: "float", str: "string"}[type(value)]
+
+
 def test_tables_are_those_of_the_docstrings():
     result = run([sys.executable, str(ROOT / "tools" / "parameter_tables.py"), "--check"], ROOT)
     assert result.returncode == 0, result.stdout
 
 
-@pytest.mark.parametrize("page", [*PAGES, ROOT / "README.md"], ids=lambda page: page.name)
+@pytest.mark.parametrize("page", [*PAGES, *OTHERS], ids=lambda page: str(page.relative_to(ROOT)))
 def test_links_lead_somewhere(page):
     """Files that exist, and headings of those that are named."""
     text = re.sub(r"^```.*?^```$", "", page.read_text(), flags=re.MULTILINE | re.DOTALL)
