@@ -137,6 +137,21 @@ def test_winner_and_those_that_cannot_be_told_apart(module):
 # --- The commands ---------------------------------------------------------------------------------------
 
 
+def test_bundled_scenes_are_as_frozen(module, monkeypatch, tmp_path, capsys):
+    """Figures of different versions are about the same scenes. A file that changed, one that is new, and one that is gone are named."""
+    freezing = module("freezing")
+    freezing.check(None)
+    frozen = json.loads(freezing.RECORD.read_text())
+    assert len(frozen) > 20 and all(len(digest) == 64 for digest in frozen.values())
+    del frozen["door.xml"]
+    monkeypatch.setattr(freezing, "RECORD", tmp_path / "scenes.json")
+    freezing.RECORD.write_text(json.dumps({**frozen, "sds.xml": 64 * "0", "attic.xml": 64 * "0"}))
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as exit:
+        freezing.check(None)
+    assert exit.value.code == 1 and capsys.readouterr().out.splitlines() == ["attic.xml: gone", "door.xml: new", "sds.xml: changed"]
+
+
 def test_sweeps_of_views(module):
     """The views' sweeps name plugins that there are, and vary what they say."""
     sweeps = [sweep for sweep in module("sweeps").SWEEPS if sweep.labels]

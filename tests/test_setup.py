@@ -153,6 +153,21 @@ def test_llvm_that_aborts_is_refused(order):
     assert "aborts the process" in result.stderr.splitlines()[-1]
 
 
+@pytest.mark.parametrize("python, environment, message", [
+    (sys.executable, {llvm.VARIABLE: "/none.so"}, "does not exist"), ("no-such-python", {}, "does not run; install Python 3.10 or newer"),
+    (None, {}, "is Python 3.9")])
+def test_set_up_stops_with_one_message(tmp_path, python, environment, message):
+    """What `make render` begins with says what to install, and makes nothing, where it cannot go on."""
+    if python is None:
+        python = tmp_path / "old-python"
+        python.write_text("#!/bin/sh\ncase $2 in *version_info\\ \\<*) exit 1;; *) echo 3.9;; esac\n")
+        python.chmod(0o755)
+    result = subprocess.run([ROOT / "tools" / "setup.sh", python, tmp_path / "venv"], capture_output=True, text=True, timeout=60,
+                            env={**os.environ, **environment})
+    assert result.returncode == 1 and message in result.stderr and result.stderr.count("\n") == 1, result.stderr
+    assert result.stderr.startswith("setup: ") and not (tmp_path / "venv").exists()
+
+
 # --- Registration ---------------------------------------------------------------------------------
 
 CHECK = """
