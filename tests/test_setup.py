@@ -220,6 +220,20 @@ def test_modules_that_define_plugin_classes_are_loaded_anew(rgb):
             assert file.stem in _plugins.MODULES
 
 
+def package_files() -> list[Path]:
+    """All files of the package but what Python leaves there."""
+    return [file for file in (ROOT / "mis_integrators").rglob("*") if file.is_file() and "__pycache__" not in file.parts]
+
+
+def test_files_that_are_no_modules_are_declared():
+    """Setuptools leaves out of a wheel what pyproject.toml does not name."""
+    tomllib = pytest.importorskip("tomllib", reason="Python 3.11 or newer reads TOML")
+    declared = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]
+    named = {file for package, patterns in declared.items() for pattern in patterns for file in ROOT.joinpath(*package.split(".")).glob(pattern)}
+    data = {file for file in package_files() if file.suffix != ".py"}
+    assert data and data <= named
+
+
 def test_type_hints_are_right(tmp_path):
     """Those of the modules that pyproject.toml lists."""
     pytest.importorskip("mypy", reason="mypy is not installed: pip install 'mis-integrators[lint]'")
@@ -227,7 +241,7 @@ def test_type_hints_are_right(tmp_path):
     assert result.returncode == 0, result.stdout
 
 
-def test_wheel_holds_every_module(tmp_path):
+def test_wheel_holds_every_file(tmp_path):
     """Built without isolation: it needs no network, but a recent setuptools, which extra `test` brings."""
     setuptools = pytest.importorskip("setuptools")
     if int(setuptools.__version__.split(".")[0]) < 77:
@@ -254,6 +268,5 @@ def test_wheel_holds_every_module(tmp_path):
     )
     (wheel,) = tmp_path.glob("*.whl")
     names = set(zipfile.ZipFile(wheel).namelist())
-    sources = {file.relative_to(ROOT).as_posix() for file in (ROOT / "mis_integrators").rglob("*.py")}
-    assert sources <= names
+    assert {file.relative_to(ROOT).as_posix() for file in package_files()} <= names
     assert any(name.endswith("licenses/LICENSE") for name in names)
