@@ -11,6 +11,7 @@ import pytest
 from comparing import (Estimate, PathBatches, SessionBatches, agree, assert_same, block_means, collect_until, differences, extrapolate,
                        kernels_of, pictures)
 from worlds import T, bdpm, diffuse, film, grey, look, path, sensor, tray
+from mis_integrators._plugins import PLUGINS
 
 
 def box_scene(size=32, rfilter="box", film_options=None, light="area", **entries):
@@ -139,8 +140,8 @@ def test_iteration_depends_on_its_index_alone(rgb):
 
 
 def test_seeds_and_iterations_are_uncorrelated(rgb):
-    """Correlation of the pixels' noise over pairs of renders, of different seeds and iterations: below 0.2, four to five standard deviations of chance
-    (0.04 to 0.06: neighbouring pixels share photons). With random numbers in common it is far above."""
+    """Correlation of the pixels' noise over pairs of renders, of different seeds and iterations: below 0.2, four to five standard deviations of
+    chance (0.04 to 0.06: neighbouring pixels share photons). With random numbers in common it is far above."""
     scene = glossy_box(size=32)
     mean = render(scene, 1000, 256).mean(axis=2)
     session = bdpm(camera_paths=1, photon_count=3000).session(scene, 0, 3, 0)
@@ -456,8 +457,8 @@ def test_merged_shapes(rgb, bdd):
 
 
 @pytest.mark.parametrize("name, value, allowed", [
-    ("max_depth", -2, "-1"), ("max_depth", 2 ** 40, "below 2^31"), ("max_depth", 1.5, "integer"), ("max_depth", "many", "integer"), ("rr_depth", 0, "at least 1"),
-    ("rr_depth", -1, "at least 1"), ("hide_emitters", 1, "true or false"), ("hide_emitters", "yes", "true or false"),
+    ("max_depth", -2, "-1"), ("max_depth", 2 ** 40, "below 2^31"), ("max_depth", 1.5, "integer"),
+    ("max_depth", "many", "integer"), ("rr_depth", 0, "at least 1"), ("rr_depth", -1, "at least 1"), ("hide_emitters", 1, "true or false"), ("hide_emitters", "yes", "true or false"),
     ("photon_count", -1, "at least 0"), ("photon_count", 1000.5, "integer"), ("photon_count", 2 ** 40, "at least 0"),
     ("initial_radius", -0.1, "at least 0"), ("initial_radius", float("inf"), "finite"), ("initial_radius", float("nan"), "finite"),
     ("initial_radius", "big", "number"), ("alpha", 0.0, "(0, 1]"), ("alpha", 1.1, "(0, 1]"), ("alpha", -1.0, "(0, 1]"),
@@ -484,12 +485,14 @@ def test_polarised_variant():
     if name not in mi.variants():
         pytest.skip(f"Mitsuba here lacks {name}")
     mi.set_variant(name)
-    with pytest.raises(Exception) as error:
-        render(box_scene(8))
-    assert "bdpm" in last_words(error.value) and "polarised" in last_words(error.value)
+    scene = box_scene(8)
+    for plugin in PLUGINS:
+        with pytest.raises(Exception) as error:
+            mi.render(scene, integrator=mi.load_dict({"type": plugin}), spp=8)
+        assert last_words(error.value).startswith(f"{plugin}: ") and "polarised" in last_words(error.value)
 
 
-@pytest.mark.parametrize("case", ["medium", "homogeneous inside", "curve emitter", "inside aov"])
+@pytest.mark.parametrize("case", ["medium", "homogeneous inside", "curve emitter", "sdfgrid emitter", "inside aov"])
 def test_unrenderable_scene(rgb, case, tmp_path):
     fog = {"type": "homogeneous", "albedo": 0.8, "sigma_t": 1.0}
     curve = tmp_path / "curve.txt"
@@ -500,11 +503,13 @@ def test_unrenderable_scene(rgb, case, tmp_path):
         else:
             entry = {"medium": {"type": "sphere", "bsdf": {"type": "null"}, "interior": fog},
                      "homogeneous inside": {"type": "cube", "bsdf": {"type": "dielectric"}, "interior": fog},
-                     "curve emitter": {"type": "linearcurve", "filename": str(curve),
-                                       "emitter": {"type": "area", "radiance": 1.0}}}[case]
+                     "curve emitter": {"type": "linearcurve", "filename": str(curve), "emitter": {"type": "area", "radiance": 1.0}},
+                     "sdfgrid emitter": {"type": "sdfgrid", "grid": mi.TensorXf(np.indices((4, 4, 4, 1)).sum(axis=0) - 3.5),
+                                         "emitter": {"type": "area", "radiance": 1.0}}}[case]
             render(box_scene(8, extra=entry))
     message = last_words(error.value)
     words = {"medium": ("bdpm", "media"), "homogeneous inside": ("bdpm", "media"), "curve emitter": ("bdpm", "emitter"),
+             "sdfgrid emitter": ("bdpm", "SDFGrid", "emitter"),
              "inside aov": ("AOVIntegrator", "Child objects must be of type 'SamplingIntegrator'")}[case]           # that is Mitsuba's
     assert all(word in message for word in words), message
 
@@ -514,9 +519,10 @@ def test_special_film():
     scene = mi.load_dict({"type": "scene", "ball": {"type": "sphere"}, "sensor": {
         "type": "perspective", "film": {"type": "specfilm", "width": 8, "height": 8,
                                         "band": {"type": "spectrum", "value": [(400, 1.0), (700, 1.0)]}}}})
-    with pytest.raises(Exception) as error:
-        mi.render(scene, integrator=bdpm(), spp=1)
-    assert "bdpm" in last_words(error.value) and "specfilm" in last_words(error.value)
+    for plugin in PLUGINS:
+        with pytest.raises(Exception) as error:
+            mi.render(scene, integrator=mi.load_dict({"type": plugin}), spp=8)
+        assert last_words(error.value).startswith(f"{plugin}: ") and "specfilm" in last_words(error.value)
 
 
 def test_gradients_are_refused(rgb):
@@ -525,10 +531,11 @@ def test_gradients_are_refused(rgb):
     key = next(k for k in parameters.keys() if k.endswith("reflectance.value"))
     dr.enable_grad(parameters[key])
     parameters.update()
-    with pytest.raises(Exception) as error:
-        image = mi.render(scene, parameters, integrator=bdpm(), spp=1)
-        dr.backward(dr.sum(image))
-    assert "bdpm: gradients are not supported" in last_words(error.value)
+    for plugin in PLUGINS:
+        with pytest.raises(Exception) as error:
+            image = mi.render(scene, parameters, integrator=mi.load_dict({"type": plugin}), spp=8)
+            dr.backward(dr.sum(image))
+        assert f"{plugin}: gradients are not supported" in last_words(error.value)
 
 
 def test_scene_of_another_variant():
