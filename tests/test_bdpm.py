@@ -458,7 +458,8 @@ def test_merged_shapes(rgb, bdd):
 
 @pytest.mark.parametrize("name, value, allowed", [
     ("max_depth", -2, "-1"), ("max_depth", 2 ** 40, "below 2^31"), ("max_depth", 1.5, "integer"),
-    ("max_depth", "many", "integer"), ("rr_depth", 0, "at least 1"), ("rr_depth", -1, "at least 1"), ("hide_emitters", 1, "true or false"), ("hide_emitters", "yes", "true or false"),
+    ("max_depth", "many", "integer"), ("rr_depth", 0, "at least 1"), ("rr_depth", -1, "at least 1"),
+    ("hide_emitters", 1, "true or false"), ("hide_emitters", "yes", "true or false"),
     ("photon_count", -1, "at least 0"), ("photon_count", 1000.5, "integer"), ("photon_count", 2 ** 40, "at least 0"),
     ("initial_radius", -0.1, "at least 0"), ("initial_radius", float("inf"), "finite"), ("initial_radius", float("nan"), "finite"),
     ("initial_radius", "big", "number"), ("alpha", 0.0, "(0, 1]"), ("alpha", 1.1, "(0, 1]"), ("alpha", -1.0, "(0, 1]"),
