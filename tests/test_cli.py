@@ -248,6 +248,10 @@ def test_passes_are_independent_and_add_up(scene, monkeypatch):
     assert not np.allclose(single, other.image(), rtol=1e-2)
     first.iterate()
     assert not np.allclose(single, first.image(), rtol=1e-2)
+    second = MitsubaSession(integrator, noisy, sensor, seed=0, spp=8)
+    second.iterate(1)
+    assert single.mean() > 0
+    np.testing.assert_allclose(first.image(), (single + second.image()) / 2, rtol=1e-4, atol=1e-6)
 
 
 def test_sampler_that_rounds_up(rgb):
