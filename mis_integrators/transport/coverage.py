@@ -15,7 +15,7 @@ from .random import vertex_streams
 
 PROBES = 8
 HEIGHT = 0.25
-"""Probes start this share of the radius above the vertex."""
+"""Probes start this share of the radius above the vertex, or halfway to what is closer."""
 SMALLEST_SHARE = 0.4
 """Right at a wall half of the disk is left. Smaller estimates come from clutter that the probes meet as often as from corners,
 and would brighten more than they mend."""
@@ -34,13 +34,16 @@ def covered_share(scene, vertices, radius, seed, active):
     frame = mi.Frame3f(normal)
     rng = vertex_streams(vertices["path"], vertices["depth"], seed ^ OWN_STREAM)
     turn, shift = rng.next_float32() * dr.two_pi, rng.next_float32()
-    start = si.p + normal * (HEIGHT * radius)
+    above = mi.Ray3f(si.spawn_ray(normal))
+    above.maxt = 2 * HEIGHT * radius
+    height = 0.5 * dr.minimum(scene.ray_intersect_preliminary(above, coherent=False, active=active).t, above.maxt)
+    start = si.p + normal * height
     covered = mi.Float(0)
     probe = mi.UInt32(0)
     while dr.hint(active & (probe < PROBES), label="coverage probes"):
         distance = radius * dr.sqrt((mi.Float(probe) + shift) * (1 / PROBES))
         sine, cosine = dr.sincos(turn + GOLDEN_ANGLE * mi.Float(probe))
-        towards = distance * (cosine * frame.s + sine * frame.t) - (HEIGHT * radius) * normal
+        towards = distance * (cosine * frame.s + sine * frame.t) - height * normal
         hit = scene.ray_intersect(mi.Ray3f(start, dr.normalize(towards)), mi.RayFlags.Minimal, coherent=False, reorder=False,
                                   active=active)
         offset = hit.p - si.p
