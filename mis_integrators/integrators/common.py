@@ -20,6 +20,8 @@ from .parameters import Parameters
 
 MOST_PATHS = 2 ** 32 - 1
 """Camera paths of an iteration at most: their numbers have 32 bits."""
+MOST_LIGHT_PATHS = 2 ** 28
+"""Light sub-paths of an iteration at most: the words of their photons are numbered with 32 bits."""
 
 
 class IterativeIntegrator(mi.AdjointIntegrator):
