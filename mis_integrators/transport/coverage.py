@@ -14,6 +14,9 @@ from .gather import SAME_SURFACE_COSINE, SAME_SURFACE_OFFSET
 from .random import vertex_streams
 
 PROBES = 8
+OUTER = PROBES // 2
+"""Probes of the outer half of the disk, which are made first, a quarter turn apart: where they all find surface there is no edge, and the others are
+not made."""
 HEIGHT = 0.25
 """Probes start this share of the radius above the vertex, or halfway to what is closer."""
 SMALLEST_SHARE = 0.4
@@ -21,7 +24,6 @@ SMALLEST_SHARE = 0.4
 and would brighten more than they mend."""
 OWN_STREAM = 0x70726f62
 """Keeps the probes' random numbers apart from those of the camera paths, which share their seed."""
-GOLDEN_ANGLE = 2.399963229728653
 
 
 @dr.syntax
@@ -38,11 +40,10 @@ def covered_share(scene, vertices, radius, seed, active):
     above.maxt = 2 * HEIGHT * radius
     height = 0.5 * dr.minimum(scene.ray_intersect_preliminary(above, coherent=False, active=active).t, above.maxt)
     start = si.p + normal * height
-    covered = mi.Float(0)
-    probe = mi.UInt32(0)
+    covered, probe = mi.UInt32(0), mi.UInt32(0)
     while dr.hint(active & (probe < PROBES), label="coverage probes"):
-        distance = radius * dr.sqrt((mi.Float(probe) + shift) * (1 / PROBES))
-        sine, cosine = dr.sincos(turn + GOLDEN_ANGLE * mi.Float(probe))
+        distance = radius * dr.sqrt((mi.Float(PROBES - 1 - probe) + shift) * (1 / PROBES))
+        sine, cosine = dr.sincos(turn + dr.two_pi / OUTER * (mi.Float(probe) + dr.select(probe < OUTER, 0, 0.5)))
         towards = distance * (cosine * frame.s + sine * frame.t) - height * normal
         hit = scene.ray_intersect(mi.Ray3f(start, dr.normalize(towards)), mi.RayFlags.Minimal, coherent=False, reorder=False,
                                   active=active)
@@ -50,6 +51,9 @@ def covered_share(scene, vertices, radius, seed, active):
         same = hit.is_valid() & (dr.dot(hit.n, si.n) > SAME_SURFACE_COSINE) & \
             (dr.abs(dr.dot(offset, normal)) < SAME_SURFACE_OFFSET * radius) & \
             (dr.squared_norm(offset) < dr.square(1.3 * radius))
-        covered += dr.select(same, 1 / PROBES, 0)
+        covered += dr.select(same, 1, 0)
         probe += 1
-    return dr.maximum(covered, SMALLEST_SHARE)
+        if (probe == OUTER) & (covered == OUTER):
+            covered = mi.UInt32(PROBES)
+            probe = mi.UInt32(PROBES)
+    return dr.maximum(mi.Float(covered) * (1 / PROBES), SMALLEST_SHARE)
