@@ -457,11 +457,12 @@ def test_merged_shapes(rgb, bdd):
 
 
 @pytest.mark.parametrize("name, value, allowed", [
-    ("max_depth", -2, "-1"), ("max_depth", 2 ** 40, "below 2^31"), ("max_depth", 1.5, "integer"),
+    ("max_depth", -2, "-1"), ("max_depth", 2 ** 40, "at most 2147483647"), ("max_depth", 1.5, "integer"),
     ("max_depth", "many", "integer"), ("rr_depth", 0, "at least 1"), ("rr_depth", -1, "at least 1"),
     ("hide_emitters", 1, "true or false"), ("hide_emitters", "yes", "true or false"),
     ("photon_count", -1, "at least 0"), ("photon_count", 1000.5, "integer"), ("photon_count", 2 ** 40, "at least 0"),
-    ("initial_radius", -0.1, "at least 0"), ("initial_radius", float("inf"), "finite"), ("initial_radius", float("nan"), "finite"),
+    ("initial_radius", -0.1, "from 1e-15 to"), ("initial_radius", float("inf"), "from 1e-15 to"), ("initial_radius", float("nan"), "from 1e-15 to"),
+    ("initial_radius", 1e-40, "from 1e-15 to"), ("bdd", 10 ** 12, "at most 2147483647"), ("photon_count", 2 ** 30, "at most 268435456"),
     ("initial_radius", "big", "number"), ("alpha", 0.0, "(0, 1]"), ("alpha", 1.1, "(0, 1]"), ("alpha", -1.0, "(0, 1]"),
     ("camera_paths", 0, "at least 1"), ("camera_paths", 1.5, "integer"), ("camera_paths", True, "integer"),
     ("variance", 1, "true or false"), ("bdd", -1, "at least 0"), ("bdd", 1.5, "integer"), ("bdd", True, "integer"),

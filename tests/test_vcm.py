@@ -83,7 +83,7 @@ def test_radii(rgb):
 
 
 @pytest.mark.parametrize("name, value, allowed", [
-    ("beta", 9, "from 1"), ("photon_count", -1, "at least 0"), ("initial_radius", -1.0, "finite"), ("alpha", 0.0, r"in \(0, 1\]"),
+    ("beta", 9, "from 1"), ("photon_count", -1, "at least 0"), ("initial_radius", -1.0, "from 1e-15 to"), ("alpha", 0.0, r"in \(0, 1\]"),
     ("techniques", 2, "unknown parameter")])
 def test_bad_parameter(rgb, name, value, allowed):
     with pytest.raises(RuntimeError, match=allowed) as error:

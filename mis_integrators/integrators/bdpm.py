@@ -18,7 +18,7 @@ from ..transport.photon_map import PhotonMap, build_photon_map, smallest_cell
 from ..transport.random import mix
 from ..transport.recording import recorder
 from ..transport.traits import SceneTraits, lookup
-from .common import IterativeIntegrator, IterativeSession
+from .common import MOST_LIGHT_PATHS, IterativeIntegrator, IterativeSession
 from .pilot import choose_radii
 from .schedule import read_radius, shrunk
 
@@ -102,7 +102,7 @@ class BDPM(IterativeIntegrator):
 
     def read_photon_parameters(self, parameters):
         """Reads what concerns the photon map."""
-        self.photon_count = parameters.integer("photon_count", 0, 0, "at least 0 (0: as many as pixels)", high=2 ** 31)
+        self.photon_count = parameters.integer("photon_count", 0, 0, "at least 0 (0: as many as pixels)", high=MOST_LIGHT_PATHS)
         self.initial_radius, self.alpha = read_radius(parameters)
 
     def settings(self):

@@ -9,6 +9,7 @@ import mitsuba as mi
 
 from ..transport.irradiance_cache import IrradianceCache
 from ..transport.light_pass import trace_light_paths
+from .common import MOST_LIGHT_PATHS
 from .optimal import OptimalWeights
 from .surroundings import Surroundings
 from .weighted import WeightedBDPM, WeightedSession
@@ -36,7 +37,7 @@ class BDPMOpt(WeightedBDPM):
          that scatter smoothly, counted from 0). (Default: 3)
      * - first_vertex
        - |int|
-       - The first camera vertex at which photons are merged. (Default: 0)
+       - The first camera vertex at which photons are merged, from 0 to 16. (Default: 0)
      * - weights
        - |string|
        - ``full`` keeps the means over directions in the optimal weights, estimated from typical neighbours; ``local`` drops them, which
@@ -79,10 +80,10 @@ class BDPMOpt(WeightedBDPM):
     def read_parameters(self, parameters):
         self.read_photon_parameters(parameters)
         self.strategies = self.fixed_strategies or parameters.integer("strategies", 3, 1, "from 1 to 6", high=6)
-        self.first_vertex = self.bdd = parameters.integer("first_vertex", 0, 0, "at least 0")
+        self.first_vertex = self.bdd = parameters.integer("first_vertex", 0, 0, "from 0 to 16", high=16)
         self.weights = parameters.choice("weights", "local", ("full", "local"))
         self.mix_diffuse = parameters.boolean("mix_diffuse", None)
-        self.frozen_photons = parameters.integer("frozen_photons", 0, 0, "at least 0 (0: 131072)", high=2 ** 28)
+        self.frozen_photons = parameters.integer("frozen_photons", 0, 0, "at least 0 (0: 131072)", high=MOST_LIGHT_PATHS)
 
     def settings(self):
         mixing = "automatic" if self.mix_diffuse is None else self.mix_diffuse

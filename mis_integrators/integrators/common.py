@@ -20,6 +20,8 @@ from .parameters import Parameters
 
 MOST_PATHS = 2 ** 32 - 1
 """Camera paths of an iteration at most: their numbers have 32 bits."""
+MOST_LIGHT_PATHS = 2 ** 28
+"""Light sub-paths of an iteration at most: the words of their photons are numbered with 32 bits."""
 
 
 class IterativeIntegrator(mi.AdjointIntegrator):
@@ -34,8 +36,8 @@ class IterativeIntegrator(mi.AdjointIntegrator):
     def __init__(self, props):
         parameters = Parameters(props)
         self.plugin = parameters.plugin
-        self.max_depth = parameters.integer("max_depth", -1, -1, "-1 (unlimited) or at least 0, below 2^31", high=2 ** 31 - 1)
-        self.rr_depth = parameters.integer("rr_depth", 5, 1, "at least 1, below 2^31", high=2 ** 31 - 1)
+        self.max_depth = parameters.integer("max_depth", -1, -1, "-1 (unlimited) or at least 0")
+        self.rr_depth = parameters.integer("rr_depth", 5, 1, "at least 1")
         self.hide_emitters = parameters.boolean("hide_emitters", False)
         self.camera_paths = parameters.integer("camera_paths", *self.CAMERA_PATHS)
         self.variance = parameters.boolean("variance", False)

@@ -7,6 +7,10 @@ REFUSED = {"samples_per_pass": 'iterations are passes already; use "camera_paths
            "block_size": "there are no blocks: an iteration covers the whole film"}
 
 
+LARGEST = 2 ** 31 - 1
+"""Integers beyond this fit into no array of 32 bits."""
+
+
 class ParameterError(ValueError):
     """A plugin parameter that is unknown, of the wrong type or out of range; the message says what is allowed."""
 
@@ -29,11 +33,13 @@ class Parameters:
         self.known.append(name)
         return self.props.get(name, default) if name in self.props else default
 
-    def integer(self, name, default, low, allowed, high=None):
-        """An integer in [low, high]; `allowed` is the range in words."""
+    def integer(self, name, default, low, allowed, high=LARGEST):
+        """An integer in [low, high]; `allowed` is the range in words (that a number is too large is added where it does not say so)."""
         value = self._get(name, default)
-        if type(value) is not int or value < low or (high is not None and value > high):
+        if type(value) is not int or value < low:
             self._fail(name, value, f"an integer, {allowed}")
+        if value > high:
+            self._fail(name, value, f"an integer, {allowed}" + ("" if str(high) in allowed else f", at most {high}"))
         return value
 
     def number(self, name, default, accept, allowed):

@@ -26,8 +26,8 @@ MOST_PHOTONS = 160
 """Photons a vertex within the largest radius that is tried."""
 GATHER_COST = 0.013
 """Cost of one gathered photon a vertex, in units of an iteration's light and camera passes (0.006 to 0.018 on the bundled scenes)."""
-PROBE_COST = 0.3
-"""Cost of the coverage probes, in the same units (0.05 to 0.36)."""
+PROBE_COST = 0.15
+"""Cost of the coverage probes, in the same units (0.03 to 0.25)."""
 LIKE_A_PILOT = 1.5
 """What an iteration takes, in seconds of one of the pilot, until it is known."""
 TOO_SLOW = 1.5

@@ -12,6 +12,7 @@ from ..transport.photon_map import smallest_cell
 from ..transport.recording import lanes
 from ..transport.subpaths import read_vertices
 from .bdpt import BDPT, BDPTSession
+from .common import MOST_LIGHT_PATHS
 from .connection_weights import ConnectionWeights
 from .schedule import read_radius, shrunk
 
@@ -69,7 +70,7 @@ class VCM(BDPT):
 
     def read_parameters(self, parameters):
         self.read_heuristic(parameters)
-        self.photon_count = parameters.integer("photon_count", 0, 0, "at least 0 (0: as many as camera paths)", high=2 ** 31)
+        self.photon_count = parameters.integer("photon_count", 0, 0, "at least 0 (0: as many as camera paths)", high=MOST_LIGHT_PATHS)
         self.initial_radius, self.alpha = read_radius(parameters)
 
     def settings(self):
