@@ -445,6 +445,20 @@ def test_merged_shapes(rgb, bdd):
     agree(bdpm(bdd=bdd, max_depth=4, initial_radius=0.1), path(max_depth=4), scene, blocks=2)
 
 
+@pytest.mark.parametrize("lamps", [1, 2])
+def test_shapes_without_points_to_sample(rgb, tmp_path, lamps):
+    """Instances and curves have no points on them to give, and are not asked for any: they are no lamps. (`path` 2 % and 5 %.)"""
+    curve = tmp_path / "curve.txt"
+    curve.write_text("".join(f"{i * 0.3 - 1.2} -1 0.4 0.15\n" for i in range(9)))
+    lamp = {"type": "sphere", "center": [1.5, -1, 2.5], "radius": 0.5, "emitter": {"type": "area", "radiance": grey(2.0)}}
+    scene = box_scene(size=24, curve={"type": "bsplinecurve", "filename": str(curve), "bsdf": diffuse(0.6)},
+                      group={"type": "shapegroup", "cube": {"type": "cube", "to_world": T().scale(0.3), "bsdf": diffuse(0.8)},
+                             "ball": {"type": "sphere", "center": [0, 0, 0.7], "radius": 0.4, "bsdf": {"type": "roughconductor", "alpha": 0.3}}},
+                      copy={"type": "instance", "to_world": T().translate([1.3, 0, 0.5]).rotate([0, 0, 1], 30), "of": {"type": "ref", "id": "group"}},
+                      **({"lamp": lamp} if lamps == 2 else {}))
+    agree(bdpm(bdd=1), path(), scene, blocks=2, whole=0.02, block=0.05, most=200)
+
+
 # --- Errors ---------------------------------------------------------------------------------------------------------------
 
 
