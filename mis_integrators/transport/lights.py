@@ -19,6 +19,9 @@ from .spectra import channel_mean
 from .traits import UnsupportedScene, lookup, registry_table
 
 POWER_SAMPLES = 4096
+LEAST_POWER = 1e-6
+"""Of a textured emitter of which no sample has met light, as a share of the others' power: its texture may have small bright spots all the same.
+(By `UNIFORM_SHARE` it is chosen more often.)"""
 UNIFORM_SHARE = 0.1
 """Share of the choices among emitters that ignores power, so that a dim but near emitter is not starved."""
 
@@ -66,6 +69,18 @@ def _mean_power(emitter):
     return float(value) if np.isfinite(value) and value > 0 else 0.0
 
 
+def _may_be_missed(emitter, kind):
+    """Whether Mitsuba's light rays may not meet small bright spots of the emitter's texture: they start anywhere, or (on rotated spheres, cylinders)
+    not where the texture has told them to."""
+    return kind in ("area", "directionalarea", "spot") and bool(emitter.flags() & mi.EmitterFlags.SpatiallyVarying)
+
+
+def _with_doubtful(power, may_be_missed):
+    """Estimated powers, those that are zero by chance, perhaps, raised to a little."""
+    least = LEAST_POWER * power.sum() or LEAST_POWER
+    return np.where((power == 0) & np.array(may_be_missed, dtype=bool), least, power)
+
+
 def _invariant_key(emitter):
     shape = emitter.get_shape()
     return emitter.class_name(), str(emitter), str(shape.bbox()) if shape is not None else ""
@@ -90,6 +105,7 @@ class Lights:
         power = np.array([_mean_power(e) for e in self.emitters])
         if guide is not None:
             power = guide.useful_power(power[np.argsort(order)])[order]
+        power = _with_doubtful(power, [_may_be_missed(e, kind) for e, kind in zip(self.emitters, self.kinds)])
         self.total_power = float(power.sum())
         if not self.emitters:
             return
