@@ -355,6 +355,27 @@ def test_photons_that_overflow_are_not_lost(rgb, bdd):
     np.testing.assert_allclose(with_capacity(scene, photons=7, bdd=bdd), with_capacity(scene, bdd=bdd), rtol=1e-3, atol=1e-6)
 
 
+def test_photons_that_overflow_later_are_not_lost(rgb):
+    """The passes are recorded when an iteration overflows: none of them may go on with the old room."""
+    sessions = [bdpm(bdd=0, camera_paths=2, photon_count=3000, initial_radius=0.05).session(box_scene(16), 0, 3, 0) for _ in range(2)]
+    room, tight = sessions
+    room.photon_capacity = 1 << 16
+    room._freeze()
+    images = dict(enumerate(pictures(room, 8)))
+    found = {}
+    for number in range(8):
+        room._photons(number, room._spectral(number))
+        found[number] = room.photons_found
+    order = sorted(found, key=found.get)
+    tight.photon_capacity = found[order[4]]
+    tight._freeze()
+    for done, number in enumerate(order):
+        before = done * tight.image().astype(np.float64) if done else 0.0
+        tight.iterate(number)
+        np.testing.assert_allclose((done + 1) * tight.image().astype(np.float64) - before, images[number], rtol=1e-3, atol=1e-4)
+    assert tight.photon_capacity > found[order[-1]] > found[order[4]]
+
+
 def test_vertices_that_overflow_are_not_lost(rgb):
     scene = glossy_box()                                          # plastic and glass: several vertices a path
     np.testing.assert_allclose(with_capacity(scene, vertices=11), with_capacity(scene), rtol=1e-3, atol=1e-6)
