@@ -8,8 +8,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from mis_integrators.integrators.pilot import Pilot
 from comparing import (Estimate, PathBatches, SessionBatches, agree, assert_same, block_means, collect_until, differences, extrapolate,
-                       kernels_of, pictures)
+                       kernels_of, pictures, smallest_visible)
 from worlds import T, bdpm, diffuse, film, grey, look, path, sensor, tray
 
 
@@ -478,6 +479,33 @@ def test_shapes_without_points_to_sample(rgb, tmp_path, lamps):
                       copy={"type": "instance", "to_world": T().translate([1.3, 0, 0.5]).rotate([0, 0, 1], 30), "of": {"type": "ref", "id": "group"}},
                       **({"lamp": lamp} if lamps == 2 else {}))
     agree(bdpm(bdd=1), path(), scene, blocks=2, whole=0.02, block=0.05, most=200)
+
+
+def point_film():
+    return {"type": "hdrfilm", "width": 1, "height": 1, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
+
+
+def test_a_camera_that_sees_one_point(rgb):
+    """The automatic radius then follows from the photons, not from the spread of what is seen: indirect light, two fifths here, is not lost."""
+    scene = box_scene(sensor={"type": "radiancemeter", "origin": [0, -5, 2.5], "direction": [0, 5, -2.3], "film": point_film()})
+    a = SessionBatches(mi.load_dict({"type": "bdpm", "bdd": 0, "max_depth": 4, "photon_count": 4000, "camera_paths": 64}), scene, 1, seed=2)
+    b = PathBatches(path(), scene, 1, spp=8192)
+    a.add(150)
+    b.add(16)
+    assert smallest_visible(a.estimate(), b.estimate())[0] < 0.25, "test too weak"
+    assert not differences(a.estimate(), b.estimate(), slack=0.05)                  # a disk around one point is as wrong as its light is curved
+    assert a.session.radii["indirect"] > 0.03
+
+
+def test_rare_photons_get_no_smallest_radius(rgb):
+    """Where the pilot meets no photon at all, nothing speaks for the smallest radius that it tries."""
+    scene = box_scene(16)
+    session = bdpm(bdd=0, photon_count=1, initial_radius=0.0).session(scene, seed=1, spp=4)
+    pilot = Pilot(session)
+    pilot.ladder, pilot.photons, pilot.direct = np.array([0.01 * 2 ** i for i in range(7)]), {"indirect": 0.0}, [np.ones(16)] * 4
+    pilot.samples = {key: [np.zeros((7, 16))] * 4 for key in pilot.samples}
+    pilot.decide(100)
+    assert session.radii["indirect"] == pytest.approx(0.16)
 
 
 # --- Errors ---------------------------------------------------------------------------------------------------------------
