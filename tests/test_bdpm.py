@@ -497,6 +497,14 @@ def test_a_camera_that_sees_one_point(rgb):
     assert a.session.radii["indirect"] > 0.03
 
 
+@pytest.mark.parametrize("plugin", ["bdpm", "bdpt"])
+def test_irradiance_meter(rgb, plugin):
+    """A sensor of another kind, on a surface, under a lamp and a sky (5 % of its one value)."""
+    scene = box_scene(sensor=diffuse(0.1), sky={"type": "constant", "radiance": 0.3},
+                      ball={"type": "sphere", "center": [0, 0, 1], "radius": 0.5, "sensor": {"type": "irradiancemeter", "film": point_film()}})
+    agree(mi.load_dict({"type": plugin, "max_depth": 4, "camera_paths": 4096}), path(), scene, blocks=1, whole=0.05, block=0.05, spp=16384)
+
+
 def test_rare_photons_get_no_smallest_radius(rgb):
     """Where the pilot meets no photon at all, nothing speaks for the smallest radius that it tries."""
     scene = box_scene(16)

@@ -12,6 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .camera_rays import sample_camera_ray
 from .packing import from_numpy
 from .random import next_2d, streams
 from .spectra import channel_mean
@@ -216,7 +217,7 @@ class EnvironmentGuide:
         """
         rng = streams(dr.arange(mi.UInt32, PILOT_PATHS), mi.UInt32(0x67756964))
         wavelength_sample = 0.5
-        ray, throughput = sensor.sample_ray(sensor.shutter_open(), wavelength_sample, next_2d(rng), next_2d(rng))
+        ray, throughput = sample_camera_ray(sensor, sensor.shutter_open(), wavelength_sample, next_2d(rng), next_2d(rng))
         throughput = mi.Spectrum(throughput) + dr.zeros(mi.Spectrum, PILOT_PATHS)
         active = dr.full(mi.Bool, True, PILOT_PATHS)
         context = mi.BSDFContext()
