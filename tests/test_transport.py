@@ -336,6 +336,21 @@ def test_small_spots_of_light_are_not_taken_for_darkness():
     assert both.choice.pmf.min() == pytest.approx(0.05, rel=1e-3)
 
 
+def test_spectral_suns_are_chosen_by_their_light():
+    """A sun and a sky: the choice between them is the same in rgb and in spectral variants (looked at without wavelengths, the sun is dark)."""
+    chosen = []
+    for variant_name in ("llvm_ad_rgb", "llvm_ad_spectral"):
+        mi.set_variant(variant_name)
+        scene = mi.load_dict({
+            "type": "scene", "floor": {"type": "rectangle", "to_world": T().scale(3), "bsdf": diffuse(0.5)},
+            "sun": {"type": "directional", "direction": [0.3, 0.2, -1], "irradiance": {"type": "rgb", "value": 5.0}},
+            "sky": {"type": "constant", "radiance": {"type": "rgb", "value": 0.2}},
+            "sensor": {"type": "perspective", "to_world": look((0, -1.5, 6), (0, 0, 0)), "fov": 30, "film": film(16)}})
+        lights = Lights.seen_by(scene, scene.sensors()[0], "bdpm")
+        chosen.append(lights.choice.pmf[lights.kinds.index("directional")])
+    assert chosen[1] == pytest.approx(chosen[0], rel=0.1)
+
+
 # --- Direct light ---------------------------------------------------------------------------------------------------
 
 

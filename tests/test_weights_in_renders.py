@@ -13,7 +13,7 @@ from comparing import PathBatches, SessionBatches, agree, assert_powerful, colle
 from mis_integrators.integrators import optimal
 from mis_integrators.integrators.optimal import OptimalWeights
 from test_against_path import LENS, MONO, ORTHO, PERSPECTIVE, RGB, SPECTRAL, oracle
-from worlds import EMITTERS, RADIUS, has_delta, tray
+from worlds import EMITTERS, RADIUS, T, colour, has_delta, look, sensor, tray
 
 
 def weighted(plugin="bdpm_opt", **parameters):
@@ -345,6 +345,25 @@ def test_presets_fix_the_number_of_strategies(rgb, plugin, strategies):
     assert mi.load_dict({"type": plugin}).settings()["strategies"] == strategies
     with pytest.raises(RuntimeError, match='unknown parameter "strategies"'):
         mi.load_dict({"type": plugin, "strategies": 2})
+
+
+def test_what_the_cache_knows_of_direct_light():
+    """Cells that a lamp shines upon know it, and so do their surroundings; in spectral variants no less than in rgb."""
+    facts = []
+    for variant_name in (RGB, SPECTRAL):
+        mi.set_variant(variant_name)
+        lamp = {"type": "rectangle", "to_world": look((0, 0, 3), (0, 0, 0)) @ T().scale(0.8),
+                "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 4.0}}}
+        floor = {"type": "rectangle", "to_world": T().scale(2.5), "bsdf": {"type": "diffuse", "reflectance": colour(0.7, 0.7, 0.7)}}
+        scene = mi.load_dict({"type": "scene", "lamp": lamp, "floor": floor,
+                              "ball": {"type": "sphere", "center": [0, 0, 1], "radius": 0.5, "bsdf": {"type": "roughconductor", "alpha": 0.2}},
+                              "sensor": sensor(size=16)})
+        session = mi.load_dict({"type": "bdpm_opt2", "weights": "full", "initial_radius": 0.05, "frozen_photons": 20000}).session(scene)
+        session.start()
+        known = session.cache.lookup(session.cache.center, session.cache.facing)
+        facts.append([np.median(np.array(known.noise)), (np.array(known.visible_share) > 0).mean(), float(session.surroundings.albedo[0])])
+    assert facts[0][0] < 5 and facts[0][1] > 0.5
+    np.testing.assert_allclose(facts[1], facts[0], rtol=0.1)
 
 
 @pytest.mark.parametrize("radius, mixes", [(0.003, True), (0.3, False), (0.0, False)])

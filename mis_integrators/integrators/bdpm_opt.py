@@ -136,7 +136,7 @@ class BDPMOptSession(WeightedSession):
         if self.cache is None:
             self._learn(spectral)
         if self.integrator.weights == "full":
-            self.surroundings = Surroundings(self.scene, self.weights({"n": mi.Spectrum(0), "caustic_cost": mi.Float(0)}))
+            self.surroundings = Surroundings(self.scene, self.weights({"n": mi.Spectrum(0), "caustic_cost": mi.Float(0)}), spectral["wavelengths"])
 
     def _learn(self, spectral):
         """One dense light pass, frozen: for the weights only."""
@@ -150,7 +150,7 @@ class BDPMOptSession(WeightedSession):
                                         integrator.rr_depth, keep_direct=True)
             dr.eval(photons)
             found = int(photons[2][0])
-        self.cache = IrradianceCache(self.scene, self.lights, *photons, paths, self.traits.bounds)
+        self.cache = IrradianceCache(self.scene, self.lights, *photons, paths, self.traits.bounds, spectral["wavelengths"])
 
     def _freeze(self):
         super()._freeze()

@@ -31,6 +31,8 @@ PASS_THROUGH = 8
 LEVEL_SHARES = (0.55, 0.25, 0.1, 0.1)
 """Shares of the position histogram at full, half, quarter and eighth resolution."""
 FEWEST_RECORDS = 64
+SPREAD_WAVELENGTHS = 450, 520, 590, 640
+"""Wavelengths [nm] at which lights are looked at where no path brings its own."""
 FOCUS_TAIL = 0.01
 """Share of the records' weight that may lie outside the focus, at each end of each axis."""
 
@@ -201,13 +203,15 @@ class EnvironmentGuide:
         it = dr.zeros(mi.Interaction3f)
         it.p = p
         it.time = time
+        if mi.is_spectral:
+            it.wavelengths = mi.UnpolarizedSpectrum(*SPREAD_WAVELENGTHS)
         return it
 
     def _radiance(self, emitter, towards, active=True):
         si = dr.zeros(mi.SurfaceInteraction3f, dr.width(towards))
         si.wi = -towards
         if mi.is_spectral:
-            si.wavelengths = mi.UnpolarizedSpectrum(450, 520, 590, 640)
+            si.wavelengths = mi.UnpolarizedSpectrum(*SPREAD_WAVELENGTHS)
         return channel_mean(emitter.eval(si, active)) + dr.zeros(mi.Float, dr.width(towards))
 
     def _pilot(self, sensor):
