@@ -398,6 +398,19 @@ def test_darkness_and_no_indirect_light(rgb, kind):
         assert np.allclose(np.array(mine)[..., :3].mean(), np.array(truth)[..., :3].mean(), rtol=0.02)
 
 
+@pytest.mark.parametrize("parameters", [{}, {"initial_radius": 0.05, "mix_diffuse": True, "weights": "full"}, {"initial_radius": 0.05}])
+def test_light_that_meets_nothing_smooth(rgb, parameters):
+    """A sky and glass, and rough metal out of its reach: nothing is learned, nothing is mixed, and what is seen is right."""
+    hidden = {"type": "sphere", "center": [0, 0, 9], "radius": 0.5}
+    scene = mi.load_dict({
+        "type": "scene", "glass": {"type": "sphere", "bsdf": {"type": "dielectric"}}, "sensor": sensor(size=16),
+        "sky": {"type": "constant", "radiance": {"type": "rgb", "value": [0.7, 0.5, 0.3]}},
+        "box": {**hidden, "bsdf": {"type": "conductor"}}, "metal": {**hidden, "radius": 0.4, "bsdf": {"type": "roughconductor", "alpha": 0.2}}})
+    images = [np.array(mi.render(scene, integrator=mi.load_dict({"type": plugin, "max_depth": 6, **extra}), spp=64))
+              for plugin, extra in (("bdpm_opt3", parameters), ("path", {}))]
+    assert images[0].mean() == pytest.approx(images[1].mean(), rel=0.02) and images[1].mean() > 0.01
+
+
 def test_same_seed_same_image(rgb):
     scene = tray("smooth1", "point")
     first, second, other = (np.array(mi.render(scene, integrator=weighted(strategies=2, weights="local"), spp=16, seed=seed)) for seed in (5, 5, 6))

@@ -107,8 +107,10 @@ class IrradianceCache:
 
     def _sum_cells(self, position, normal, place, stored):
         cells = dr.width(self._occupied)
+        self.center, self.facing, self.index = dr.zeros(mi.Point3f, cells), dr.zeros(mi.Vector3f, cells), dr.zeros(mi.UInt32, 1 << INDEX_BITS)
+        if cells == 0:
+            return
         number = dr.arange(mi.UInt32, cells) + 1                            # cell 0 is the empty one
-        self.index = dr.zeros(mi.UInt32, 1 << INDEX_BITS)
         dr.scatter(self.index, number, self._occupied)
         del self._occupied
         slot = dr.gather(mi.UInt32, self.index, place, stored)
