@@ -8,8 +8,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from mis_integrators.integrators.pilot import Pilot
 from comparing import (Estimate, PathBatches, SessionBatches, agree, assert_same, block_means, collect_until, differences, extrapolate,
-                       kernels_of, pictures)
+                       kernels_of, pictures, smallest_visible)
 from worlds import T, bdpm, diffuse, film, grey, look, path, sensor, tray
 from mis_integrators._plugins import PLUGINS
 
@@ -363,6 +364,27 @@ def test_photons_that_overflow_are_not_lost(rgb, bdd):
     np.testing.assert_allclose(with_capacity(scene, photons=7, bdd=bdd), with_capacity(scene, bdd=bdd), rtol=1e-3, atol=1e-6)
 
 
+def test_photons_that_overflow_later_are_not_lost(rgb):
+    """The passes are recorded when an iteration overflows: none of them may go on with the old room."""
+    sessions = [bdpm(bdd=0, camera_paths=2, photon_count=3000, initial_radius=0.05).session(box_scene(16), 0, 3, 0) for _ in range(2)]
+    room, tight = sessions
+    room.photon_capacity = 1 << 16
+    room._freeze()
+    images = dict(enumerate(pictures(room, 8)))
+    found = {}
+    for number in range(8):
+        room._photons(number, room._spectral(number))
+        found[number] = room.photons_found
+    order = sorted(found, key=found.get)
+    tight.photon_capacity = found[order[4]]
+    tight._freeze()
+    for done, number in enumerate(order):
+        before = done * tight.image().astype(np.float64) if done else 0.0
+        tight.iterate(number)
+        np.testing.assert_allclose((done + 1) * tight.image().astype(np.float64) - before, images[number], rtol=1e-3, atol=1e-4)
+    assert tight.photon_capacity > found[order[-1]] > found[order[4]]
+
+
 def test_vertices_that_overflow_are_not_lost(rgb):
     scene = glossy_box()                                          # plastic and glass: several vertices a path
     np.testing.assert_allclose(with_capacity(scene, vertices=11), with_capacity(scene), rtol=1e-3, atol=1e-6)
@@ -451,6 +473,55 @@ def test_merged_shapes(rgb, bdd):
         "lamp": {"type": "point", "position": [0, 0, 3], "intensity": 6.0},
         "sensor": {"type": "perspective", "fov": 40, "to_world": look((0, 0, 2), (1, 0, 0)), "film": film(24)}})
     agree(bdpm(bdd=bdd, max_depth=4, initial_radius=0.1), path(max_depth=4), scene, blocks=2)
+
+
+@pytest.mark.parametrize("lamps", [1, 2])
+def test_shapes_without_points_to_sample(rgb, tmp_path, lamps):
+    """Instances and curves have no points on them to give, and are not asked for any: they are no lamps. (`path` 2 % and 5 %.)"""
+    curve = tmp_path / "curve.txt"
+    curve.write_text("".join(f"{i * 0.3 - 1.2} -1 0.4 0.15\n" for i in range(9)))
+    lamp = {"type": "sphere", "center": [1.5, -1, 2.5], "radius": 0.5, "emitter": {"type": "area", "radiance": grey(2.0)}}
+    scene = box_scene(size=24, curve={"type": "bsplinecurve", "filename": str(curve), "bsdf": diffuse(0.6)},
+                      group={"type": "shapegroup", "cube": {"type": "cube", "to_world": T().scale(0.3), "bsdf": diffuse(0.8)},
+                             "ball": {"type": "sphere", "center": [0, 0, 0.7], "radius": 0.4, "bsdf": {"type": "roughconductor", "alpha": 0.3}}},
+                      copy={"type": "instance", "to_world": T().translate([1.3, 0, 0.5]).rotate([0, 0, 1], 30), "of": {"type": "ref", "id": "group"}},
+                      **({"lamp": lamp} if lamps == 2 else {}))
+    agree(bdpm(bdd=1), path(), scene, blocks=2, whole=0.02, block=0.05, most=200)
+
+
+def point_film():
+    return {"type": "hdrfilm", "width": 1, "height": 1, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
+
+
+def test_a_camera_that_sees_one_point(rgb):
+    """The automatic radius then follows from the photons, not from the spread of what is seen: indirect light, two fifths here, is not lost."""
+    scene = box_scene(sensor={"type": "radiancemeter", "origin": [0, -5, 2.5], "direction": [0, 5, -2.3], "film": point_film()})
+    a = SessionBatches(mi.load_dict({"type": "bdpm", "bdd": 0, "max_depth": 4, "photon_count": 4000, "camera_paths": 64}), scene, 1, seed=2)
+    b = PathBatches(path(), scene, 1, spp=8192)
+    a.add(150)
+    b.add(16)
+    assert smallest_visible(a.estimate(), b.estimate())[0] < 0.25, "test too weak"
+    assert not differences(a.estimate(), b.estimate(), slack=0.05)                  # a disk around one point is as wrong as its light is curved
+    assert a.session.radii["indirect"] > 0.03
+
+
+@pytest.mark.parametrize("plugin", ["bdpm", "bdpt"])
+def test_irradiance_meter(rgb, plugin):
+    """A sensor of another kind, on a surface, under a lamp and a sky (5 % of its one value)."""
+    scene = box_scene(sensor=diffuse(0.1), sky={"type": "constant", "radiance": 0.3},
+                      ball={"type": "sphere", "center": [0, 0, 1], "radius": 0.5, "sensor": {"type": "irradiancemeter", "film": point_film()}})
+    agree(mi.load_dict({"type": plugin, "max_depth": 4, "camera_paths": 4096}), path(), scene, blocks=1, whole=0.05, block=0.05, spp=16384)
+
+
+def test_rare_photons_get_no_smallest_radius(rgb):
+    """Where the pilot meets no photon at all, nothing speaks for the smallest radius that it tries."""
+    scene = box_scene(16)
+    session = bdpm(bdd=0, photon_count=1, initial_radius=0.0).session(scene, seed=1, spp=4)
+    pilot = Pilot(session)
+    pilot.ladder, pilot.photons, pilot.direct = np.array([0.01 * 2 ** i for i in range(7)]), {"indirect": 0.0}, [np.ones(16)] * 4
+    pilot.samples = {key: [np.zeros((7, 16))] * 4 for key in pilot.samples}
+    pilot.decide(100)
+    assert session.radii["indirect"] == pytest.approx(0.16)
 
 
 # --- Errors ---------------------------------------------------------------------------------------------------------------

@@ -9,9 +9,9 @@ from hypothesis import given, settings, strategies as st
 from comparing import assert_frequencies, kernels_of
 from mis_integrators.transport import packing, photon_map
 from mis_integrators.transport.guide import EnvironmentGuide, cell_direction, direction_cell
-from mis_integrators.transport.lights import Lights, mis_power
+from mis_integrators.transport.lights import Lights, _mean_power, mis_power
 from mis_integrators.transport.random import mix, next_2d, streams
-from worlds import EMITTERS, T, diffuse, film, look, tray
+from worlds import EMITTERS, T, bitmap, diffuse, film, look, tray
 
 
 @pytest.fixture(autouse=True)
@@ -311,6 +311,44 @@ def test_power_decides_among_emitters():
     assert lights.choice.pmf[order.index(0)] == pytest.approx(expected, rel=0.01)
     mean, error = mean_and_error(flux)
     assert abs(mean - 16 * np.pi) < 5 * error
+
+
+def test_small_spots_of_light_are_not_taken_for_darkness():
+    """A lamp of one bright texel on a rotated sphere, where Mitsuba's light rays do not meet it: its flux is the texel's all the same, and beside
+    other lamps it has its even share of the choices."""
+    texels = np.zeros((256, 256, 3), np.float32)
+    texels[131, 28] = 1e5
+    lamp = {"type": "sphere", "to_world": look((1, 2, 3), (0, 1, 0)), "emitter": {"type": "area", "radiance": bitmap(texels, filter_type="nearest")}}
+    scene = mi.load_dict({"type": "scene", "lamp": lamp})
+    emitter = scene.emitters()[0]
+    assert _mean_power(emitter) == 0, "test too weak"
+    lights, ray, flux = emission(scene, 1 << 21)
+    assert not lights.dark
+    mean, error = mean_and_error(flux)
+    everywhere = mi.warp.square_to_uniform_sphere(next_2d(streams(dr.arange(mi.UInt32, 1 << 22), mi.UInt32(3))))
+    si = scene.ray_intersect(mi.Ray3f(mi.Point3f(1, 2, 3), everywhere))
+    si.wi = mi.Vector3f(0, 0, 1)
+    radiance, radiance_error = mean_and_error(np.array(dr.mean(emitter.eval(si))))
+    power, power_error = 4 * np.pi ** 2 * radiance, 4 * np.pi ** 2 * radiance_error
+    assert abs(mean - power) < 5 * np.hypot(error, power_error)
+    assert 5 * np.hypot(error, power_error) < mean, "test too weak"
+    both = Lights(mi.load_dict({"type": "scene", "lamp": lamp, "other": {"type": "point", "intensity": 3.0}}))
+    assert both.choice.pmf.min() == pytest.approx(0.05, rel=1e-3)
+
+
+def test_spectral_suns_are_chosen_by_their_light():
+    """A sun and a sky: the choice between them is the same in rgb and in spectral variants (looked at without wavelengths, the sun is dark)."""
+    chosen = []
+    for variant_name in ("llvm_ad_rgb", "llvm_ad_spectral"):
+        mi.set_variant(variant_name)
+        scene = mi.load_dict({
+            "type": "scene", "floor": {"type": "rectangle", "to_world": T().scale(3), "bsdf": diffuse(0.5)},
+            "sun": {"type": "directional", "direction": [0.3, 0.2, -1], "irradiance": {"type": "rgb", "value": 5.0}},
+            "sky": {"type": "constant", "radiance": {"type": "rgb", "value": 0.2}},
+            "sensor": {"type": "perspective", "to_world": look((0, -1.5, 6), (0, 0, 0)), "fov": 30, "film": film(16)}})
+        lights = Lights.seen_by(scene, scene.sensors()[0], "bdpm")
+        chosen.append(lights.choice.pmf[lights.kinds.index("directional")])
+    assert chosen[1] == pytest.approx(chosen[0], rel=0.1)
 
 
 # --- Direct light ---------------------------------------------------------------------------------------------------

@@ -13,7 +13,7 @@ from comparing import PathBatches, SessionBatches, agree, assert_powerful, colle
 from mis_integrators.integrators import optimal
 from mis_integrators.integrators.optimal import OptimalWeights
 from test_against_path import LENS, MONO, ORTHO, PERSPECTIVE, RGB, SPECTRAL, oracle
-from worlds import EMITTERS, RADIUS, has_delta, tray
+from worlds import EMITTERS, RADIUS, T, colour, has_delta, look, sensor, tray
 
 
 def weighted(plugin="bdpm_opt", **parameters):
@@ -347,6 +347,25 @@ def test_presets_fix_the_number_of_strategies(rgb, plugin, strategies):
         mi.load_dict({"type": plugin, "strategies": 2})
 
 
+def test_what_the_cache_knows_of_direct_light():
+    """Cells that a lamp shines upon know it, and so do their surroundings; in spectral variants no less than in rgb."""
+    facts = []
+    for variant_name in (RGB, SPECTRAL):
+        mi.set_variant(variant_name)
+        lamp = {"type": "rectangle", "to_world": look((0, 0, 3), (0, 0, 0)) @ T().scale(0.8),
+                "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 4.0}}}
+        floor = {"type": "rectangle", "to_world": T().scale(2.5), "bsdf": {"type": "diffuse", "reflectance": colour(0.7, 0.7, 0.7)}}
+        scene = mi.load_dict({"type": "scene", "lamp": lamp, "floor": floor,
+                              "ball": {"type": "sphere", "center": [0, 0, 1], "radius": 0.5, "bsdf": {"type": "roughconductor", "alpha": 0.2}},
+                              "sensor": sensor(size=16)})
+        session = mi.load_dict({"type": "bdpm_opt2", "weights": "full", "initial_radius": 0.05, "frozen_photons": 20000}).session(scene)
+        session.start()
+        known = session.cache.lookup(session.cache.center, session.cache.facing)
+        facts.append([np.median(np.array(known.noise)), (np.array(known.visible_share) > 0).mean(), float(session.surroundings.albedo[0])])
+    assert facts[0][0] < 5 and facts[0][1] > 0.5
+    np.testing.assert_allclose(facts[1], facts[0], rtol=0.1)
+
+
 @pytest.mark.parametrize("radius, mixes", [(0.003, True), (0.3, False), (0.0, False)])
 def test_diffuse_surfaces_mix_where_photons_are_few(rgb, radius, mixes):
     scene = tray("lambertian", "rectangle")
@@ -377,6 +396,19 @@ def test_darkness_and_no_indirect_light(rgb, kind):
         mine = mi.render(lit, integrator=mi.load_dict({"type": "bdpm_opt", "weights": kind, "max_depth": depth}), spp=64)
         truth = mi.render(lit, integrator=mi.load_dict({"type": "path", "max_depth": depth}), spp=64)
         assert np.allclose(np.array(mine)[..., :3].mean(), np.array(truth)[..., :3].mean(), rtol=0.02)
+
+
+@pytest.mark.parametrize("parameters", [{}, {"initial_radius": 0.05, "mix_diffuse": True, "weights": "full"}, {"initial_radius": 0.05}])
+def test_light_that_meets_nothing_smooth(rgb, parameters):
+    """A sky and glass, and rough metal out of its reach: nothing is learned, nothing is mixed, and what is seen is right."""
+    hidden = {"type": "sphere", "center": [0, 0, 9], "radius": 0.5}
+    scene = mi.load_dict({
+        "type": "scene", "glass": {"type": "sphere", "bsdf": {"type": "dielectric"}}, "sensor": sensor(size=16),
+        "sky": {"type": "constant", "radiance": {"type": "rgb", "value": [0.7, 0.5, 0.3]}},
+        "box": {**hidden, "bsdf": {"type": "conductor"}}, "metal": {**hidden, "radius": 0.4, "bsdf": {"type": "roughconductor", "alpha": 0.2}}})
+    images = [np.array(mi.render(scene, integrator=mi.load_dict({"type": plugin, "max_depth": 6, **extra}), spp=64))
+              for plugin, extra in (("bdpm_opt3", parameters), ("path", {}))]
+    assert images[0].mean() == pytest.approx(images[1].mean(), rel=0.02) and images[1].mean() > 0.01
 
 
 def test_same_seed_same_image(rgb):

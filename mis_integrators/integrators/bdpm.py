@@ -284,7 +284,8 @@ class BDPMSession(IterativeSession):
             return self.rehearsed.pop(iteration)
         radii = self.radii_at(iteration)
         spectral = self._spectral(iteration)
-        maps = self._map_pass(self._photons(iteration, spectral), radii) if radii else None
+        photons = self._photons(iteration, spectral) if radii else None          # before any pass is looked up: they may have to be recorded anew
+        maps = self._map_pass(photons, radii) if radii else None
 
         def render(chunk, first):
             while True:

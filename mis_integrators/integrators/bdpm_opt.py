@@ -131,13 +131,15 @@ class BDPMOptSession(WeightedSession):
             self._learn(self._spectral(0))
             photons = self.light_paths * math.pi * max(self.radii.values()) ** 2 * self.cache.mean / max(self.cache.typical_flux, 1e-30)
             self.mix_diffuse, self.undecided = photons < FEW_PHOTONS, False
-        return self.traits.has_rough or self.mix_diffuse
+        if not (self.traits.has_rough or self.mix_diffuse):
+            return False
+        if self.cache is None:
+            self._learn(self._spectral(0))
+        return dr.width(self.cache.center) > 0           # where light meets nothing there is nothing to learn, nor to mix
 
     def prepare(self, spectral):
-        if self.cache is None:
-            self._learn(spectral)
         if self.integrator.weights == "full":
-            self.surroundings = Surroundings(self.scene, self.weights({"n": mi.Spectrum(0), "caustic_cost": mi.Float(0)}))
+            self.surroundings = Surroundings(self.scene, self.weights({"n": mi.Spectrum(0), "caustic_cost": mi.Float(0)}), spectral["wavelengths"])
 
     def _learn(self, spectral):
         """One dense light pass, frozen: for the weights only."""
@@ -151,7 +153,7 @@ class BDPMOptSession(WeightedSession):
                                         integrator.rr_depth, keep_direct=True)
             dr.eval(photons)
             found = int(photons[2][0])
-        self.cache = IrradianceCache(self.scene, self.lights, *photons, paths, self.traits.bounds)
+        self.cache = IrradianceCache(self.scene, self.lights, *photons, paths, self.traits.bounds, spectral["wavelengths"])
 
     def _freeze(self):
         super()._freeze()

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..transport.camera_pass import film_sample_count
 from ..transport.gather import mean_photon_count
-from ..transport.radius import best_radius, ladder, relative_weights, usual_mean
+from ..transport.radius import LARGEST_SHARE, Choice, best_radius, ladder, relative_weights, usual_mean
 from ..transport.spectra import channel_mean
 
 PILOT_PIXELS = 4096
@@ -24,6 +24,9 @@ PILOT_INDEX = 1 << 30
 UNPLANNED_ITERATIONS = 64
 MOST_PHOTONS = 160
 """Photons a vertex within the largest radius that is tried."""
+FEWEST_PHOTONS, WIDER = 1, 4
+"""Photons a vertex within the largest radius, fewer than which tell nothing (the camera may see one point only): then radii so many times larger are
+tried, up to those that suit the whole scene."""
 GATHER_COST = 0.013
 """Cost of one gathered photon a vertex, in units of an iteration's light and camera passes (0.006 to 0.018 on the bundled scenes)."""
 PROBE_COST = 0.15
@@ -185,7 +188,10 @@ class Pilot:
         if self.ladder is None:
             return False
         self._count(photons, vertices)
-        crowd = max(self.photons.values())
+        largest = LARGEST_SHARE * float(dr.norm(self.session.traits.bounds.extents())) / 3 ** 0.5
+        while (crowd := max(self.photons.values())) < FEWEST_PHOTONS and self.ladder[-1] < largest:
+            self.ladder = self.ladder * min(WIDER, largest / self.ladder[-1])
+            self._count(photons, vertices)
         if crowd > MOST_PHOTONS:
             self.ladder = self.ladder * (MOST_PHOTONS / crowd) ** 0.5
             self._count(photons, vertices)
@@ -230,7 +236,7 @@ class Pilot:
             session.radii = {kind: 1e-3 * float(dr.norm(session.traits.bounds.extents())) for kind in self.ways}
             return {}
         samples, mean = {key: np.array(values) for key, values in self.samples.items()}, self.mean()
-        choices = {kind: best_radius(
+        choices = {kind: Choice(float(self.ladder[len(self.ladder) * 2 // 3]), False, 0.0, 0.0) if not np.any(samples[kind, False]) else best_radius(
             self.ladder, samples[kind, False], samples.get((kind, True)), mean,
             lambda radius, corrected, kind=kind: np.maximum(count / self._cost(kind, corrected, radius), 1), self.at_first_vertex,
             kind == "caustic", None if reluctance is None else (session.radii[kind], session.corrected[kind]), reluctance or 0.0)

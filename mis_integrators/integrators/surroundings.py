@@ -25,8 +25,8 @@ class Surroundings:
     Attributes: `table` (float32), `albedo` of a typical neighbour (width one).
     """
 
-    def __init__(self, scene, weights):
-        """`weights`: `OptimalWeights`, whose nodes tell the neighbours' radiance."""
+    def __init__(self, scene, weights, wavelengths):
+        """`weights`: `OptimalWeights`, whose nodes tell the neighbours' radiance; `wavelengths`: those at which its cache was made."""
         cache = weights.cache
         cells = dr.width(cache.center)
         channels = colours()
@@ -34,7 +34,7 @@ class Surroundings:
         if cells == 0:
             self.table, self.albedo = dr.zeros(mi.Float, self.words), dr.opaque(mi.Float, 0)
             return
-        si, bsdf, active = self._neighbours(scene, cache, cells)
+        si, bsdf, active = self._neighbours(scene, cache, cells, wavelengths)
         node = weights.node(si, bsdf, active)
         albedo = dr.sum(dr.select(active, node.kernel / node.lobe_p, 0)) / dr.maximum(dr.count(active), 1)
         self.albedo = dr.opaque(mi.Float, min(float(albedo[0]), 1.0))
@@ -52,7 +52,7 @@ class Surroundings:
         self.table = from_numpy(mi.Float, table.ravel())
 
     @staticmethod
-    def _neighbours(scene, cache, cells):
+    def _neighbours(scene, cache, cells, wavelengths):
         """The surfaces that smoothly scatter, met by `RAYS` rays a cell, distributed by cosine, behind delta surfaces too."""
         number = dr.arange(mi.UInt32, cells * RAYS)
         cell, stratum = number // RAYS, number % RAYS
@@ -62,6 +62,7 @@ class Surroundings:
         frame = mi.Frame3f(dr.gather(mi.Vector3f, cache.facing, cell))
         start = dr.zeros(mi.SurfaceInteraction3f, cells * RAYS)
         start.p, start.n = dr.gather(mi.Point3f, cache.center, cell), mi.Normal3f(frame.n)
+        start.wavelengths = wavelengths
         ray = start.spawn_ray(frame.to_world(mi.warp.square_to_cosine_hemisphere(sample)))
         active = mi.Bool(True)
         for step in range(DELTA_STEPS + 1):
@@ -73,7 +74,7 @@ class Surroundings:
                 break
             bs, _ = bsdf.sample(mi.BSDFContext(), si, rng.next_float32(through), next_2d(rng, through), through)
             onwards = si.spawn_ray(si.to_world(bs.wo))
-            ray = mi.Ray3f(dr.select(through, onwards.o, ray.o), dr.select(through, onwards.d, ray.d))
+            ray = mi.Ray3f(dr.select(through, onwards.o, ray.o), dr.select(through, onwards.d, ray.d), 0, wavelengths)
             dr.eval(ray, rng, active)
         return si, bsdf, active & ~through
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from .camera_rays import sample_camera_ray
 from .lights import mis_power
 from .packing import Store
 from .random import next_2d, streams
@@ -61,7 +62,7 @@ def start_camera_paths(sensor, seed, first, stride: int, n_paths: int, camera_pa
     time = mi.Float(sensor.shutter_open())
     if sensor.shutter_open_time() > 0:
         time += rng.next_float32() * sensor.shutter_open_time()
-    ray, weight = sensor.sample_ray(time, wavelength_sample, unit, aperture, active)
+    ray, weight = sample_camera_ray(sensor, time, wavelength_sample, unit, aperture, active)
     return path, active, rng, mi.Ray3f(ray), weight, splat, aperture
 
 

@@ -12,6 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .camera_rays import sample_camera_ray
 from .packing import from_numpy
 from .random import next_2d, streams
 from .spectra import channel_mean
@@ -30,6 +31,8 @@ PASS_THROUGH = 8
 LEVEL_SHARES = (0.55, 0.25, 0.1, 0.1)
 """Shares of the position histogram at full, half, quarter and eighth resolution."""
 FEWEST_RECORDS = 64
+SPREAD_WAVELENGTHS = 450, 520, 590, 640
+"""Wavelengths [nm] at which lights are looked at where no path brings its own."""
 FOCUS_TAIL = 0.01
 """Share of the records' weight that may lie outside the focus, at each end of each axis."""
 
@@ -200,13 +203,15 @@ class EnvironmentGuide:
         it = dr.zeros(mi.Interaction3f)
         it.p = p
         it.time = time
+        if mi.is_spectral:
+            it.wavelengths = mi.UnpolarizedSpectrum(*SPREAD_WAVELENGTHS)
         return it
 
     def _radiance(self, emitter, towards, active=True):
         si = dr.zeros(mi.SurfaceInteraction3f, dr.width(towards))
         si.wi = -towards
         if mi.is_spectral:
-            si.wavelengths = mi.UnpolarizedSpectrum(450, 520, 590, 640)
+            si.wavelengths = mi.UnpolarizedSpectrum(*SPREAD_WAVELENGTHS)
         return channel_mean(emitter.eval(si, active)) + dr.zeros(mi.Float, dr.width(towards))
 
     def _pilot(self, sensor):
@@ -216,7 +221,7 @@ class EnvironmentGuide:
         """
         rng = streams(dr.arange(mi.UInt32, PILOT_PATHS), mi.UInt32(0x67756964))
         wavelength_sample = 0.5
-        ray, throughput = sensor.sample_ray(sensor.shutter_open(), wavelength_sample, next_2d(rng), next_2d(rng))
+        ray, throughput = sample_camera_ray(sensor, sensor.shutter_open(), wavelength_sample, next_2d(rng), next_2d(rng))
         throughput = mi.Spectrum(throughput) + dr.zeros(mi.Spectrum, PILOT_PATHS)
         active = dr.full(mi.Bool, True, PILOT_PATHS)
         context = mi.BSDFContext()

@@ -57,10 +57,10 @@ class IrradianceCache:
     `center` and `facing` (mean position and normal of the photons of each cell, from cell number 1 on).
     """
 
-    def __init__(self, scene, lights, surface, power, count, light_paths, bounds):
+    def __init__(self, scene, lights, surface, power, count, light_paths, bounds, wavelengths):
         """`surface`, `power`, `count`: photons as `trace_light_paths` stores them, direct light's included; `light_paths`: how many
-        sub-paths made them."""
-        self.origin = mi.Point3f(bounds.min)
+        sub-paths made them, all of the same `wavelengths` (empty in rgb and mono variants)."""
+        self.origin, self.wavelengths = mi.Point3f(bounds.min), wavelengths
         self.words = 12 if colours() == 1 else 16
         capacity = dr.width(surface) // 4
         index = dr.arange(mi.UInt32, capacity)
@@ -107,8 +107,10 @@ class IrradianceCache:
 
     def _sum_cells(self, position, normal, place, stored):
         cells = dr.width(self._occupied)
+        self.center, self.facing, self.index = dr.zeros(mi.Point3f, cells), dr.zeros(mi.Vector3f, cells), dr.zeros(mi.UInt32, 1 << INDEX_BITS)
+        if cells == 0:
+            return
         number = dr.arange(mi.UInt32, cells) + 1                            # cell 0 is the empty one
-        self.index = dr.zeros(mi.UInt32, 1 << INDEX_BITS)
         dr.scatter(self.index, number, self._occupied)
         del self._occupied
         slot = dr.gather(mi.UInt32, self.index, place, stored)
@@ -159,12 +161,16 @@ class IrradianceCache:
         self.mean = _mean(sum(irradiance)) / channels
         self.level = dr.opaque(mi.Float, self.mean)
 
+    def _facing_surface(self, p, n):
+        si = dr.zeros(mi.SurfaceInteraction3f, dr.width(p))
+        si.p, si.n, si.wavelengths = p, mi.Normal3f(n), self.wavelengths
+        return si
+
     def _strongest_light(self, scene, lights, direct):
         """The emitter that brings most direct light to each cell's center, and the share of its unoccluded light that the cell has."""
         best, light = mi.Float(0), mi.UInt32(0)
         near = [i for i, kind in enumerate(lights.kinds) if kind in ("point", "spot", "area", "directional")]
-        si = dr.zeros(mi.SurfaceInteraction3f, dr.width(self.center))
-        si.p, si.n = self.center, mi.Normal3f(self.facing)
+        si = self._facing_surface(self.center, self.facing)
         for index in near[:MOST_LIGHTS]:
             ds, value = lights.unoccluded(si, mi.UInt32(index), mi.Bool(True))
             value *= dr.maximum(dr.dot(ds.d, self.facing), 0)
@@ -179,8 +185,7 @@ class IrradianceCache:
         cells = dr.width(self.center)
         number = dr.arange(mi.UInt32, cells * DIRECT_SAMPLES)
         facing = dr.gather(mi.Vector3f, self.facing, number // DIRECT_SAMPLES)
-        si = dr.zeros(mi.SurfaceInteraction3f, cells * DIRECT_SAMPLES)
-        si.p, si.n = dr.gather(mi.Point3f, self.center, number // DIRECT_SAMPLES), mi.Normal3f(facing)
+        si = self._facing_surface(dr.gather(mi.Point3f, self.center, number // DIRECT_SAMPLES), facing)
         ds, weight, _ = lights.sample_direct(si, streams(number, mi.UInt32(OWN_STREAM)), mi.Bool(True))
         value = channel_mean(weight) * dr.maximum(dr.dot(ds.d, facing), 0)
         mean, square = dr.block_sum(value, DIRECT_SAMPLES) / DIRECT_SAMPLES, dr.block_sum(dr.square(value), DIRECT_SAMPLES) / DIRECT_SAMPLES

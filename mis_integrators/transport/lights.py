@@ -19,6 +19,9 @@ from .spectra import channel_mean
 from .traits import UnsupportedScene, lookup, registry_table
 
 POWER_SAMPLES = 4096
+LEAST_POWER = 1e-6
+"""Of a textured emitter of which no sample has met light, as a share of the others' power: its texture may have small bright spots all the same.
+(By `UNIFORM_SHARE` it is chosen more often.)"""
 UNIFORM_SHARE = 0.1
 """Share of the choices among emitters that ignores power, so that a dim but near emitter is not starved."""
 
@@ -66,6 +69,18 @@ def _mean_power(emitter):
     return float(value) if np.isfinite(value) and value > 0 else 0.0
 
 
+def _may_be_missed(emitter, kind):
+    """Whether Mitsuba's light rays may not meet small bright spots of the emitter's texture: they start anywhere, or (on rotated spheres, cylinders)
+    not where the texture has told them to."""
+    return kind in ("area", "directionalarea", "spot") and bool(emitter.flags() & mi.EmitterFlags.SpatiallyVarying)
+
+
+def _with_doubtful(power, may_be_missed):
+    """Estimated powers, those that are zero by chance, perhaps, raised to a little."""
+    least = LEAST_POWER * power.sum() or LEAST_POWER
+    return np.where((power == 0) & np.array(may_be_missed, dtype=bool), least, power)
+
+
 def _invariant_key(emitter):
     shape = emitter.get_shape()
     return emitter.class_name(), str(emitter), str(shape.bbox()) if shape is not None else ""
@@ -90,6 +105,7 @@ class Lights:
         power = np.array([_mean_power(e) for e in self.emitters])
         if guide is not None:
             power = guide.useful_power(power[np.argsort(order)])[order]
+        power = _with_doubtful(power, [_may_be_missed(e, kind) for e, kind in zip(self.emitters, self.kinds)])
         self.total_power = float(power.sum())
         if not self.emitters:
             return
@@ -99,7 +115,7 @@ class Lights:
         self.numbers = registry_table(self.emitters, mi.EmitterPtr, range(len(self.emitters)), mi.UInt32)
         self.kind_table = mi.UInt32([_KINDS.index(k) for k in self.kinds])
         self._spot_tables(self.emitters)
-        self._sphere_tables(self.emitters)
+        self._surface_tables(self.emitters)
 
     @classmethod
     def seen_by(cls, scene, sensor, plugin):
@@ -115,8 +131,8 @@ class Lights:
         """Every evaluated array that the sampling routines read, for `dr.freeze` to track."""
         if not self.emitters:
             return []                  # an empty array among a recording's arguments aborts the process
-        arrays = [getattr(self, name) for name in ("order", "numbers", "kind_table", "_spot_axis", "_spot_cosine",
-                                                     "_sphere_center", "_sphere_sign") if hasattr(self, name)]
+        arrays = [getattr(self, name) for name in ("order", "numbers", "kind_table", "_spot_axis", "_spot_cosine", "_surface_area",
+                                                     "_surface_number", "_sphere_center", "_sphere_sign") if hasattr(self, name)]
         if self.choice.count > 1:
             arrays += [self.choice._pmf, self.choice._cdf]
         return arrays + (self.guide.tables() if self.guide is not None else [])
@@ -153,8 +169,13 @@ class Lights:
             self._spot_axis = from_numpy(mi.Float, np.ravel(axes))
             self._spot_cosine = mi.Float(cosines)
 
-    def _sphere_tables(self, emitters):
-        shapes = [e.get_shape() for e in emitters]
+    def _surface_tables(self, emitters):
+        shapes = [e.get_shape() if kind in ("area", "directionalarea") else None for e, kind in zip(emitters, self.kinds)]
+        self._surfaces = [s for s in shapes if s is not None]
+        if self._surfaces:
+            number = np.cumsum([s is not None for s in shapes]) - 1
+            self._surface_number = from_numpy(mi.UInt32, np.maximum(number, 0))
+            self._surface_area = from_numpy(mi.Float, [float(np.array(s.surface_area()).ravel()[0]) if s is not None else 1.0 for s in shapes])
         spheres = [s is not None and s.class_name() == "Sphere" for s in shapes]
         self._has_spheres = any(spheres)
         if self._has_spheres:
@@ -163,9 +184,22 @@ class Lights:
             self._sphere_center = from_numpy(mi.Float, np.ravel(centers))
             self._sphere_sign = mi.Float(signs)
 
-    def _sample_surface(self, emitter, index, time, sample, active):
-        """A uniformly distributed point on an area light. Mitsuba's sampling of a rotated sphere forgets to rotate the normal."""
-        ps = emitter.get_shape().sample_position(mi.Float(time), sample, active)
+    def _area(self, emitter, active):
+        """Surface area of an area light."""
+        return dr.gather(mi.Float, self._surface_area, lookup(self.numbers, emitter, mi.UInt32, active), active)
+
+    def _sample_surface(self, index, time, sample, active):
+        """A uniformly distributed point on area light `index`. Mitsuba's sampling of a rotated sphere forgets to rotate the normal.
+
+        A virtual call would ask every shape of the process, and instances, curves and others have no points to give."""
+        def sampler(shape):
+            return lambda time, sample, active: shape.sample_position(time, sample, active)
+
+        if len(self._surfaces) == 1:
+            ps = sampler(self._surfaces[0])(mi.Float(time), sample, active)
+        else:
+            number = dr.gather(mi.UInt32, self._surface_number, index, active)
+            ps = dr.switch(number, [sampler(shape) for shape in self._surfaces], mi.Float(time), sample, active)
         if self._has_spheres:
             sign = dr.gather(mi.Float, self._sphere_sign, index, active)
             center = dr.gather(mi.Point3f, self._sphere_center, index, active)
@@ -240,7 +274,7 @@ class Lights:
         pdf = emitter.pdf_direction(ref, ds, active)
         if self.has_textured:
             textured = active & self._textured_mask(emitter)
-            by_area = dr.square(ds.dist) / (dr.abs_dot(ds.d, ds.n) * emitter.get_shape().surface_area())
+            by_area = dr.square(ds.dist) / (dr.abs_dot(ds.d, ds.n) * self._area(emitter, textured))
             pdf = dr.select(textured, dr.select(dr.dot(ds.d, ds.n) < 0, by_area, 0), pdf)
         return pdf
 
@@ -250,7 +284,7 @@ class Lights:
         return mi.has_flag(flags, mi.EmitterFlags.Surface) & mi.has_flag(flags, mi.EmitterFlags.SpatiallyVarying)
 
     def _sample_by_area(self, ref, emitter, index, sample, active):
-        ps = self._sample_surface(emitter, index, ref.time, sample, active)
+        ps = self._sample_surface(index, ref.time, sample, active)
         ds = mi.DirectionSample3f(ps)
         ds.d = ds.p - ref.p
         distance_squared = dr.squared_norm(ds.d)
@@ -322,7 +356,7 @@ class Lights:
         density = mi.Float(1)
         if "area" in self.kinds or "directionalarea" in self.kinds:
             on_surface = active & self._of_kind(index, "area", "directionalarea", active=active)
-            area = dr.select(on_surface, ds.emitter.get_shape().surface_area(), 1)
+            area = dr.select(on_surface, dr.gather(mi.Float, self._surface_area, index, on_surface), 1)
             cosine = dr.maximum(-dr.dot(ds.d, ds.n), 1e-6)
             density = dr.select(on_surface, dr.square(ds.dist) * dr.rcp(area * cosine), density)
         if "environment" in self.kinds:
@@ -412,7 +446,7 @@ class Lights:
         return dr.select(own_pdf > 0, density * dr.rcp(own_pdf), 0)
 
     def _ratio_area(self, ref, ds, index, active):
-        pdf = self._pdf_of_emitter(ref, ds, active) * (dr.pi * ds.emitter.get_shape().surface_area())
+        pdf = self._pdf_of_emitter(ref, ds, active) * (dr.pi * dr.gather(mi.Float, self._surface_area, index, active))
         return dr.select(pdf > 0, dr.rcp(pdf), 0)
 
     def _ratio_ray(self, ref, ds, index, active):
@@ -467,7 +501,7 @@ class Lights:
         return o, -towards, radiance * dr.select(pdf_direction > 0, dr.rcp(pdf_direction * pdf_position), 0)
 
     def _emit_area(self, emitter, index, sample_a, sample_b, extra, time, wavelengths, active):
-        ps = self._sample_surface(emitter, index, time, sample_a, active)
+        ps = self._sample_surface(index, time, sample_a, active)
         si = mi.SurfaceInteraction3f(ps, wavelengths)
         si.wi = mi.warp.square_to_cosine_hemisphere(sample_b)
         radiance = emitter.eval(si, active)
