@@ -39,6 +39,8 @@ def load(
     """
     config = mi.parser.ParserConfig(mi.variant())
     state = mi.parser.parse_file(config, str(path), **variables)
+    if state.root.type != mi.ObjectType.Scene:
+        raise RuntimeError(f'"{path}" is not a scene')
     mi.parser.transform_all(config, state)
     node = _integrator_node(state) or _add_integrator(state)
     if plugin:
@@ -55,8 +57,6 @@ def load(
 
     mi.file_resolver().prepend(str(path.parent))
     scene = mi.parser.instantiate(config, state)
-    if not isinstance(scene, mi.Scene):
-        raise RuntimeError(f'"{path}" is not a scene')
     return LoadedScene(scene, scene.integrator(), name, given)
 
 

@@ -92,6 +92,11 @@ class Chore:
         self._last = time.monotonic()
 
 
+def fewest_iterations(session: Session) -> int:
+    """How many iterations the session's image needs: one, unless it shows their variance."""
+    return getattr(session, "fewest_iterations", 1)
+
+
 def iterate(
     session: Session,
     planned: int | None,
@@ -103,8 +108,8 @@ def iterate(
     interrupt: Interrupt,
 ) -> None:
     """Iterate until there are as many iterations as ``planned``, ``seconds`` of rendering have passed, or the error reaches its target,
-    whichever is first of those that are given, or the user interrupts. A session that has enough already is left as it is. Its remarks, if it has
-    some, are said once.
+    whichever is first of those that are given, or the user interrupts; but at least as many as an image needs. A session that has enough already is
+    left as it is. Its remarks, if it has some, are said once.
     """
 
     def enough() -> bool:
@@ -116,7 +121,7 @@ def iterate(
 
     interrupt.have_result = session.iterations > 0
     remarked = False
-    while not (session.iterations and (enough() or interrupt.requested)):
+    while session.iterations < fewest_iterations(session) or not (enough() or interrupt.requested):
         with clock:
             session.iterate()
         interrupt.have_result = True

@@ -149,6 +149,11 @@ class IterativeSession:
         """Iterations done."""
         return self.accumulator.iterations
 
+    @property
+    def fewest_iterations(self):
+        """How many iterations an image needs."""
+        return 2 if self.integrator.variance else 1
+
     def keep_variance(self):
         """From the first iteration on, keeps what `estimate` needs."""
         self.accumulator.with_variance = True
