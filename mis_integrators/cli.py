@@ -35,15 +35,19 @@ class Failure(Exception):
 def main(arguments: list[str] | None = None) -> int:
     """Run ``mis-render`` with the arguments (default: those of the process) and return its exit code."""
     options = parse(arguments)
+    interrupt = Interrupt()
     try:
-        with Interrupt() as interrupt:
+        with interrupt:
             return _run(options, interrupt)
-    except Failure as failure:
-        print(f"mis-render: {failure}", file=sys.stderr)
-        return failure.code
-    except KeyboardInterrupt:
-        print("mis-render: interrupted, nothing written", file=sys.stderr)
-        return EXIT_INTERRUPTED
+    except BaseException as error:
+        # Libraries turn an interrupt that reaches them into errors of any kind.
+        if interrupt.stopped or isinstance(error, KeyboardInterrupt):
+            print("mis-render: interrupted, nothing written", file=sys.stderr)
+            return EXIT_INTERRUPTED
+        if not isinstance(error, Failure):
+            raise
+        print(f"mis-render: {error}", file=sys.stderr)
+        return error.code
 
 
 def _run(options: argparse.Namespace, interrupt: Interrupt) -> int:

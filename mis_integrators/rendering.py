@@ -21,6 +21,8 @@ class Interrupt:
     def __init__(self) -> None:
         self.requested = False
         self.have_result = False
+        self.stopped = False
+        """Whether an interrupt has stopped what was being done."""
 
     def __enter__(self) -> "Interrupt":
         self._previous = {number: signal.signal(number, self._handle) for number in (signal.SIGINT, signal.SIGTERM)}
@@ -32,6 +34,7 @@ class Interrupt:
 
     def _handle(self, *_: object) -> None:
         if self.requested or not self.have_result:
+            self.stopped = True
             raise KeyboardInterrupt
         self.requested = True
 

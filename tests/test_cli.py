@@ -492,6 +492,21 @@ def test_interrupt_before_the_first_iteration_writes_nothing(scene, tmp_path, us
     assert "nothing written" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("error", [RuntimeError, SystemError])
+def test_interrupt_that_a_library_turns_into_an_error(scene, tmp_path, use, capsys, error):
+    """Dr.Jit's compiler, and constructors of Python plugins, do so while a scene is loaded."""
+
+    def interrupt(_):
+        try:
+            signal.raise_signal(signal.SIGINT)
+        except KeyboardInterrupt:
+            raise error("it could not be compiled") from None
+
+    use(FakeSession(on_iteration=interrupt))
+    assert render(scene, "-o", tmp_path / "a.exr") == 130
+    assert capsys.readouterr().err == "mis-render: interrupted, nothing written\n"
+
+
 def test_second_interrupt_stops_at_once(scene, tmp_path, use):
     def interrupt(iterations):
         if iterations == 1:
