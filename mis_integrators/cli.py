@@ -153,9 +153,10 @@ def _render(
         Progress(paths, planned, options.time, options.quiet) as progress,
         dr.scoped_set_flag(dr.JitFlag.KernelHistory),
     ):
-        if planned and options.spp and planned * session.samples_per_iteration > options.spp:
+        asked = options.spp or sensor.sampler().sample_count()
+        if planned and planned * session.samples_per_iteration > asked:
             progress.say(
-                f"{options.spp} samples per pixel rounded up to {planned * session.samples_per_iteration}: "
+                f"{asked} samples per pixel rounded up to {planned * session.samples_per_iteration}: "
                 f"{planned} iterations of {session.samples_per_iteration}"
             )
         path = checkpoint.beside(options.output)

@@ -17,7 +17,7 @@ from mis_integrators import cli, loading, output
 from mis_integrators.session import MitsubaSession
 
 SCENE = """<scene version="3.0.0">
-  <default name="spp" value="4"/>
+  <default name="spp" value="10"/>
   <default name="integrator" value="path"/>
   <integrator type="$integrator"><integer name="max_depth" value="3"/></integrator>
   <sensor type="perspective">
@@ -185,6 +185,7 @@ def test_preview_of_luminance_and_of_spectral_bands(tmp_path, rgb):
     [
         ("volpath", {"max_depth": 3, "rr_depth": 7, "hide_emitters": True}),
         ("direct", {"hide_emitters": True}),
+        ("aov", {"aovs": "d:depth", "hide_emitters": True}),
     ],
 )
 def test_replaced_integrator_hands_on_what_the_new_one_knows(scene, plugin, kept):
@@ -195,7 +196,7 @@ def test_replaced_integrator_hands_on_what_the_new_one_knows(scene, plugin, kept
             '<boolean name="hide_emitters" value="true"/></integrator>',
         )
     )
-    loaded = loading.load(scene, {}, plugin, {})
+    loaded = loading.load(scene, {}, plugin, {"aovs": "d:depth"} if plugin == "aov" else {})
     assert loaded.plugin == plugin and loaded.parameters == kept
 
 
@@ -308,6 +309,13 @@ def test_rounding_up_is_said_once(scene, tmp_path, use, capsys):
     use(FakeSession())
     assert render(scene, "-o", tmp_path / "a.exr", "--spp", 9) == 0
     assert capsys.readouterr().err.count("rounded up to 10") == 1
+
+
+@pytest.mark.parametrize("quiet", [False, True])
+def test_rounding_up_of_an_integrator_is_said_once(scene, tmp_path, capfd, quiet):
+    arguments = "-i", "bdpt", "-P", "max_depth=1", "-P", "camera_paths=3", "-o", tmp_path / "a.exr", *["--quiet"] * quiet
+    assert render(scene, *arguments) == 0
+    assert sum(text.count("rounded up") for text in capfd.readouterr()) == (0 if quiet else 1)
 
 
 def test_progress_in_lines_and_quiet(scene, tmp_path, use, capsys, monkeypatch):
