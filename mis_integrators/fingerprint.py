@@ -44,7 +44,7 @@ def changes(then: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
 
 
 def _elements(file: Path) -> list[tuple[str, Mapping[str, str]]]:
-    """Tags and attributes of an XML file. Mitsuba's parser takes files that are not well-formed, such as those with ``--`` in comments; so does this."""
+    """Tags and attributes of an XML file; as in Mitsuba's parser, it need not be well-formed (``--`` in comments)."""
     try:
         return [(element.tag, element.attrib) for element in ElementTree.parse(file).iter()]
     except ElementTree.ParseError:
