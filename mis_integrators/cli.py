@@ -17,7 +17,7 @@ from .checkpoint import Checkpoint, CheckpointError
 from .opening import Request
 from .options import parse, versions
 from .progress import Progress
-from .rendering import Chore, Clock, Interrupt, iterate
+from .rendering import Chore, Clock, Interrupt, fewest_iterations, iterate
 from .session import Session
 from .stopping import TargetError
 
@@ -35,15 +35,19 @@ class Failure(Exception):
 def main(arguments: list[str] | None = None) -> int:
     """Run ``mis-render`` with the arguments (default: those of the process) and return its exit code."""
     options = parse(arguments)
+    interrupt = Interrupt()
     try:
-        with Interrupt() as interrupt:
+        with interrupt:
             return _run(options, interrupt)
-    except Failure as failure:
-        print(f"mis-render: {failure}", file=sys.stderr)
-        return failure.code
-    except KeyboardInterrupt:
-        print("mis-render: interrupted, nothing written", file=sys.stderr)
-        return EXIT_INTERRUPTED
+    except BaseException as error:
+        # Libraries turn an interrupt that reaches them into errors of any kind.
+        if interrupt.stopped or isinstance(error, KeyboardInterrupt):
+            print("mis-render: interrupted, nothing written", file=sys.stderr)
+            return EXIT_INTERRUPTED
+        if not isinstance(error, Failure):
+            raise
+        print(f"mis-render: {error}", file=sys.stderr)
+        return error.code
 
 
 def _run(options: argparse.Namespace, interrupt: Interrupt) -> int:
@@ -149,9 +153,10 @@ def _render(
         Progress(paths, planned, options.time, options.quiet) as progress,
         dr.scoped_set_flag(dr.JitFlag.KernelHistory),
     ):
-        if planned and options.spp and planned * session.samples_per_iteration > options.spp:
+        asked = options.spp or sensor.sampler().sample_count()
+        if planned and planned * session.samples_per_iteration > asked:
             progress.say(
-                f"{options.spp} samples per pixel rounded up to {planned * session.samples_per_iteration}: "
+                f"{asked} samples per pixel rounded up to {planned * session.samples_per_iteration}: "
                 f"{planned} iterations of {session.samples_per_iteration}"
             )
         path = checkpoint.beside(options.output)
@@ -193,7 +198,9 @@ def _resume(options: argparse.Namespace, identity: dict[str, Any], session: Sess
 
 
 def _preview(session: Any, options: argparse.Namespace, path: Path) -> None:
-    """Write the image so far."""
+    """Write the image so far, if there is one."""
+    if session.iterations < fewest_iterations(session):
+        return
     image = output.contact_sheet(session.view_images()) if options.all_views else session.image()
     output.write_exr(path, image, session.channels, {"iterations": session.iterations})
     output.write_png(path.with_suffix(".png"), image, session.channels)
@@ -205,23 +212,28 @@ def _write(
     png, channels = path.with_suffix(".png"), session.channels
     views = session.view_images() if options.all_views or options.frames else []
     image = output.contact_sheet(views) if options.all_views else session.image()
+    writing, written = path, ""
     try:
         output.write_exr(path, image, channels, metadata)
-        written = f"{path} and {png}" if output.write_png(png, image, channels) else str(path)
+        writing, written = png, str(path)
+        if output.write_png(png, image, channels):
+            written += f" and {png}"
         if options.frames:
             for number, view in enumerate(views):
-                output.write_png(output.frame_path(path, number), view, channels)
+                writing = output.frame_path(path, number)
+                output.write_png(writing, view, channels)
             written += f", {len(views)} frames from {output.frame_path(path, 0)}"
         return written
     except OSError as error:
-        rest = f"; {kept} holds what was rendered, for --resume" if kept else ""
-        raise Failure(EXIT_OUTPUT, f"cannot write {path}: {error.strerror or error}{rest}") from error
+        rest = f"; {written} is written" if written else f"; {kept} holds what was rendered, for --resume" if kept else ""
+        raise Failure(EXIT_OUTPUT, f"cannot write {writing}: {error.strerror or error}{rest}") from error
 
 
 def _check_output(path: Path) -> None:
+    for file in (path, path.with_suffix(".png")):
+        if file.is_dir():
+            raise Failure(EXIT_OUTPUT, f"cannot write {file}: it is a directory")
     try:
-        if path.is_dir():
-            raise IsADirectoryError("it is a directory")
         output.make_writable(path.parent)
     except OSError as error:
         raise Failure(EXIT_OUTPUT, f"cannot write {path}: {error.strerror or error}") from error

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+import html
+import os
+import re
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 from typing import Mapping
@@ -16,18 +19,17 @@ def scene_digests(path: Path, variables: Mapping[str, str]) -> dict[str, str]:
     """
     state = mi.parser.parse_file(mi.parser.ParserConfig(mi.variant()), str(path), **variables)
     sources = [Path(str(file)) for file in state.files]
-    documents = [ElementTree.parse(file) for file in sources]
-    values = {e.get("name", ""): e.get("value", "") for document in documents for e in document.iter("default")}
+    elements = [element for file in sources for element in _elements(file)]
+    values = {given.get("name", ""): given.get("value", "") for tag, given in elements if tag == "default"}
     values.update(variables)
     resolver = mi.file_resolver()
     named = {}
-    for document in documents:
-        for element in document.iter():
-            for attribute in (element.get("value"), element.get("filename")):
-                name = _substituted(attribute or "", values)
-                file = Path(str(resolver.resolve(name))) if name else None
-                if file and file.is_file():
-                    named[name] = file
+    for _, given in elements:
+        for attribute in (given.get("value"), given.get("filename")):
+            name = _substituted(attribute or "", values)
+            file = str(resolver.resolve(name)) if name else ""
+            if os.path.isfile(file):                     # false, too, for spectra and matrices that are no possible names
+                named[name] = Path(file)
     named.update({_name(file, path): file for file in sources})
     return {name: _digest(file) for name, file in sorted(named.items())}
 
@@ -39,6 +41,20 @@ def changes(then: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
         for name in sorted({*then, *now})
         if then.get(name) != now.get(name)
     ]
+
+
+def _elements(file: Path) -> list[tuple[str, Mapping[str, str]]]:
+    """Tags and attributes of an XML file; as in Mitsuba's parser, it need not be well-formed (``--`` in comments)."""
+    try:
+        return [(element.tag, element.attrib) for element in ElementTree.parse(file).iter()]
+    except ElementTree.ParseError:
+        text = re.sub(r"<!--.*?-->", "", file.read_text(encoding="utf-8", errors="replace"), flags=re.DOTALL)
+        elements = re.findall(rf"<(\w+)((?:\s+{_ATTRIBUTE})*)", text)
+        assignments = [(tag, [given.partition("=") for given in re.findall(_ATTRIBUTE, rest)]) for tag, rest in elements]
+        return [(tag, {name.strip(): html.unescape(value.strip()[1:-1]) for name, _, value in given}) for tag, given in assignments]
+
+
+_ATTRIBUTE = r"""[\w:.-]+\s*=\s*(?:"[^"]*"|'[^']*')"""
 
 
 def _name(file: Path, scene: Path) -> str:

@@ -39,6 +39,8 @@ def load(
     """
     config = mi.parser.ParserConfig(mi.variant())
     state = mi.parser.parse_file(config, str(path), **variables)
+    if state.root.type != mi.ObjectType.Scene:
+        raise RuntimeError(f'"{path}" is not a scene')
     mi.parser.transform_all(config, state)
     node = _integrator_node(state) or _add_integrator(state)
     if plugin:
@@ -48,15 +50,13 @@ def load(
             for name, value in _plain(props).items()
             if name in INHERITED
         }
-        node.props = _properties(plugin, _known_to(plugin, inherited))
+        node.props = _properties(plugin, _known_to(plugin, inherited, parameters))
     for name, value in parameters.items():
         node.props[name] = value
     name, given = node.props.plugin_name(), _plain(node.props)
 
     mi.file_resolver().prepend(str(path.parent))
     scene = mi.parser.instantiate(config, state)
-    if not isinstance(scene, mi.Scene):
-        raise RuntimeError(f'"{path}" is not a scene')
     return LoadedScene(scene, scene.integrator(), name, given)
 
 
@@ -143,9 +143,9 @@ def _properties(plugin: str, values: Mapping[str, Value]) -> mi.Properties:
     return props
 
 
-def _known_to(plugin: str, values: Mapping[str, Value]) -> dict[str, Value]:
-    """Those of the values that the integrator asks for when it is built."""
-    props = _properties(plugin, values)
+def _known_to(plugin: str, values: Mapping[str, Value], parameters: Mapping[str, Value]) -> dict[str, Value]:
+    """Those of the values that the integrator asks for when it is built with these parameters, without which it may not be built at all."""
+    props = _properties(plugin, {**values, **parameters})
     try:
         mi.PluginManager.instance().create_object(props)
     except SCENE_ERRORS:

@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 
 from . import fingerprint, llvm, loading
@@ -37,7 +38,12 @@ class Request:
         """
         if self.variant.startswith("llvm_"):
             llvm.require()
-        mi.set_variant(self.variant)
+        try:
+            mi.set_variant(self.variant)
+        except (ImportError, RuntimeError):
+            if not self.variant.startswith("cuda_") or dr.has_backend(dr.JitBackend.CUDA):
+                raise
+            raise RuntimeError(f"{self.variant} needs an NVIDIA GPU and its driver, and Dr.Jit finds none; use --variant llvm_ad_rgb") from None
         loaded = loading.load(Path(self.scene), self.variables, self.plugin, self.parameters)
         sensor = _sensor(loaded.scene, self.sensor)
         spp = sensor.sampler().sample_count() if self.spp is None else self.spp

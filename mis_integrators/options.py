@@ -44,7 +44,7 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
         help="stop when the estimated relative error of the image is E or less, such as 0.05: the root mean square over the pixels of standard "
         "deviation over brightness, without the worst 0.1 %% of the pixels; --spp or --time are then upper bounds, and there is none without them")
     add("--seed", type=_seed, default=0, metavar="S", help="seed of the random numbers (default: 0)")
-    add("--sensor", type=int, default=0, metavar="N", help="index of the sensor (default: 0)")
+    add("--sensor", type=_integer, default=None, metavar="N", help="index of the sensor (default: 0)")
     add("--all-views", action="store_true",
         help="render all views of the scene together (all sensors, and the children of a batch) into a contact sheet")
     add("--frames", action="store_true", help="also write each view, FILE.000.png and so on: frames of an animation")
@@ -65,9 +65,14 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     add("--quiet", action="store_true", help="print errors only")
     add("--version", action="version", version=versions())
     options = parser.parse_args(arguments)
+    if options.scene.is_dir():
+        parser.error(f"argument SCENE.xml: {options.scene} is a directory")
     options.output = options.output or options.scene.with_suffix(".exr")
     if options.output.suffix != ".exr":
         parser.error(f"argument -o: {options.output} does not end in .exr")
+    if options.all_views and options.sensor is not None:
+        parser.error("argument --sensor: not allowed with argument --all-views")
+    options.sensor = options.sensor or 0
     if options.resume and not options.checkpoint:
         options.checkpoint = 60.0
     return options
@@ -85,22 +90,32 @@ def _assignment(text: str) -> tuple[str, str]:
     return name, value
 
 
+def _integer(text: str) -> int:
+    try:
+        return int(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text} is not an integer") from None
+
+
 def _positive_int(text: str) -> int:
-    value = int(text)
+    value = _integer(text)
     if value < 1:
         raise argparse.ArgumentTypeError("at least 1")
     return value
 
 
 def _positive_number(text: str) -> float:
-    value = float(text)
+    try:
+        value = float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text} is not a number") from None
     if not 0 < value < float("inf"):
         raise argparse.ArgumentTypeError("more than 0")
     return value
 
 
 def _seed(text: str) -> int:
-    value = int(text)
+    value = _integer(text)
     if not 0 <= value < 1 << 32:
         raise argparse.ArgumentTypeError("0 to 4294967295")
     return value

@@ -25,11 +25,13 @@ def make_writable(directory: Path) -> None:
 def write_exr(
     path: Path, image: np.ndarray, channels: Sequence[str], metadata: Mapping[str, str | int | float]
 ) -> None:
-    """Write an image of shape (H, W, C) with named channels as float32, and the metadata as attributes.
+    """Write an image of shape (H, W, C) with named channels as float32, and the metadata as attributes; integers beyond the 32 bits of
+    OpenEXR's become text.
 
     Raises ``OSError`` if it cannot be written; a file that was there before is then still whole.
     """
-    header = {**metadata, "compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    attributes = {name: str(value) if isinstance(value, int) and not -(2**31) <= value < 2**31 else value for name, value in metadata.items()}
+    header = {**attributes, "compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     planes = {name: np.ascontiguousarray(image[..., i], dtype=np.float32) for i, name in enumerate(channels)}
     with replacing(path) as temporary:
         try:

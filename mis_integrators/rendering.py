@@ -21,6 +21,8 @@ class Interrupt:
     def __init__(self) -> None:
         self.requested = False
         self.have_result = False
+        self.stopped = False
+        """Whether an interrupt has stopped what was being done."""
 
     def __enter__(self) -> "Interrupt":
         self._previous = {number: signal.signal(number, self._handle) for number in (signal.SIGINT, signal.SIGTERM)}
@@ -32,6 +34,7 @@ class Interrupt:
 
     def _handle(self, *_: object) -> None:
         if self.requested or not self.have_result:
+            self.stopped = True
             raise KeyboardInterrupt
         self.requested = True
 
@@ -92,6 +95,11 @@ class Chore:
         self._last = time.monotonic()
 
 
+def fewest_iterations(session: Session) -> int:
+    """How many iterations the session's image needs: one, unless it shows their variance."""
+    return getattr(session, "fewest_iterations", 1)
+
+
 def iterate(
     session: Session,
     planned: int | None,
@@ -103,8 +111,8 @@ def iterate(
     interrupt: Interrupt,
 ) -> None:
     """Iterate until there are as many iterations as ``planned``, ``seconds`` of rendering have passed, or the error reaches its target,
-    whichever is first of those that are given, or the user interrupts. A session that has enough already is left as it is. Its remarks, if it has
-    some, are said once.
+    whichever is first of those that are given, or the user interrupts; but at least as many as an image needs. A session that has enough already is
+    left as it is. Its remarks, if it has some, are said once.
     """
 
     def enough() -> bool:
@@ -116,7 +124,7 @@ def iterate(
 
     interrupt.have_result = session.iterations > 0
     remarked = False
-    while not (session.iterations and (enough() or interrupt.requested)):
+    while session.iterations < fewest_iterations(session) or not (enough() or interrupt.requested):
         with clock:
             session.iterate()
         interrupt.have_result = True

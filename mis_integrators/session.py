@@ -25,7 +25,7 @@ class Session(Protocol):
 
     A session may have a method ``plan_time(seconds: float) -> None``. It is called once, before the first
     iteration, when the render has a time limit instead of a number of samples. It may have ``remarks``, a list of lines that
-    the user should read, complete once an iteration is done.
+    the user should read, complete once an iteration is done, and ``fewest_iterations``, how many its image needs (else one).
     """
 
     iterations_planned: int | None

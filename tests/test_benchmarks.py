@@ -258,3 +258,12 @@ def test_a_slow_start_does_not_end_a_rendering(module):
     assert not Contender("any", None, seconds=[1.4]).wants(2.0)
     contender.seconds.append(0.5)
     assert contender.wants(2.2) and not contender.wants(2.1)
+
+
+@pytest.mark.parametrize("arguments, message", [
+    (["--integrators", "bdpmm"], '"bdpmm" not found'), (["--integrators", "bdpm:bdd"], "name=value"),
+    (["--scenes", "none.xml"], "no file none.xml"), (["--time", "-1"], "-1 is not a number above 0")])
+def test_what_is_asked_for_is_checked_before_it_is_measured(module, capsys, arguments, message):
+    with pytest.raises(SystemExit) as exit:
+        module("run").main(["compare", *arguments])
+    assert exit.value.code == 2 and message in capsys.readouterr().err.splitlines()[-1]

@@ -7,6 +7,7 @@ import sys
 import time
 from pathlib import Path
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import OpenEXR
@@ -16,7 +17,7 @@ from mis_integrators import cli, loading, output
 from mis_integrators.session import MitsubaSession
 
 SCENE = """<scene version="3.0.0">
-  <default name="spp" value="4"/>
+  <default name="spp" value="10"/>
   <default name="integrator" value="path"/>
   <integrator type="$integrator"><integer name="max_depth" value="3"/></integrator>
   <sensor type="perspective">
@@ -140,6 +141,26 @@ def test_bdpm_with_variance(scene, tmp_path):
     assert header["integrator"] == "bdpm" and header["max_depth"] == 3 and header["spp"] == 2
 
 
+def test_variance_of_a_short_render(scene, tmp_path):
+    """An image that shows its variance needs a second iteration, whatever the time says; nor is there a preview before."""
+    arguments = "-i", "bdpt", "-P", "variance=true", "-P", "max_depth=2", "--time", "1e-6", "--preview", "1e-6", "-o", tmp_path / "a.exr"
+    assert render(scene, *arguments) == 0
+    header, channels = read(tmp_path / "a.exr")
+    assert header["iterations"] == 2 and np.isfinite(channels["var.R"]).all()
+
+
+def test_interrupt_waits_for_an_image_that_shows_its_variance(scene, tmp_path, use):
+    session = use(FakeSession(on_iteration=lambda number: signal.raise_signal(signal.SIGINT) if number == 1 else None))
+    session.fewest_iterations = 3
+    assert render(scene, "-o", tmp_path / "a.exr") == 130
+    assert read(tmp_path / "a.exr")[0]["iterations"] == 3
+
+
+def test_largest_seed_is_kept_with_the_image(scene, tmp_path):
+    assert render(scene, "-o", tmp_path / "a.exr", "--seed", 2**32 - 1, "--spp", 1) == 0
+    assert int(read(tmp_path / "a.exr")[0]["seed"]) == 2**32 - 1
+
+
 def test_failed_write_leaves_the_old_file(tmp_path):
     file = tmp_path / "a.exr"
     output.write_exr(file, np.ones((2, 3, 1)), ["Y"], {})
@@ -164,6 +185,7 @@ def test_preview_of_luminance_and_of_spectral_bands(tmp_path, rgb):
     [
         ("volpath", {"max_depth": 3, "rr_depth": 7, "hide_emitters": True}),
         ("direct", {"hide_emitters": True}),
+        ("aov", {"aovs": "d:depth", "hide_emitters": True}),
     ],
 )
 def test_replaced_integrator_hands_on_what_the_new_one_knows(scene, plugin, kept):
@@ -174,7 +196,7 @@ def test_replaced_integrator_hands_on_what_the_new_one_knows(scene, plugin, kept
             '<boolean name="hide_emitters" value="true"/></integrator>',
         )
     )
-    loaded = loading.load(scene, {}, plugin, {})
+    loaded = loading.load(scene, {}, plugin, {"aovs": "d:depth"} if plugin == "aov" else {})
     assert loaded.plugin == plugin and loaded.parameters == kept
 
 
@@ -293,6 +315,13 @@ def test_rounding_up_is_said_once(scene, tmp_path, use, capsys):
     assert capsys.readouterr().err.count("rounded up to 10") == 1
 
 
+@pytest.mark.parametrize("quiet", [False, True])
+def test_rounding_up_of_an_integrator_is_said_once(scene, tmp_path, capfd, quiet):
+    arguments = "-i", "bdpt", "-P", "max_depth=1", "-P", "camera_paths=3", "-o", tmp_path / "a.exr", *["--quiet"] * quiet
+    assert render(scene, *arguments) == 0
+    assert sum(text.count("rounded up") for text in capfd.readouterr()) == (0 if quiet else 1)
+
+
 def test_progress_in_lines_and_quiet(scene, tmp_path, use, capsys, monkeypatch):
     monkeypatch.setattr("mis_integrators.progress.SECONDS_BETWEEN_LINES", 0.0)
     use(FakeSession())
@@ -377,6 +406,41 @@ def test_error_of_a_python_plugin_loses_its_traceback(rgb):
     assert message.endswith('plugin of type "broken": broken: wings must be even, not 3')
 
 
+def test_document_that_is_no_scene_is_called_so(scene, capsys):
+    scene.write_text("<bsdf version='3.0.0' type='diffuse'/>")
+    assert render(scene) == 1
+    assert "is not a scene" in capsys.readouterr().err
+
+
+def test_variant_without_its_gpu(scene, capsys, monkeypatch):
+    def refuse(variant):
+        raise ImportError("jit_init_thread_state(): the CUDA backend hasn't been initialized.")
+
+    monkeypatch.setattr(mi, "set_variant", refuse)
+    monkeypatch.setattr(dr, "has_backend", lambda backend: False)
+    assert render(scene, "--variant", "cuda_ad_rgb") == 1
+    error = capsys.readouterr().err
+    assert "NVIDIA" in error and "llvm_ad_rgb" in error and error.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [(["--spp", "many"], "many is not an integer"), (["--seed", "x"], "x is not an integer"), (["--time", "long"], "long is not a number"),
+     (["--all-views", "--sensor", "1"], "not allowed with")],
+)
+def test_wrong_usage_is_said_in_words(scene, capsys, arguments, message):
+    with pytest.raises(SystemExit) as exit:
+        render(scene, *arguments)
+    assert exit.value.code == 2 and message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("folder", [".", "..", ""])
+def test_folder_instead_of_a_scene(folder, capsys):
+    with pytest.raises(SystemExit) as exit:
+        cli.main([folder])
+    assert exit.value.code == 2 and "is a directory" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     "arguments",
     [
@@ -402,7 +466,19 @@ def test_output_is_checked_before_rendering(scene, tmp_path, use, capsys):
     assert render(scene, "-o", tmp_path / "file" / "a.exr") == 3
     (tmp_path / "a.exr").mkdir()
     assert render(scene, "-o", tmp_path / "a.exr") == 3
-    assert session.iterations == 0 and capsys.readouterr().err.count("\n") == 2
+    (tmp_path / "b.png").mkdir()
+    assert render(scene, "-o", tmp_path / "b.exr") == 3
+    assert session.iterations == 0
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 3 and "b.png" in lines[-1]
+
+
+def test_picture_that_cannot_be_written_is_named(scene, tmp_path, use, capsys):
+    use(FakeSession(on_iteration=lambda number: None if number else (tmp_path / "a.png").mkdir()))
+    assert render(scene, "-o", tmp_path / "a.exr") == 3
+    error = capsys.readouterr().err
+    assert "cannot write " + str(tmp_path / "a.png") in error and "a.exr is written" in error
+    assert read(tmp_path / "a.exr")[0]["iterations"] == 5
 
 
 # --- Ctrl-C ---------------------------------------------------------------------------------------
@@ -426,6 +502,21 @@ def test_interrupt_before_the_first_iteration_writes_nothing(scene, tmp_path, us
     assert render(scene, "-o", tmp_path / "a.exr") == 130
     assert not (tmp_path / "a.exr").exists()
     assert "nothing written" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("error", [RuntimeError, SystemError])
+def test_interrupt_that_a_library_turns_into_an_error(scene, tmp_path, use, capsys, error):
+    """Dr.Jit's compiler, and constructors of Python plugins, do so while a scene is loaded."""
+
+    def interrupt(_):
+        try:
+            signal.raise_signal(signal.SIGINT)
+        except KeyboardInterrupt:
+            raise error("it could not be compiled") from None
+
+    use(FakeSession(on_iteration=interrupt))
+    assert render(scene, "-o", tmp_path / "a.exr") == 130
+    assert capsys.readouterr().err == "mis-render: interrupted, nothing written\n"
 
 
 def test_second_interrupt_stops_at_once(scene, tmp_path, use):

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from lamplit import LAMP, ROOT, SCENE, command, read, render, run, same, write_scene
 
-from mis_integrators import checkpoint, cli, loading, output, stopping
+from mis_integrators import checkpoint, cli, fingerprint, loading, output, stopping
 from mis_integrators.checkpoint import Checkpoint, CheckpointError
 from mis_integrators.session import make_session
 from mis_integrators.sums import Iterations, Sums
@@ -65,6 +65,25 @@ def test_sums_are_merged_once():
         with pytest.raises(ValueError):
             sums.merge(arrays, done)
     np.testing.assert_array_equal(sums["total"], 2)
+
+
+# --- What a scene consists of -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("comment", ["<!-- one -->", "<!-- a -- b, value='none.ply' -->"])
+def test_scene_that_only_mitsuba_takes_has_its_digests(tmp_path, rgb, comment):
+    """Values too long for the name of a file, and comments that XML forbids but Mitsuba's parser does not."""
+    spectrum = ", ".join(f"{wavelength}:0.5" for wavelength in range(400, 700, 2))
+    (tmp_path / "it's & co.bmp").write_bytes(b"picture")
+    (tmp_path / "none.ply").write_bytes(b"commented out")
+    file = tmp_path / "scene.xml"
+    file.write_text(f"""<scene version="3.0.0">{comment}<default name="picture" value="co"/>
+        <bsdf type="diffuse"><spectrum name="reflectance" value="{spectrum}"/></bsdf>
+        <bsdf type="diffuse"><texture type="bitmap" name="reflectance"
+            ><string name = "filename" value='{tmp_path}/it&apos;s &amp; $picture.bmp'/></texture></bsdf></scene>""")
+    mi.file_resolver().prepend(str(tmp_path))
+    digests = fingerprint.scene_digests(file, {})
+    assert sorted(digests) == sorted([f"{tmp_path}/it's & co.bmp", "scene.xml"])
 
 
 # --- Resuming ---------------------------------------------------------------------------------------

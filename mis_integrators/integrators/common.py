@@ -87,13 +87,17 @@ class IterativeIntegrator(mi.AdjointIntegrator):
         if not spp:
             return None
         iterations = math.ceil(spp / camera_paths)
-        if iterations * camera_paths != spp:
-            mi.Log(mi.LogLevel.Warn, f"{self.plugin}: {spp} samples per pixel rounded up to {iterations} iterations of "
-                                     f"camera_paths = {camera_paths}")
         if self.variance and iterations < 2:
             raise ValueError(f'{self.plugin}: parameter "variance" needs at least two iterations; ask for spp > '
                              f'{camera_paths}')
         return iterations
+
+    def say_rounded(self, session, spp):
+        """Warns where a session of `spp` samples per pixel makes more of them."""
+        iterations, camera_paths = session.iterations_planned, session.samples_per_iteration
+        if iterations * camera_paths != spp:
+            mi.Log(mi.LogLevel.Warn, f"{self.plugin}: {spp} samples per pixel rounded up to {iterations} iterations of "
+                                     f"camera_paths = {camera_paths}")
 
     def _sensor(self, scene, sensor):
         check_variant(scene, self.plugin)
@@ -107,7 +111,9 @@ class IterativeIntegrator(mi.AdjointIntegrator):
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
         with dr.suspend_grad():
             sensor = self._sensor(scene, sensor)
-            session = self.session(scene, sensor, seed, spp or sensor.sampler().sample_count())
+            spp = spp or sensor.sampler().sample_count()
+            session = self.session(scene, sensor, seed, spp)
+            self.say_rounded(session, spp)
             for _ in range(session.iterations_planned):
                 session.iterate()
             with TURN:
@@ -150,6 +156,11 @@ class IterativeSession:
     def iterations(self):
         """Iterations done."""
         return self.accumulator.iterations
+
+    @property
+    def fewest_iterations(self):
+        """How many iterations an image needs."""
+        return 2 if self.integrator.variance else 1
 
     def keep_variance(self):
         """From the first iteration on, keeps what `estimate` needs."""

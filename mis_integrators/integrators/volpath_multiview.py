@@ -342,6 +342,7 @@ def render_views(scene, integrator=None, spp=0, seed=0):
     with dr.suspend_grad():
         spp = spp or max((sensor.sampler().sample_count() for sensor in scene.sensors()), default=1)
         session = integrator.views_session(scene, seed, spp)
+        integrator.say_rounded(session, spp)
         for _ in range(session.iterations_planned):
             session.iterate()
         return session.view_tensors()

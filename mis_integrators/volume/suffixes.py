@@ -108,18 +108,21 @@ def continue_paths(scene, lights, traits, summand, pivot, connections, number, s
         light_d, light, light_pdf, on_delta_light = mi.Vector3f(ds.d), mi.Spectrum(value), mi.Float(pdf), mi.Bool(ds.delta)
     own_next, next_pdf = scattering(pivot, surface, pivot["wi"], next_d, shared & taken)
     own_light, light_scatter_pdf = scattering(pivot, surface, pivot["wi"], light_d, shared)
+    all_next = mi.Spectrum(own_next)                 # to all views, each by its share
     if dr.hint(views > 1, mode='scalar'):
         share = dr.rcp(densities)
         next_pdf *= share
+        all_next *= share
         light_scatter_pdf *= share
         k = mi.UInt32(0)
         while dr.hint(k < views, label="mixture"):
             ratio = dr.gather(mi.Float, connections["ratio"], k * paths + path, shared)
             d = dr.gather(mi.Vector3f, connections["d"], k * paths + path, shared)
             counts = shared & ~alone & (ratio > 0) & (k != pivot["view"])
-            _, pdf_next = scattering(pivot, surface, d, next_d, counts & taken)
+            value_next, pdf_next = scattering(pivot, surface, d, next_d, counts & taken)
             _, pdf_light = scattering(pivot, surface, d, light_d, counts)
             next_pdf[counts] += pdf_next * ratio * share
+            all_next[counts] += value_next * (ratio * share)
             light_scatter_pdf[counts] += pdf_light * ratio * share
             k += 1
 
@@ -132,7 +135,8 @@ def continue_paths(scene, lights, traits, summand, pivot, connections, number, s
     spawned = surface.spawn_ray(next_d)
     ray = mi.Ray3f(dr.select(pivot["kind"] == ON_SURFACE, spawned.o, pivot["p"]), next_d, pivot["time"], pivot["wavelengths"])
     medium[goes_on & transition] = surface.target_medium(next_d)
-    strength = dr.select(specular, 1, dr.max(own_next) * per_density)
+    # What the path brings to all views: by what its own would get alone, roulette would kill what others sampled.
+    strength = dr.select(specular, 1, dr.max(all_next) * per_density)
     strength = dr.select(strength > 0, strength, 1)
     arriving = incident_radiance(scene, lights, traits, ray, medium, it, next_pdf, specular, pivot["weight"] * carried, strength, mi.UInt32(1), rng,
                                  max_depth, rr_depth, goes_on)
