@@ -8,11 +8,12 @@ import mitsuba as mi
 import numpy as np
 from hypothesis import strategies as st
 
-unit = st.floats(0.0, 1.0, width=32)
-
-
 def between(low, high):
-    return st.floats(low, high, width=32)
+    """Numbers of single precision, but none of the tiny ones that Mitsuba cannot read."""
+    return st.floats(low, high, width=32, allow_subnormal=False)
+
+
+unit = between(0.0, 1.0)
 
 
 colours = st.tuples(*[between(0.125, 0.875)] * 3).map(lambda rgb: {"type": "rgb", "value": list(rgb)})
