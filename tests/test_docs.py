@@ -70,7 +70,7 @@ def test_commands_of_the_pages_are_understood(module):  # noqa: F811
     assert len(benchmarks) > 12 and len(renders) > 8
     parser = module("run")._parser()
     for arguments in benchmarks:
-        parser.parse_args(["path" if argument == "..." else argument for argument in arguments])
+        parser.parse_args(["path" if argument == "..." else argument.replace("scenes/NAME", str(ROOT / "scenes" / "door")) for argument in arguments])
     for arguments in renders:
         options.parse(arguments if any(argument.endswith(".xml") for argument in arguments) else ["scene.xml", *arguments])
 

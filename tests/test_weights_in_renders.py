@@ -378,7 +378,7 @@ def test_diffuse_surfaces_mix_where_photons_are_few(rgb, radius, mixes):
 
 
 @pytest.mark.parametrize("name, value, allowed", [("strategies", 0, "from 1 to 6"), ("strategies", 2.0, "an integer"),
-                                                  ("weights", "best", '"full" or "local"'), ("first_vertex", -1, "at least 0"),
+                                                  ("weights", "best", '"full" or "local"'), ("first_vertex", -1, "from 0 to 16"),
                                                   ("frozen_photons", -1, "at least 0"), ("bdd", 1, "unknown parameter")])
 def test_bad_parameter(rgb, name, value, allowed):
     with pytest.raises(RuntimeError, match=allowed):
