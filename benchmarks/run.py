@@ -59,7 +59,8 @@ def _parser() -> argparse.ArgumentParser:
     command = _measuring(commands, "page", overview)
     _renders(command, None)
     _compares_with_references(command)
-    command.add_argument("--minutes", type=_positive, default=28, metavar="MINUTES", help="what all should take, if --time is not given (default: 28)")
+    command.set_defaults(seeds=2)
+    command.add_argument("--minutes", type=_positive, default=24, metavar="MINUTES", help="what all should take, if --time is not given (default: 24)")
     command.add_argument("--snapshots", type=int, default=5, metavar="N", help="at times T, T/2, T/4, ... (default: 5)")
     command.add_argument("--varied", nargs="+", type=_method, default=registered(VARIED), metavar="PLUGIN[:...]",
                          help=f"methods of the variance maps (default: {' '.join(method.label for method in registered(VARIED))})")
@@ -251,7 +252,7 @@ def _renders(command: argparse.ArgumentParser, seconds: float | None) -> None:
 
 
 def _compares_with_references(command: argparse.ArgumentParser) -> None:
-    command.add_argument("--seeds", type=int, default=3, help="renders of each method (default: 3)")
+    command.add_argument("--seeds", type=int, default=3, help="renders of each method (default: 3; page: 2)")
     command.add_argument("--scale", type=_positive, default=1, help="film size, scene's own = 1 (default: 1)")
     references.add_options(command)
 

@@ -140,14 +140,19 @@ class Pilot:
         self.samples = {(kind, way): [] for kind, ways in self.ways.items() for way in ways}
         self.direct, self.photons = [], {}
         self._record_camera(session._vertex_room(self.paths) * (1 if session.one_vertex else 4))
-        self._gather = session.recorded(lambda scene, tables, photons, vertices, radii, spectral: {
-            kind: session._gather(session._map(photons, kind, radii[-1]), vertices, kind, radii, spectral, grey=True) for kind in self.ways})
+        self._record_gather()
         self._covered = session.recorded(session._covered)
 
     def _record_camera(self, capacity):
         session, self.capacity = self.session, capacity
         self._camera = session.recorded(lambda scene, sensor, tables, seed, spectral: session._trace_camera(
             scene, sensor, seed, mi.UInt32(0), self.stride, self.paths, capacity, spectral))
+
+    def _record_gather(self):
+        session = self.session
+        self.photon_capacity = session.photon_capacity
+        self._gather = session.recorded(lambda scene, tables, photons, vertices, radii, spectral: {
+            kind: session._gather(session._map(photons, kind, radii[-1]), vertices, kind, radii, spectral, grey=True) for kind in self.ways})
 
     def _trace(self, seed, spectral):
         """Radiance and vertices of the pilot's camera paths. Where the vertices overflow their buffer, it grows and the pass runs again."""
@@ -165,6 +170,8 @@ class Pilot:
         number += PILOT_INDEX
         spectral = session._spectral(number)
         photons = session._photons(number, spectral)
+        if self.photon_capacity != session.photon_capacity:
+            self._record_gather()
         seed = session._seed(number, 1)
         radiance, vertices = self._trace(seed, spectral)
         if self.ladder is None and not self._prepare(photons, vertices):
