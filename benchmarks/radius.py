@@ -100,7 +100,7 @@ def sweep(opened: OpenScene, references: References, bdd: int, times: list[float
 def free_choice(pilot: Contender, maker: SessionMaker) -> Contender:
     """A rendering with the radii that a pilot chose, which needs no pilot of its own."""
     free = Contender.begin(pilot.label, maker.make, seed=0)
-    adopt_choice(free.session, pilot.session)
+    free.session.radii, free.session.corrected = dict(pilot.session.radii), dict(pilot.session.corrected)
     return free
 
 
@@ -108,11 +108,6 @@ def with_set_up(law: ErrorLaw, pilot: Contender) -> ErrorLaw:
     """The law with the set-up that its pilot took: a pilot keeps the iterations by which it has measured time, so that what is left of them after
     the first is no set-up either."""
     return replace(law, set_up=pilot.first - (1 + len(pilot.session.rehearsed)) * law.seconds)
-
-
-def adopt_choice(session, pilot) -> None:
-    """Give a session the radii that another one chose, so that it needs no pilot of its own."""
-    session.radii, session.corrected = dict(pilot.radii), dict(pilot.corrected)
 
 
 def law(contender: Contender, references: References) -> ErrorLaw:

@@ -1,12 +1,16 @@
 """What all tests share."""
 
+import importlib
+import sys
 from collections import Counter
+from pathlib import Path
 
 import mis_integrators  # noqa: F401  before mitsuba: it chooses the LLVM
 
 import mitsuba as mi
 import pytest
 
+BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
 VARIANTS = ("llvm_ad_rgb", "llvm_ad_mono", "llvm_ad_spectral", "cuda_ad_rgb")
 
 
@@ -20,6 +24,17 @@ def variant(request) -> str:
 def rgb() -> str:
     """The variant ``llvm_ad_rgb``, active during the test."""
     return _activate("llvm_ad_rgb")
+
+
+@pytest.fixture
+def module(monkeypatch, rgb):
+    """Imports a module of the benchmarks."""
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    before = set(sys.modules)
+    yield importlib.import_module
+    for name in set(sys.modules) - before:
+        if str(BENCHMARKS) in str(getattr(sys.modules[name], "__file__", "")):
+            del sys.modules[name]
 
 
 def _activate(variant: str) -> str:

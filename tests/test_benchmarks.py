@@ -1,9 +1,7 @@
 """What the benchmarks conclude from figures: breaks, choices, fronts, regressions, styles, pages."""
 
-import importlib
 import json
 import math
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -17,18 +15,7 @@ from mis_integrators.analysis.metrics import References
 from mis_integrators.analysis.stability import Point, breaks, choose, judge
 from mis_integrators.analysis.zooms import telling_windows
 
-BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
-
-
-@pytest.fixture
-def module(monkeypatch, rgb):
-    """Imports a module of the benchmarks."""
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
-    before = set(sys.modules)
-    yield importlib.import_module
-    for name in set(sys.modules) - before:
-        if str(BENCHMARKS) in str(getattr(sys.modules[name], "__file__", "")):
-            del sys.modules[name]
+SCENES = Path(__file__).parent.parent / "scenes"
 
 
 def points(*errors, off=()):
@@ -167,7 +154,7 @@ def test_sweeps_of_views(module):
 
 def test_first_views_of_a_scene(module):
     """Those of a batch, and sensors of their own."""
-    load, folder = module("multiview").load, BENCHMARKS.parent / "scenes" / "multiview"
+    load, folder = module("multiview").load, SCENES / "multiview"
     orbit, parameters = load(folder / "smoke_orbit.xml", 0.25, 3)
     assert tuple(orbit.sensors()[0].film().size()) == (48, 16) and parameters["max_depth"] == 64
     whole, _ = load(folder / "smoke_orbit.xml", 0.25)

@@ -4,10 +4,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from test_radius import FIVE_SIGMA, lost_share
 
 COUNT = 4096
-FIVE_SIGMA = 4.9
-"""Two-sided false-alarm rate 1e-6 for a normal estimate."""
 RADIUS = 0.1
 EDGES = [0.2, 0.4, 0.6, 0.8]
 """Distances of edges, in radii. Between 0.5 and 0.7 probes may end before they meet one: 0.002 are allowed."""
@@ -27,13 +26,8 @@ def share_at(scene, x, height=0.5):
     return np.array(covered_share(scene, vertices, dr.opaque(mi.Float, RADIUS), dr.opaque(mi.UInt32, 7), mi.Bool(True)))
 
 
-def left_of(u):
-    """Share of a disk's area on its side of a straight edge u radii from its centre."""
-    return 1 - (np.arccos(u) - u * np.sqrt(1 - u * u)) / np.pi
-
-
-def mean_is(shares, expected):
-    assert abs(shares.mean() - expected) < FIVE_SIGMA * shares.std() / np.sqrt(COUNT) + 0.002
+def lacks(shares, expected):
+    assert abs(1 - shares.mean() - expected) < FIVE_SIGMA * shares.std() / np.sqrt(COUNT) + 0.002
 
 
 def test_whole_disks_are_covered(rgb):
@@ -42,14 +36,14 @@ def test_whole_disks_are_covered(rgb):
 
 @pytest.mark.parametrize("u", EDGES)
 def test_where_the_floor_ends(rgb, u):
-    mean_is(share_at(scene_with(), 1 - u * RADIUS), left_of(u))
+    lacks(share_at(scene_with(), 1 - u * RADIUS), lost_share(u))
 
 
 @pytest.mark.parametrize("u", EDGES)
 def test_in_front_of_a_wall(rgb, u):
     """The floor goes on behind the wall, but no photon of this side lands there."""
     place = mi.ScalarTransform4f().translate([u * RADIUS, 0, 0]).rotate([0, 1, 0], -90)
-    mean_is(share_at(scene_with(wall={"type": "rectangle", "to_world": place}), 0.0), left_of(u))
+    lacks(share_at(scene_with(wall={"type": "rectangle", "to_world": place}), 0.0), lost_share(u))
 
 
 def test_in_a_corner(rgb):

@@ -12,7 +12,6 @@ import mitsuba as mi
 import pytest
 
 from mis_integrators import _plugins, options
-from test_benchmarks import module  # noqa: F401  (a fixture)
 
 ROOT = Path(__file__).parent.parent
 PAGES = sorted((ROOT / "docs").glob("*.md"))
@@ -71,7 +70,7 @@ def named(argument: str) -> str:
     return "path" if argument == "..." else argument
 
 
-def test_commands_of_the_pages_are_understood(module):  # noqa: F811
+def test_commands_of_the_pages_are_understood(module):
     """Every option is one that there is, with a value that it takes; nothing is run."""
     benchmarks, renders = commands(r"python benchmarks/run\.py"), commands("mis-render")
     assert len(benchmarks) > 12 and len(renders) > 8

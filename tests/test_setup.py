@@ -13,6 +13,7 @@ import mitsuba as mi
 import pytest
 
 from mis_integrators import _plugins, llvm
+from mis_integrators.llvm import library_directories
 
 ROOT = Path(__file__).parent.parent
 MULTIARCH = sysconfig.get_config_var("MULTIARCH") or "lib"
@@ -143,7 +144,7 @@ def test_llvm_that_aborts_is_refused(order):
     """With a library that Dr.Jit would accept, and that would abort the process."""
     aborting = [
         file
-        for file in llvm.libraries_in(llvm.library_directories({}))
+        for file in llvm.libraries_in(library_directories({}))
         if (llvm.version_of(file) or (0,))[0] in (15, 16)
     ]
     if not aborting:

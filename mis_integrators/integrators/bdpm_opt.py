@@ -128,22 +128,23 @@ class BDPMOptSession(WeightedSession):
 
     def mixes(self):
         if self.undecided and self.integrator.strategies > 1:
-            self._learn(self._spectral(0))
+            self._learn()
             photons = self.light_paths * math.pi * max(self.radii.values()) ** 2 * self.cache.mean / max(self.cache.typical_flux, 1e-30)
             self.mix_diffuse, self.undecided = photons < FEW_PHOTONS, False
         if not (self.traits.has_rough or self.mix_diffuse):
             return False
-        if self.cache is None:
-            self._learn(self._spectral(0))
+        self._learn()
         return dr.width(self.cache.center) > 0           # where light meets nothing there is nothing to learn, nor to mix
 
     def prepare(self, spectral):
         if self.integrator.weights == "full":
             self.surroundings = Surroundings(self.scene, self.weights({"n": mi.Spectrum(0), "caustic_cost": mi.Float(0)}), spectral["wavelengths"])
 
-    def _learn(self, spectral):
-        """One dense light pass, frozen: for the weights only."""
-        integrator = self.integrator
+    def _learn(self):
+        """One dense light pass, frozen, the first time that it is asked for: for the weights only."""
+        if self.cache is not None:
+            return
+        integrator, spectral = self.integrator, self._spectral(0)
         paths = integrator.frozen_photons or USUAL_FROZEN_PATHS
         capacity, found = 0, PHOTONS_A_PATH * paths
         while found > capacity:

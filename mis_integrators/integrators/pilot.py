@@ -12,7 +12,7 @@ import numpy as np
 
 from ..transport.camera_pass import film_sample_count
 from ..transport.gather import mean_photon_count
-from ..transport.radius import LARGEST_SHARE, Choice, best_radius, ladder, relative_weights, usual_mean
+from ..transport.radius import LARGEST_SHARE, best_radius, ladder, middling, relative_weights, usual_mean
 from ..transport.spectra import channel_mean
 
 PILOT_PIXELS = 4096
@@ -243,7 +243,7 @@ class Pilot:
             session.radii = {kind: 1e-3 * float(dr.norm(session.traits.bounds.extents())) for kind in self.ways}
             return {}
         samples, mean = {key: np.array(values) for key, values in self.samples.items()}, self.mean()
-        choices = {kind: Choice(float(self.ladder[len(self.ladder) * 2 // 3]), False, 0.0, 0.0) if not np.any(samples[kind, False]) else best_radius(
+        choices = {kind: best_radius(
             self.ladder, samples[kind, False], samples.get((kind, True)), mean,
             lambda radius, corrected, kind=kind: np.maximum(count / self._cost(kind, corrected, radius), 1), self.at_first_vertex,
             kind == "caustic", None if reluctance is None else (session.radii[kind], session.corrected[kind]), reluctance or 0.0)
@@ -260,4 +260,4 @@ class Pilot:
 
     def middling(self, kind):
         """What photons of a kind bring at a middling radius: (iterations, pixels)."""
-        return [step[len(self.ladder) * 2 // 3] for step in self.samples[kind, False]]
+        return [step[middling(self.ladder)] for step in self.samples[kind, False]]

@@ -184,9 +184,9 @@ class Lights:
             self._sphere_center = from_numpy(mi.Float, np.ravel(centers))
             self._sphere_sign = mi.Float(signs)
 
-    def _area(self, emitter, active):
-        """Surface area of an area light."""
-        return dr.gather(mi.Float, self._surface_area, lookup(self.numbers, emitter, mi.UInt32, active), active)
+    def _area(self, index, active):
+        """Surface area of area light `index`."""
+        return dr.gather(mi.Float, self._surface_area, index, active)
 
     def _sample_surface(self, index, time, sample, active):
         """A uniformly distributed point on area light `index`. Mitsuba's sampling of a rotated sphere forgets to rotate the normal.
@@ -274,7 +274,7 @@ class Lights:
         pdf = emitter.pdf_direction(ref, ds, active)
         if self.has_textured:
             textured = active & self._textured_mask(emitter)
-            by_area = dr.square(ds.dist) / (dr.abs_dot(ds.d, ds.n) * self._area(emitter, textured))
+            by_area = dr.square(ds.dist) / (dr.abs_dot(ds.d, ds.n) * self._area(lookup(self.numbers, emitter, mi.UInt32, textured), textured))
             pdf = dr.select(textured, dr.select(dr.dot(ds.d, ds.n) < 0, by_area, 0), pdf)
         return pdf
 
@@ -356,7 +356,7 @@ class Lights:
         density = mi.Float(1)
         if "area" in self.kinds or "directionalarea" in self.kinds:
             on_surface = active & self._of_kind(index, "area", "directionalarea", active=active)
-            area = dr.select(on_surface, dr.gather(mi.Float, self._surface_area, index, on_surface), 1)
+            area = dr.select(on_surface, self._area(index, on_surface), 1)
             cosine = dr.maximum(-dr.dot(ds.d, ds.n), 1e-6)
             density = dr.select(on_surface, dr.square(ds.dist) * dr.rcp(area * cosine), density)
         if "environment" in self.kinds:
@@ -446,7 +446,7 @@ class Lights:
         return dr.select(own_pdf > 0, density * dr.rcp(own_pdf), 0)
 
     def _ratio_area(self, ref, ds, index, active):
-        pdf = self._pdf_of_emitter(ref, ds, active) * (dr.pi * dr.gather(mi.Float, self._surface_area, index, active))
+        pdf = self._pdf_of_emitter(ref, ds, active) * (dr.pi * self._area(index, active))
         return dr.select(pdf > 0, dr.rcp(pdf), 0)
 
     def _ratio_ray(self, ref, ds, index, active):

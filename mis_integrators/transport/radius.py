@@ -45,6 +45,11 @@ def ladder(points, weights):
     return max(spread, 1e-6) * LARGEST_SHARE * STEP ** -np.arange(LADDER_STEPS - 1, -1, -1.0)
 
 
+def middling(radii):
+    """The place of a middling radius of the ladder: little blur, little noise."""
+    return len(radii) * 2 // 3
+
+
 def relative_weights(mean):
     """Weights 1 / (mean^2 + 0.1 <mean>^2) of squared errors: relative error, without letting dark pixels rule. The overall mean <mean>
     leaves out the brightest twentieth (visible lamps)."""
@@ -173,8 +178,10 @@ def best_radius(radii, plain, corrected, mean, iterations, at_first_vertex=True,
 
     `radii`: the ladder; `plain`, `at_first_vertex`, `alike`: see `noise_and_difference`; `corrected`: the same samples corrected at edges, or `None`;
     `mean`: (pixels,) mean radiance; `iterations(R, corrected)`: how many iterations there will be, so that larger gathers and the correction are
-    charged for.
+    charged for. Where no photon was met, nothing speaks for any radius, and it is a middling one.
     """
+    if not np.any(plain):
+        return Choice(float(radii[middling(radii)]), False, 0.0, 0.0)
     weights = relative_weights(mean)
     fine = np.exp(np.linspace(np.log(radii[0]), np.log(radii[-1]), 16 * len(radii)))
     ways, best = {False: (plain, 0.0)}, plain
