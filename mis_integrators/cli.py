@@ -145,12 +145,12 @@ def _render(
 ) -> Path | None:
     """Iterate as long as the options say; returns the checkpoint that holds all of it, if there is one."""
     width, height = sensor.film().crop_size()
-    paths = getattr(session, "pixels", width * height) * session.samples_per_iteration
+    pixels = getattr(session, "pixels", width * height)
     if options.time and hasattr(session, "plan_time"):
         session.plan_time(options.time)
     planned = None if options.time else session.iterations_planned
     with (
-        Progress(paths, planned, options.time, options.quiet) as progress,
+        Progress(lambda: pixels * session.samples_per_iteration, planned, options.time, options.quiet) as progress,
         dr.scoped_set_flag(dr.JitFlag.KernelHistory),
     ):
         asked = options.spp or sensor.sampler().sample_count()

@@ -2,6 +2,7 @@
 
 import sys
 import time
+from collections.abc import Callable
 
 import rich.console
 import rich.progress
@@ -12,11 +13,11 @@ SECONDS_BETWEEN_LINES = 5.0
 class Progress:
     """Progress on standard error as a context: iterations, camera paths a second, time left.
 
-    ``paths`` are the camera paths of one iteration. ``planned`` iterations or ``seconds`` of rendering,
+    ``paths`` tells the camera paths of one iteration, which the first one may decide. ``planned`` iterations or ``seconds`` of rendering,
     whichever is given, are the whole; with neither, only what ``update`` is told. Nothing is shown if ``quiet``.
     """
 
-    def __init__(self, paths: int, planned: int | None, seconds: float | None, quiet: bool):
+    def __init__(self, paths: Callable[[], int], planned: int | None, seconds: float | None, quiet: bool):
         self._paths, self._planned, self._seconds, self._quiet = paths, planned, seconds, quiet
         self._last_line = time.monotonic()
         self._console = rich.console.Console(file=sys.stderr, quiet=quiet, highlight=False)
@@ -50,7 +51,7 @@ class Progress:
             rendering / self._seconds if self._seconds else 0.0, iterations / self._planned if self._planned else 0.0, share or 0.0
         )
         left = f"{_duration(max(0.0, rendering / done - rendering))} left" if done else "time left unknown"
-        speed = iterations * self._paths / max(rendering, 1e-9) / 1e6
+        speed = iterations * self._paths() / max(rendering, 1e-9) / 1e6
         of = "" if self._seconds or not self._planned else f"/{self._planned}"
         text = f"iteration {iterations}{of}, {speed:.2f} M samples/s, {left}"
         self._bar.update(self._task, completed=min(done, 1.0), description=text)

@@ -151,6 +151,24 @@ def test_a_short_render_does_not_spend_its_time_on_trials(rgb, seconds, tried):
     assert "bdpm bdd=0" in session.decision.errors
 
 
+def test_camera_paths_of_the_chosen_are_its_own(rgb, monkeypatch):
+    """Those that its pilot found worth while, which make an iteration dearer by what they cost."""
+    def three(pilot, *_):
+        pilot.camera_paths = 3
+        pilot.session.send(3)
+        return 0.0
+    monkeypatch.setattr("mis_integrators.integrators.pilot.choose_camera_paths", three)
+    session = auto().session(caustic_scene("point"))
+    session.plan_time(1000.0)
+    session.iterate()
+    assert session.samples_per_iteration == session.settings["camera_paths"] == session.decision.session.samples_per_iteration == 3
+    trial = session.decision.trials[0]
+    assert 1.5 < trial.cost / costs.cost(trial.plugin, costs.events(trial.session, [1.0] * 5, 0, session.decision.session.forecast.gathered))
+    other = auto().session(caustic_scene("point"))
+    other.recall(json.loads(json.dumps(session.learned)))
+    assert other.samples_per_iteration == 3
+
+
 def test_prediction_is_checked(rgb):
     """The error that is predicted for `path` is what independent renders have: within a factor of two, the pilot's pixels being few."""
     scene = tray("lambertian", "rectangle")

@@ -8,7 +8,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mis_integrators.integrators.pilot import Pilot
+from mis_integrators.integrators.pilot import Pilot, choose_camera_paths
+from mis_integrators.transport.radius import relative_weights, usual_mean
 from comparing import (Estimate, PathBatches, SessionBatches, agree, assert_same, block_means, collect_until, differences, extrapolate,
                        kernels_of, pictures, smallest_visible)
 from worlds import T, bdpm, diffuse, film, grey, look, path, sensor, tray
@@ -122,7 +123,7 @@ def test_same_seed_same_edges(rgb):
     images = []
     for _ in range(2):
         session = bdpm(bdd=0, initial_radius=0.0, photon_count=3000).session(glossy_box(size=128), seed=5)
-        session.recall({"radii": dict.fromkeys(session.kinds(), 0.3), "corrected": {"caustic": False, "indirect": True}})
+        session.recall({"radii": dict.fromkeys(session.kinds(), 0.3), "corrected": {"caustic": False, "indirect": True}, "camera_paths": 1})
         session.iterate()
         images.append(session.image())
     np.testing.assert_allclose(*images, rtol=1e-4, atol=1e-6)
@@ -518,10 +519,88 @@ def test_rare_photons_get_no_smallest_radius(rgb):
     scene = box_scene(16)
     session = bdpm(bdd=0, photon_count=1, initial_radius=0.0).session(scene, seed=1, spp=4)
     pilot = Pilot(session)
-    pilot.ladder, pilot.photons, pilot.direct = np.array([0.01 * 2 ** i for i in range(7)]), {"indirect": 0.0}, [np.ones(16)] * 4
-    pilot.samples = {key: [np.zeros((7, 16))] * 4 for key in pilot.samples}
+    pilot.ladder, pilot.photons, pilot.direct = np.array([0.01 * 2 ** i for i in range(7)]), {"indirect": 0.0}, [np.ones((1, 256))] * 4
+    pilot.samples = {key: [np.zeros((7, 1, 256))] * 4 for key in pilot.samples}
     pilot.decide(100)
     assert session.radii["indirect"] == pytest.approx(0.16)
+
+
+# --- Camera paths of an iteration ------------------------------------------------------------------------
+
+
+def made_up_pilot(scene, direct_noise, shared=True):
+    """A pilot of three iterations over a constant image: photons make half of it, with a noise that falls with the radius and that the camera paths of a
+    pixel have in common if it is `shared`; `direct_noise` is that of the other half, relative to the image."""
+    session = bdpm(bdd=0, camera_paths=0, photon_count=3000, initial_radius=0.0).session(scene, seed=1)
+    session.plan_time(1000.0)
+    pilot, rng = Pilot(session), np.random.default_rng(5)
+    shape = pilot.copies, pilot.pixels
+    pilot.ladder, pilot.photons = 0.1 * 2.0 ** -np.arange(6, -1, -1.0), {"indirect": 10.0}
+    pilot.direct = [0.5 + direct_noise * rng.normal(size=shape) for _ in range(3)]
+    photons = [0.5 + 0.05 * rng.normal(size=(7, 1 if shared else pilot.copies, pilot.pixels)) * (0.1 / pilot.ladder)[:, None, None] for _ in range(3)]
+    pilot.samples = {key: [np.broadcast_to(values, (7, *shape)) for values in photons] for key in pilot.samples}
+    pilot.decide(100)
+    return pilot
+
+
+@pytest.mark.parametrize("direct_noise, cost, expected", [(1.0, 0.15, {4, 8}), (1.0, 0.9, {2}), (0.3, 0.3, {2, 4}), (0.02, 0.15, {1})])
+def test_camera_paths_follow_noise_and_cost(rgb, monkeypatch, direct_noise, cost, expected):
+    """Several where camera paths make most of the noise and little of the cost; where they make little of the noise, two are not even tried."""
+    pilot, tried = made_up_pilot(box_scene(), direct_noise), []
+
+    def rehearse(session, guess, left):
+        tried.append(session.samples_per_iteration)
+        return 1 + cost, 1 + cost
+    monkeypatch.setattr("mis_integrators.integrators.pilot.rehearse", rehearse)
+    choose_camera_paths(pilot, 1.0, 200, 200)
+    assert pilot.camera_paths == pilot.session.samples_per_iteration and pilot.camera_paths in expected
+    assert tried == ([2] if expected != {1} else [])
+
+
+@pytest.mark.parametrize("shared", [True, False])
+def test_camera_paths_average_their_own_noise_only(rgb, shared):
+    """Of what photons bring, too, where it differs between the camera paths of a pixel (5 % of noise in the estimate)."""
+    pilot = made_up_pilot(box_scene(), 0.0, shared)
+    found = []
+    for camera_paths in (1, 2, 8):
+        choice = pilot._best_radii(camera_paths, 100)["indirect"]
+        found.append(choice.variance * choice.radius ** 2 * (1 if shared else camera_paths))
+    assert found[1:] == pytest.approx([found[0]] * 2, rel=0.25)
+
+
+@pytest.mark.parametrize("camera_paths", [2, 8])
+@pytest.mark.parametrize("plugin, given", [("bdpm", {"bdd": 0}), ("bdpm", {"bdd": 1}), ("bdpm_opt2", {})], ids=["bdd0", "bdd1", "opt2"])
+def test_noise_of_several_camera_paths_is_foreseen(rgb, plugin, given, camera_paths):
+    """The pilot's two camera paths a pixel say what an iteration of more, or fewer, of them will have: within a factor 1.3 of twelve renders."""
+    session = mi.load_dict({"type": plugin, "max_depth": 4, "photon_count": 20000, "camera_paths": camera_paths, **given}).session(
+        glossy_box(size=48), spp=16 * camera_paths)
+    session.keep_variance()
+    for _ in range(12):
+        session.iterate()
+    mean, variance = session.estimate()
+    measured = relative_weights(mean.mean(axis=-1).ravel()) * 12 * variance.mean(axis=-1).ravel()
+    assert 1 / 1.3 < session.forecast.variance / usual_mean(measured) < 1.3
+
+
+def test_a_timed_render_chooses_its_camera_paths(rgb, monkeypatch):
+    """What is chosen is rendered with, said, and rendered with again by whoever is told."""
+    monkeypatch.setattr("mis_integrators.integrators.pilot.choose_camera_paths", lambda pilot, *_: (
+        setattr(pilot, "camera_paths", 4), pilot.session.send(4), 0.0)[-1])
+    scene = glossy_box()
+    timed = bdpm(bdd=0, camera_paths=0, photon_count=3000, initial_radius=0.0).session(scene, seed=4)
+    timed.plan_time(1000.0)
+    for _ in range(3):
+        timed.iterate()
+    assert timed.settings["camera_paths"] == timed.samples_per_iteration == 4
+    for camera_paths in (0, 4):
+        same = bdpm(bdd=0, camera_paths=camera_paths, photon_count=3000, initial_radius=0.0).session(scene, seed=4)
+        same.recall(timed.learned)
+        for _ in range(3):
+            same.iterate()
+        np.testing.assert_allclose(timed.image(), same.image(), rtol=1e-4, atol=1e-5)
+    counted = bdpm(camera_paths=0, photon_count=3000, initial_radius=0.0).session(scene, spp=4)
+    counted.iterate()
+    assert (counted.iterations_planned, counted.settings["camera_paths"]) == (4, 1)
 
 
 # --- Errors ---------------------------------------------------------------------------------------------------------------
@@ -535,7 +614,7 @@ def test_rare_photons_get_no_smallest_radius(rgb):
     ("initial_radius", -0.1, "from 1e-15 to"), ("initial_radius", float("inf"), "from 1e-15 to"), ("initial_radius", float("nan"), "from 1e-15 to"),
     ("initial_radius", 1e-40, "from 1e-15 to"), ("bdd", 10 ** 12, "at most 2147483647"), ("photon_count", 2 ** 30, "at most 268435456"),
     ("initial_radius", "big", "number"), ("alpha", 0.0, "(0, 1]"), ("alpha", 1.1, "(0, 1]"), ("alpha", -1.0, "(0, 1]"),
-    ("camera_paths", 0, "at least 1"), ("camera_paths", 1.5, "integer"), ("camera_paths", True, "integer"),
+    ("camera_paths", -1, "at least 0"), ("camera_paths", 1.5, "integer"), ("camera_paths", True, "integer"),
     ("variance", 1, "true or false"), ("bdd", -1, "at least 0"), ("bdd", 1.5, "integer"), ("bdd", True, "integer"),
     ("samples_per_pass", 4, "camera_paths"), ("timeout", 3.0, "--time"), ("block_size", 32, "film"),
     ("radius", 0.1, "initial_radius"), ("strategies", 3, "bdd"),

@@ -83,7 +83,8 @@ def test_workers_are_told_what_a_pilot_found(scene, client):
     """With a time limit it hangs on the clock: a worker that had a pilot of its own would merge within another radius."""
     request = request_for(scene, "bdpm", 8, bdd=0)
     opened = request.open()
-    told = {"radii": {kind: 0.31 for kind in opened.session.kinds()}, "corrected": {kind: False for kind in opened.session.kinds()}}
+    told = {"radii": {kind: 0.31 for kind in opened.session.kinds()}, "corrected": {kind: False for kind in opened.session.kinds()},
+            "camera_paths": 2}
     identity = opened.identity()
     opened.session.recall(told)
     opened.session.iterate(2)

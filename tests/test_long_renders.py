@@ -143,7 +143,8 @@ def test_learned_radii_are_not_learned_again(scene):
     """With a time limit the pilot hangs on the clock, so a resumed render must not have another."""
     loaded = loading.load(scene, {"size": "16"}, "bdpm", {"bdd": 0})
     session = make_session(loaded.integrator, loaded.scene, loaded.scene.sensors()[0], 3, 0)
-    learned = {"radii": {kind: 0.123 for kind in session.kinds()}, "corrected": {kind: False for kind in session.kinds()}}
+    learned = {"radii": {kind: 0.123 for kind in session.kinds()}, "corrected": {kind: False for kind in session.kinds()},
+               "camera_paths": 2}
     session.recall(learned)
     session.plan_time(5.0)
     session.iterate()

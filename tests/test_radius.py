@@ -157,6 +157,30 @@ def test_noise_of_small_disks_is_what_large_ones_saw():
     assert radius.noise_of_photons(radii, seen, 0.0, alike=True) == pytest.approx([0.0, 4.0, 1.0])
 
 
+def test_steadied_means_do_not_know_their_own_noise():
+    """Noise is relative to the mean that there is, not to that which the same few samples happened to have. 0.15 is seven standard deviations of
+    the ratio."""
+    rng, cells = np.random.default_rng(3), np.arange(PIXELS) // 16
+    truth = np.exp(rng.normal(size=PIXELS // 16))[cells]
+    samples = truth * rng.exponential(size=(3, PIXELS))
+
+    def noise(mean):
+        return np.mean(radius.relative_weights(mean) * samples.var(axis=0, ddof=1))
+    assert noise(samples.mean(axis=0)) < 0.8 * noise(truth)
+    assert noise(radius.steadied(samples, cells)) == pytest.approx(noise(truth), rel=0.15)
+
+
+def test_steadied_means_keep_what_is_real():
+    rng, cells = np.random.default_rng(4), np.arange(PIXELS) // 16
+    truth = np.exp(rng.normal(size=PIXELS))
+    np.testing.assert_allclose(radius.steadied(np.array([truth] * 3), cells), truth)
+    noisy = truth * rng.normal(1, 0.1, size=(3, PIXELS))
+    weights, plain, right = (radius.relative_weights(mean) for mean in (radius.steadied(noisy, cells), noisy.mean(axis=0), truth))
+    assert np.std(weights / right) < 1.1 * np.std(plain / right) < 0.2
+    assert radius.steadied(noisy, cells).sum() == pytest.approx(noisy.mean(axis=0).sum())
+    np.testing.assert_array_equal(radius.steadied(noisy[:1], cells), noisy[0])
+
+
 def test_ladder_needs_vertices():
     assert radius.ladder(np.zeros((3, 5)), np.zeros(5)) is None
     points = np.random.default_rng(0).uniform(size=(3, 1000))

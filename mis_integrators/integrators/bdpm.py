@@ -54,7 +54,8 @@ class BDPM(IterativeIntegrator):
          radius. (Default: 1)
      * - camera_paths
        - |int|
-       - Camera paths per pixel and iteration. (Default: 1)
+       - Camera paths per pixel and iteration. 0 stands for one; in a render of a given time whose radius is automatic, for as many
+         of 1, 2, 4 and 8 as make the least error. (Default: 0)
      * - variance
        - |bool|
        - Adds the channels ``var.R``, ``var.G``, ``var.B`` (mono: ``var.Y``): the estimated variance of the pixel mean over the
@@ -92,6 +93,8 @@ class BDPM(IterativeIntegrator):
             'bdd': 0,
             'max_depth': 10
     """
+
+    CAMERA_PATHS = 0, 0, "at least 0 (0: automatic)"
 
     survey = None
     """Traits and lights of the scene, where another session knows them already."""
@@ -158,6 +161,14 @@ class BDPMSession(IterativeSession):
         """Photon maps that the scene needs."""
         return [kind for kind, needed in (("caustic", self.has_caustics), ("indirect", self.has_indirect)) if needed]
 
+    def send(self, camera_paths):
+        """Sends so many camera paths through each pixel from the next iteration on."""
+        self.samples_per_iteration = camera_paths
+        self.rehearsed.clear()
+        self.split_paths(CAMERA_CHUNK)
+        self.vertex_capacity = self._vertex_room(self.chunk)
+        self._camera_pass = self.recorded(self._render_chunk)
+
     def radii_at(self, iteration):
         """Merge radius of each kind of photon."""
         return {kind: dr.opaque(mi.Float, shrunk(radius, self.integrator.alpha, iteration)) for kind, radius in self.radii.items()}
@@ -181,10 +192,11 @@ class BDPMSession(IterativeSession):
                                  spectral["wavelengths"], sensor.shutter_open(), sensor.shutter_open_time(),
                                  self.integrator.max_depth, self.integrator.rr_depth)
 
-    def _trace_camera(self, scene, sensor, seed, first, stride, paths, capacity, spectral):
+    def _trace_camera(self, scene, sensor, seed, first, stride, paths, together, capacity, spectral):
+        """Traces `paths` camera paths, those with numbers `first`, `first + stride`, ..., of which each pixel has so many `together`."""
         integrator = self.integrator
         return trace_camera_paths(scene, sensor, integrator, self.lights, self.traits, seed, first, stride, paths,
-                                  integrator.camera_paths, spectral["sample"], integrator.bdd, integrator.max_depth,
+                                  together, spectral["sample"], integrator.bdd, integrator.max_depth,
                                   integrator.rr_depth, integrator.hide_emitters, capacity, self.has_caustics, self.has_indirect,
                                   self.one_vertex)
 
@@ -223,7 +235,7 @@ class BDPMSession(IterativeSession):
 
     def _render_chunk(self, scene, sensor, tables, maps, seed, first, spectral, radii):
         radiance, alpha, position, vertices, count = self._trace_camera(scene, sensor, seed, first, 1, self.chunk,
-                                                                        self.vertex_capacity, spectral)
+                                                                        self.samples_per_iteration, self.vertex_capacity, spectral)
         if radii:
             dr.eval(radiance, alpha, position, vertices, count)
         for kind, radius in radii.items():
@@ -271,12 +283,13 @@ class BDPMSession(IterativeSession):
         if self.radii is None:
             return {}
         return {"radii": {kind: float(radius) for kind, radius in self.radii.items()},
-                "corrected": {kind: bool(flag) for kind, flag in self.corrected.items()}}
+                "corrected": {kind: bool(flag) for kind, flag in self.corrected.items()},
+                "camera_paths": self.samples_per_iteration}
 
     def recall(self, learned):
         if learned:
             self.radii, self.corrected = dict(learned["radii"]), dict(learned["corrected"])
-            self._freeze()
+            self.send(learned["camera_paths"])
 
     def _iteration(self, iteration):
         self.start()

@@ -6,6 +6,7 @@ import mitsuba as mi
 
 from ..transport.traits import check_scene, has_media
 from ..volume.traits import check_volume_scene
+from .bdpm import BDPM
 from .choice import Decision, choose, handed_on, new_session
 from .common import IterativeIntegrator, IterativeSession
 
@@ -42,6 +43,8 @@ class BDPMAuto(IterativeIntegrator):
             'type': 'bdpm_auto'
     """
 
+    CAMERA_PATHS = BDPM.CAMERA_PATHS
+
     def check(self, scene, sensor):
         if has_media(scene):
             check_volume_scene(scene, self.plugin)
@@ -51,7 +54,7 @@ class BDPMAuto(IterativeIntegrator):
     def new_session(self, scene, sensor, seed, iterations):
         if has_media(scene):
             volumetric = mi.load_dict({"type": "volpath_multiview", **handed_on(self)})
-            return volumetric.session(scene, sensor, seed, (iterations or 0) * self.camera_paths)
+            return volumetric.session(scene, sensor, seed, (iterations or 0) * (self.camera_paths or 1))
         return AutoSession(self, scene, sensor, seed, iterations)
 
 
@@ -82,7 +85,10 @@ class AutoSession(IterativeSession):
 
     def start(self):
         if self.decision is None:
-            self.decision = choose(self.integrator, self.scene, self.sensor, self.seed, self.iterations_planned, self.seconds)
+            self._take(choose(self.integrator, self.scene, self.sensor, self.seed, self.iterations_planned, self.seconds))
+
+    def _take(self, decision):
+        self.decision, self.samples_per_iteration = decision, decision.session.samples_per_iteration
 
     @property
     def learned(self):
@@ -97,7 +103,7 @@ class AutoSession(IterativeSession):
             session = new_session(learned["plugin"], learned["parameters"], self.integrator, self.scene, self.sensor, self.seed,
                                   self.iterations_planned)
             session.recall(learned["session"])
-            self.decision = Decision(learned["plugin"], learned["parameters"], session, learned["reasons"], learned["errors"])
+            self._take(Decision(learned["plugin"], learned["parameters"], session, learned["reasons"], learned["errors"]))
 
     def _iteration(self, iteration):
         self.start()

@@ -164,7 +164,7 @@ class BDPMOptSession(WeightedSession):
     def weights(self, merging):
         integrator = self.integrator
         return OptimalWeights(self.lights, self.traits, self.cache, self.surroundings, merging["n"], merging["caustic_cost"],
-                              integrator.strategies, integrator.first_vertex, integrator.camera_paths, integrator.weights == "full",
+                              integrator.strategies, integrator.first_vertex, self.samples_per_iteration, integrator.weights == "full",
                               self.mix_diffuse)
 
     def merging(self, radii):

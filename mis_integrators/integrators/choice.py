@@ -89,18 +89,18 @@ def choose(integrator, scene, sensor, seed, iterations, seconds):
     first = new_session(plugin, parameters, integrator, scene, sensor, seed, iterations)
     if not first.kinds():
         return Decision("path", {}, path, [_no_photons(integrator, first)])
-    first.seconds = seconds
+    first.seconds, first.begun = seconds, began
     first.start()
     forecast = first.forecast
     if forecast is None:
         return Decision("path", {}, path, ["path: no camera path meets a surface that scatters smoothly"])
     first_seconds = time.perf_counter() - began
 
-    stride, pixels = pilot_pixels(path)
-    segments = mean_segments(scene, sensor, seed, stride * integrator.camera_paths, pixels, integrator.max_depth, integrator.rr_depth)
-    usual = costs.cost(plugin, costs.events(first, segments, first.last_vertex, forecast.gathered))
-    budget = (forecast.count if seconds else iterations or UNPLANNED_ITERATIONS) * usual
+    stride, pixels, _ = pilot_pixels(first)
+    segments = mean_segments(scene, sensor, seed, stride, pixels, integrator.max_depth, integrator.rr_depth)
     trials, reasons, spent = [_trial(plugin, parameters, first, segments)], [], _pilot_cost(first, segments)
+    usual = trials[0].cost
+    budget = (forecast.count if seconds else iterations or UNPLANNED_ITERATIONS) * usual
     blind = _why_not_path(first, forecast)
     if blind:
         reasons.append(blind)
@@ -122,7 +122,7 @@ def choose(integrator, scene, sensor, seed, iterations, seconds):
             reasons.append(f"not {name}: trying it would take more than {PILOT_SHARE:.0%} of the time")
             continue
         session = new_session(plugin, parameters, integrator, scene, sensor, seed, max(int(budget / usual), 1), (first.traits, first.lights))
-        session.judged_by = forecast.mean
+        session.judged_by, session.seconds, session.begun = forecast.mean, seconds, began
         session.start()
         if session.forecast is None:
             continue
@@ -169,7 +169,7 @@ def _why_not_path(session, forecast):
 def _trial(plugin, parameters, session, segments):
     forecast = session.forecast
     counted = costs.events(session, segments, session.last_vertex, forecast.gathered)
-    return Trial(plugin, parameters, session, forecast.squared_bias, forecast.variance, costs.cost(plugin, counted))
+    return Trial(plugin, parameters, session, forecast.squared_bias, forecast.variance, costs.cost(plugin, counted) * forecast.cost_of_paths)
 
 
 def _pilot_cost(session, segments):
@@ -192,7 +192,7 @@ def _try_path(path, segments, stride, pixels, mean):
         values += list(np.broadcast_to(np.array(channel_mean(radiance)), together * pixels).reshape(together, pixels))
     path.sampler.seed(0, 1)
     variance = usual_mean(relative_weights(mean) * np.var(values, axis=0, ddof=1))
-    return Trial("path", {}, path, 0.0, variance, costs.cost("path", costs.events(path, segments, None, 0.0)))
+    return Trial("path", {}, path, 0.0, variance, costs.cost("path", costs.events(path, segments, None, 0.0)) * path.samples_per_iteration)
 
 
 def _worse(trials, budget):

@@ -31,7 +31,7 @@ class IterativeIntegrator(mi.AdjointIntegrator):
     """
 
     CAMERA_PATHS = 1, 1, "at least 1"
-    """Default, least value and range in words of the parameter `camera_paths`."""
+    """Default, least value and range in words of the parameter `camera_paths`; 0 stands for as many as the session finds worth while."""
 
     def __init__(self, props):
         parameters = Parameters(props)
@@ -73,7 +73,7 @@ class IterativeIntegrator(mi.AdjointIntegrator):
         sensor = self._sensor(scene, sensor)
         self.check(scene, sensor)
         self.check_path_number([sensor])
-        return self.new_session(scene, sensor, scalar_seed(seed), self.planned_iterations(spp, self.camera_paths))
+        return self.new_session(scene, sensor, scalar_seed(seed), self.planned_iterations(spp, self.camera_paths or 1))
 
     def check_path_number(self, sensors):
         """Raises `ValueError` where an iteration would have more camera paths than can be numbered."""
@@ -142,7 +142,7 @@ class IterativeSession:
     def __init__(self, integrator, scene, sensor, seed, iterations):
         self.integrator, self.scene, self.sensor, self.seed = integrator, scene, sensor, seed
         self.iterations_planned = iterations
-        self.samples_per_iteration = integrator.camera_paths
+        self.samples_per_iteration = integrator.camera_paths or 1
         self.accumulator = Accumulator(integrator.variance)
         self.variant = mi.variant()
         settle(scene)
@@ -184,7 +184,7 @@ class IterativeSession:
     @property
     def settings(self):
         """Names and values that reproduce the image, together with the scene."""
-        return {"integrator": self.integrator.plugin, **self.integrator.settings(), "seed": self.seed}
+        return {"integrator": self.integrator.plugin, **self.integrator.settings(), "camera_paths": self.samples_per_iteration, "seed": self.seed}
 
     @by_turns
     def iterate(self, iteration=None):
@@ -208,7 +208,7 @@ class IterativeSession:
 
     def split_paths(self, largest):
         """Splits the `path_count` camera paths of an iteration into `chunks` parts of `chunk` paths, at most `largest` each: that bounds memory."""
-        self.path_count = film_sample_count(self.sensor) * self.integrator.camera_paths
+        self.path_count = film_sample_count(self.sensor) * self.samples_per_iteration
         self.chunks = -(-self.path_count // largest)
         self.chunk = -(-self.path_count // self.chunks)
 

@@ -15,15 +15,15 @@ PRICES = json.loads(Path(__file__).with_name("costs.json").read_text())
 
 
 def events(session, segments, last_vertex, gathered):
-    """Events of one iteration a pixel, in the order of `EVENTS`.
+    """Events of an iteration of one camera path a pixel, in the order of `EVENTS`.
 
     `segments`: `transport.census.mean_segments`; `last_vertex`: the last smooth vertex that shades (`None`: all); `gathered`: photons within a
     vertex's merge disks.
     """
     camera = float(sum(segments if last_vertex is None else segments[:last_vertex + 1]))
     paths = getattr(session, "light_paths", 0)
-    light = (paths + getattr(session, "photons_found", 0)) / session.path_count
-    return camera * session.integrator.camera_paths, light, gathered * session.integrator.camera_paths, 1.0
+    light = (paths + getattr(session, "photons_found", 0)) * session.samples_per_iteration / session.path_count
+    return camera, light, gathered, 1.0
 
 
 def cost(plugin, counted, prices=PRICES):

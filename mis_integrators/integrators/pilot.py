@@ -1,4 +1,4 @@
-"""The pilot of `bdpm`: a few iterations on a subset of the pixels, from which the merge radii follow."""
+"""The pilot of `bdpm`: a few iterations on a subset of the pixels, from which the merge radii and the number of camera paths follow."""
 
 from __future__ import annotations
 
@@ -10,13 +10,16 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..transport.camera_pass import film_sample_count
+from ..transport.camera_pass import film_sample_count, film_size
 from ..transport.gather import mean_photon_count
-from ..transport.radius import LARGEST_SHARE, best_radius, ladder, middling, relative_weights, usual_mean
+from ..transport.radius import LARGEST_SHARE, best_radius, ladder, middling, relative_weights, steadied, usual_mean
+from ..transport.recording import lanes
 from ..transport.spectra import channel_mean
 
-PILOT_PIXELS = 4096
+PILOT_PATHS = 4096
 FEWEST_ITERATIONS, FEWEST_TIMED_ITERATIONS, MOST_ITERATIONS = 4, 3, 16
+NEIGHBOURS = 16
+"""Pilot pixels that are expected to look alike."""
 PILOT_SHARE = 0.04
 """Share of the planned iterations, or seconds, that the pilot may have once it has the fewest."""
 PILOT_INDEX = 1 << 30
@@ -35,6 +38,17 @@ LIKE_A_PILOT = 1.5
 """What an iteration takes, in seconds of one of the pilot, until it is known."""
 TOO_SLOW = 1.5
 """An iteration that takes so many times the guess is not believed to be typical."""
+CAMERA_SHARE = 0.35
+"""Share of the same units that each camera path of a pixel takes, until it is known (0.1 to 0.5 on the bundled scenes)."""
+LEAST_CAMERA_SHARE, MOST_CAMERA_SHARE = 0.1, 0.8
+NUMBERS_OF_PATHS = (1, 2, 4, 8)
+"""Camera paths a pixel and iteration that are considered."""
+WORTH_TRYING = 0.92
+"""Two camera paths are tried where the best number is expected to make the error smaller by this factor, if a camera path costs the least that it may."""
+LONG = 16
+"""... in renders of so many iterations at least."""
+WORTH_CHANGING = 0.95
+"""Another number than was tried must make it smaller by this factor."""
 USUAL_PHOTONS = 10
 """Photons a gather at which an iteration counts as one planned iteration: larger gathers must pay for themselves."""
 
@@ -65,6 +79,8 @@ def choose_radii(session):
     pilot.decide(left / guess)
     seconds, spent = rehearse(session, guess, left)
     count = max(left / seconds * pilot.cost_of_choice(), 1)
+    if not session.integrator.camera_paths and left / seconds > LONG:
+        spent += choose_camera_paths(pilot, seconds, count, left)
     before = dict(session.radii), dict(session.corrected)
     choices = pilot.decide(count, min(spent / left, 1))
     if (session.radii, session.corrected) != before:
@@ -72,6 +88,25 @@ def choose_radii(session):
     if session.corrected != before[1]:
         session._freeze()
     return pilot.forecast(choices, count)
+
+
+def choose_camera_paths(pilot, seconds, count, left):
+    """Sets how many camera paths each pixel has in an iteration, where one takes so many `seconds` and there is time for `count` of them; returns the
+    seconds that this took. What camera paths cost is measured where they may pay; the session keeps the iterations if they have the right number."""
+    session = pilot.session
+    if pilot.ladder is None:
+        return 0.0
+    pilot.camera_share = LEAST_CAMERA_SHARE
+    if min(pilot.error(number, count) for number in NUMBERS_OF_PATHS) > WORTH_TRYING * pilot.error(1, count):
+        return 0.0
+    session.send(2)
+    of_two, spent = rehearse(session, 2 * seconds, left)
+    pilot.learn_cost(of_two / seconds)
+    errors = {number: pilot.error(number, count) * (1 if number == 2 else 1 / WORTH_CHANGING) for number in NUMBERS_OF_PATHS}
+    pilot.camera_paths = min(errors, key=errors.get)
+    if pilot.camera_paths != 2:
+        session.send(pilot.camera_paths)
+    return spent
 
 
 def rehearse(session, guess, left):
@@ -101,37 +136,55 @@ class Forecast:
     gathered: float
     """Photons within a vertex's merge disks."""
     count: float
-    """Iterations of usual cost that were planned for."""
+    """Iterations that were planned for."""
     mean: np.ndarray
     """(pixels,)"""
     caustic_share: float
     """Share of the light that caustic photons bring."""
     iterations: int
     """Of the pilot."""
+    cost_of_paths: float
+    """What an iteration costs with its camera paths, in units of one with one a pixel."""
 
 
 def pilot_pixels(session):
-    """`(stride, count)`: the pilot's pixels are numbers 0, stride, 2 stride, ... of the film's."""
+    """`(stride, count, copies)`: the pilot's pixels are numbers 0, stride, 2 stride, ... of the film's, and so many camera paths go through each."""
     pixels = film_sample_count(session.sensor)
-    count = min(pixels, PILOT_PIXELS)
+    may_choose = session.seconds is not None and not session.integrator.camera_paths
+    copies = 2 if may_choose or session.samples_per_iteration > 1 else 1
+    count = min(pixels, PILOT_PATHS // copies)
     stride = pixels // count
-    width = int(session.sensor.film().crop_size()[0])
+    width, _ = film_size(session.sensor)
     while stride > 1 and math.gcd(stride, width) > 1:          # else the pixels would stand in columns
         stride -= 1
-    return stride, count
+    return stride, count, copies
+
+
+def neighbourhoods(session, stride, count):
+    """Numbers of the square cells of the film, from 0, in which the pilot's pixels lie, `NEIGHBOURS` in each: (count,)."""
+    width = film_size(session.sensor)[0]
+    side = math.sqrt(NEIGHBOURS * stride)
+    row, column = np.divmod(np.arange(count) * stride, width)
+    cells = (row // side) * math.ceil(width / side) + column // side
+    return np.unique(cells, return_inverse=True)[1]
 
 
 class Pilot:
     """Pilot iterations of a session.
 
-    `ladder`: radii (ascending); `samples[kind, corrected]`: gathered values (iterations, radii, pixels), channel mean;
-    `photons[kind]`: mean number of photons within the largest radius.
+    `ladder`: radii (ascending); `samples[kind, corrected]`: gathered values, one array (radii, copies, pixels) an iteration, channel mean; `direct`: the
+    light that does not come from photons, (copies, pixels) an iteration; `photons[kind]`: mean number of photons within the largest radius.
+
+    `copies`: camera paths of a pixel, which share the photons of their iteration. Where an iteration may have several camera paths a pixel there are two,
+    whose difference tells the noise of camera paths from that of photons.
     """
 
     def __init__(self, session):
         self.session = session
-        stride, self.paths = pilot_pixels(session)
-        self.stride = stride * session.integrator.camera_paths
+        stride, self.pixels, self.copies = pilot_pixels(session)
+        self.camera_paths, self.camera_share = session.samples_per_iteration, CAMERA_SHARE
+        self.stride, self.paths = stride * self.copies, self.pixels * self.copies
+        self.cells = neighbourhoods(session, stride, self.pixels)
         self.ladder = None
         # Caustics have edges of their own; only the smooth indirect light gains from knowing the surfaces' edges, and only where the camera
         # sees the vertices: deeper ones are spread over the scene, and their blur averages out.
@@ -145,8 +198,9 @@ class Pilot:
 
     def _record_camera(self, capacity):
         session, self.capacity = self.session, capacity
+        back = (1 - self.pixels * self.stride) % 2 ** 32              # from a copy's path after the last pixel to the next copy's of the first one
         self._camera = session.recorded(lambda scene, sensor, tables, seed, spectral: session._trace_camera(
-            scene, sensor, seed, mi.UInt32(0), self.stride, self.paths, capacity, spectral))
+            scene, sensor, seed, lanes(self.paths) // self.pixels * back, self.stride, self.paths, self.copies, capacity, spectral))
 
     def _record_gather(self):
         session = self.session
@@ -186,7 +240,7 @@ class Pilot:
             store.append([self._numpy(session._per_path(value, vertices, self.paths)) for value in values])
 
     def _numpy(self, value):
-        return np.broadcast_to(np.array(value), self.paths)
+        return np.broadcast_to(np.array(value), self.paths).reshape(self.copies, self.pixels)
 
     def _prepare(self, photons, vertices):
         """Sets the ladder and counts photons; false if no camera path meets a surface that gathers."""
@@ -210,30 +264,46 @@ class Pilot:
             photon_map = self.session._map(photons, kind, radius)
             self.photons[kind] = mean_photon_count(photon_map, vertices, radius)
 
-    def _cost(self, kind, corrected, radius):
-        photons = self.gathered(kind, radius)
-        return (1 + GATHER_COST * photons + PROBE_COST * corrected) / (1 + GATHER_COST * USUAL_PHOTONS)
+    def _cost(self, kind, corrected, radius, camera_paths):
+        gather = GATHER_COST * self.gathered(kind, radius) + PROBE_COST * corrected
+        return (1 + gather + (camera_paths - 1) * (self.camera_share + gather)) / (1 + GATHER_COST * USUAL_PHOTONS)
 
     def forecast(self, choices, count):
-        """The `Forecast` for these choices; `None` if no camera path meets a surface that gathers."""
+        """The `Forecast` for these choices and `count` iterations of usual cost; `None` if no camera path meets a surface that gathers."""
         if self.ladder is None:
             return None
         mean = self.mean()
-        direct = usual_mean(relative_weights(mean) * np.var(self.direct, axis=0, ddof=1)) if len(self.direct) > 1 else np.inf
         session = self.session
         caustics = np.mean(self.middling("caustic")) if "caustic" in self.ways else 0.0
-        return Forecast(sum(choice.squared_bias for choice in choices.values()), direct + sum(choice.variance for choice in choices.values()),
-                        sum(self.gathered(kind, session.radii[kind]) for kind in choices), count, mean,
-                        float(caustics / max(np.mean(mean), 1e-30)), len(self.direct))
+        return Forecast(sum(choice.squared_bias for choice in choices.values()), self._variance(choices, self.camera_paths),
+                        sum(self.gathered(kind, session.radii[kind]) for kind in choices), count / self.cost_of_choice(), mean,
+                        float(caustics / max(np.mean(mean), 1e-30)), len(self.direct), self.cost_of_choice() / self.cost_of_choice(1))
+
+    def _variance(self, choices, camera_paths):
+        """Relative variance of an iteration with these choices, direct light included."""
+        of_a_path = np.var(self.direct, axis=0, ddof=1).mean(axis=0) if len(self.direct) > 1 else np.full(self.pixels, np.inf)
+        direct = usual_mean(relative_weights(self.mean()) * of_a_path)
+        return direct / camera_paths + sum(choice.variance for choice in choices.values())
 
     def gathered(self, kind, radius):
         """Photons of a kind within `radius` of a vertex, on average."""
         return self.photons[kind] * (radius / self.ladder[-1]) ** 2
 
-    def cost_of_choice(self):
+    def cost_of_choice(self, camera_paths=None):
         """Relative cost of an iteration with the session's radii."""
-        return max((self._cost(kind, self.session.corrected[kind], radius) for kind, radius in self.session.radii.items()
-                    if kind in self.photons), default=1.0)
+        return max((self._cost(kind, self.session.corrected[kind], radius, camera_paths or self.camera_paths)
+                    for kind, radius in self.session.radii.items() if kind in self.photons), default=1.0)
+
+    def learn_cost(self, of_two):
+        """Takes over what an iteration of two camera paths costs, in units of one of one."""
+        slope = (of_two - 1) * self.cost_of_choice(1) + self.camera_share - (self.cost_of_choice(2) - self.cost_of_choice(1))
+        self.camera_share = min(max(slope, LEAST_CAMERA_SHARE), MOST_CAMERA_SHARE)
+
+    def error(self, camera_paths, count):
+        """Predicted relative error of a render that could have `count` iterations of usual cost, if each has so many camera paths a pixel."""
+        choices = self._best_radii(camera_paths, count)
+        cost = max(self._cost(kind, choice.correct, choice.radius, camera_paths) for kind, choice in choices.items())
+        return sum(choice.squared_bias for choice in choices.values()) + self._variance(choices, camera_paths) / max(count / cost, 1)
 
     def decide(self, count, reluctance=None):
         """Sets the session's radii and corrections for `count` iterations of usual cost; returns the choice for each kind of photons. With a
@@ -242,22 +312,37 @@ class Pilot:
         if self.ladder is None:
             session.radii = {kind: 1e-3 * float(dr.norm(session.traits.bounds.extents())) for kind in self.ways}
             return {}
-        samples, mean = {key: np.array(values) for key, values in self.samples.items()}, self.mean()
-        choices = {kind: best_radius(
-            self.ladder, samples[kind, False], samples.get((kind, True)), mean,
-            lambda radius, corrected, kind=kind: np.maximum(count / self._cost(kind, corrected, radius), 1), self.at_first_vertex,
-            kind == "caustic", None if reluctance is None else (session.radii[kind], session.corrected[kind]), reluctance or 0.0)
-            for kind in self.ways}
+        choices = self._best_radii(self.camera_paths, count, reluctance)
         session.radii = {kind: choice.radius for kind, choice in choices.items()}
         session.corrected.update({kind: choice.correct for kind, choice in choices.items()})
+        return choices
+
+    def _best_radii(self, camera_paths, count, reluctance=None):
+        """The `Choice` for each kind of photons, in iterations of so many camera paths a pixel."""
+        session, mean = self.session, self.mean()
+        weights, choices = relative_weights(mean), {}
+        for kind, ways in self.ways.items():
+            samples = {way: np.array(self.samples[kind, way]) for way in ways}                       # (iterations, radii, copies, pixels)
+            means = {way: values.mean(axis=2) for way, values in samples.items()}
+            more_noise = {}
+            if self.copies > 1:
+                for way, values in samples.items():
+                    of_a_path = weights * np.var(values, axis=2, ddof=1).mean(axis=0)
+                    more_noise[way] = np.array([usual_mean(pixels) for pixels in of_a_path]) * (1 / camera_paths - 1 / self.copies)
+            choices[kind] = best_radius(
+                self.ladder, means[False], means.get(True), mean,
+                lambda radius, corrected, kind=kind: np.maximum(count / self._cost(kind, corrected, radius, camera_paths), 1),
+                self.at_first_vertex, kind == "caustic", None if reluctance is None else (session.radii[kind], session.corrected[kind]),
+                reluctance or 0.0, more_noise)
         return choices
 
     def mean(self):
         """The pilot's pixels, gathered at a middling radius: (pixels,), or those that the session is to be judged by."""
         if self.session.judged_by is not None:
             return self.session.judged_by
-        return np.mean(self.direct, axis=0) + sum(np.mean(self.middling(kind), axis=0) for kind in self.ways)
+        image = np.mean(self.direct, axis=1) + sum(np.mean(self.middling(kind), axis=1) for kind in self.ways)       # (iterations, pixels)
+        return steadied(image, self.cells)
 
     def middling(self, kind):
-        """What photons of a kind bring at a middling radius: (iterations, pixels)."""
+        """What photons of a kind bring at a middling radius: (iterations, copies, pixels)."""
         return [step[middling(self.ladder)] for step in self.samples[kind, False]]

@@ -35,7 +35,7 @@ class PathSession(IterativeSession):
         arrays, each lane has its own, and the paths of one number differ with the variation."""
         seed = self._seed(iteration, PATHS) + variation
         _, active, _, ray, weight, position, _ = start_camera_paths(
-            self.sensor, seed, first, stride, paths, self.integrator.camera_paths, spectral["sample"])
+            self.sensor, seed, first, stride, paths, self.samples_per_iteration, spectral["sample"])
         differential = mi.RayDifferential3f(ray)
         self.sampler.seed(self._seed(iteration, SAMPLER, chunk), paths)
         radiance, valid, _ = self.path_integrator.sample(self.scene, self.sampler, differential, None, active)

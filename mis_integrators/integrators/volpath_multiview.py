@@ -161,7 +161,7 @@ class MultiViewSession(IterativeSession):
 
     @property
     def settings(self):
-        return {**super().settings, "camera_paths": self.samples_per_iteration, "views": self.views.count}
+        return {**super().settings, "views": self.views.count}
 
     def _freeze(self):
         """Records the passes anew."""

@@ -92,11 +92,11 @@ class WeightedSession(BDPMSession):
                                  sensor.shutter_open(), sensor.shutter_open_time(), self.integrator.max_depth, self.integrator.rr_depth,
                                  notebook=notebook)
 
-    def _trace_camera(self, scene, sensor, seed, first, stride, paths, capacity, spectral):
+    def _trace_camera(self, scene, sensor, seed, first, stride, paths, together, capacity, spectral):
         if not self._weighted:
-            return super()._trace_camera(scene, sensor, seed, first, stride, paths, capacity, spectral)
+            return super()._trace_camera(scene, sensor, seed, first, stride, paths, together, capacity, spectral)
         integrator = self.integrator
-        return trace_camera_paths(scene, sensor, integrator, self.lights, self.traits, seed, first, stride, paths, integrator.camera_paths,
+        return trace_camera_paths(scene, sensor, integrator, self.lights, self.traits, seed, first, stride, paths, together,
                                   spectral["sample"], integrator.first_vertex + integrator.strategies - 1, integrator.max_depth,
                                   integrator.rr_depth, integrator.hide_emitters, capacity, self.has_caustics, self.has_indirect, False,
                                   self.weights(spectral["merging"]))

@@ -31,12 +31,17 @@ def film_samples(sensor, index, camera_paths: int, rng):
     return mi.Point2f(unit), mi.Point2f(splat)
 
 
-def film_sample_count(sensor):
-    """Pixels that camera paths are sent through: the crop window, with its border where the film samples it."""
+def film_size(sensor):
+    """Width and height, in pixels, of what camera paths are sent through: the crop window, with its border where the film samples it."""
     film = sensor.film()
-    size = film.crop_size()
     border = 2 * film.rfilter().border_size() if film.sample_border() else 0
-    return (int(size[0]) + border) * (int(size[1]) + border)
+    return tuple(int(size) + border for size in film.crop_size())
+
+
+def film_sample_count(sensor):
+    """Pixels that camera paths are sent through."""
+    width, height = film_size(sensor)
+    return width * height
 
 
 def within_crop(film, splat):

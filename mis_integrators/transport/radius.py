@@ -30,6 +30,8 @@ LEAST_BIAS, MOST_BIAS = 0.003, 1.0
 corridor, rooms lit through a door or a window it is 0.002 to 0.04.)"""
 RARE_PIXELS = 0.001
 """Share of the pixels, the noisiest, without which noise is judged."""
+LEAST_NOISE = 0.1
+"""Share of the noise of a pilot's pixels that is left, however many camera paths they average: that of their photons."""
 SHARES_STRAY, SHARES_RETURN = 0.3, 0.5
 """The share of what the correction at edges adds that plain estimates do lack: how far it strays from one radius of the ladder to the next smaller
 one, and which part of its distance from one, where small disks have it, it makes up for on the way."""
@@ -55,6 +57,24 @@ def relative_weights(mean):
     leaves out the brightest twentieth (visible lamps)."""
     usual = np.mean(np.minimum(mean, np.quantile(mean, 0.95)))
     return 1 / (mean ** 2 + 0.1 * usual ** 2 + 1e-30)
+
+
+def steadied(samples, cells):
+    """Means (pixels,) of `samples` (iterations, pixels), each drawn towards the mean of its neighbours by as much as noise is of their differences.
+
+    A pixel's own noisy mean must not say what its noise is relative to: where it came out bright by chance, its noise would count little.
+    `cells`: (pixels,) the numbers of the pixels' neighbourhoods, from 0.
+    """
+    iterations = len(samples)
+    means = samples.mean(axis=0)
+    if iterations < 2:
+        return means
+    number = np.maximum(np.bincount(cells), 1)
+    noise = np.bincount(cells, samples.var(axis=0, ddof=1) / iterations) / number
+    cell = np.bincount(cells, means) / number
+    spread = np.bincount(cells, (means - cell[cells]) ** 2) / np.maximum(number - 1, 1)
+    real = np.maximum(spread - noise, 0) / np.maximum(spread, 1e-30)
+    return cell[cells] + real[cells] * (means - cell[cells])
 
 
 def noise_of_photons(radii, variance, floor, alike=False):
@@ -172,13 +192,14 @@ class Choice(NamedTuple):
     """Of one iteration."""
 
 
-def best_radius(radii, plain, corrected, mean, iterations, at_first_vertex=True, alike=False, used=None, reluctance=0.0):
+def best_radius(radii, plain, corrected, mean, iterations, at_first_vertex=True, alike=False, used=None, reluctance=0.0, more_noise=None):
     """The `Choice` that minimises the predicted relative error; `used`, a radius and whether it corrects, if the least error is not below its by more
     than this share, `reluctance`.
 
     `radii`: the ladder; `plain`, `at_first_vertex`, `alike`: see `noise_and_difference`; `corrected`: the same samples corrected at edges, or `None`;
     `mean`: (pixels,) mean radiance; `iterations(R, corrected)`: how many iterations there will be, so that larger gathers and the correction are
-    charged for. Where no photon was met, nothing speaks for any radius, and it is a middling one.
+    charged for; `more_noise`: by whether it corrects, how much more variance than that of the samples an iteration has, one a radius (less, if
+    negative), because it averages another number of camera paths. Where no photon was met, nothing speaks for any radius, and it is a middling one.
     """
     if not np.any(plain):
         return Choice(float(radii[middling(radii)]), False, 0.0, 0.0)
@@ -194,7 +215,10 @@ def best_radius(radii, plain, corrected, mean, iterations, at_first_vertex=True,
     blur = expected_squared_bias(radii, difference, error, len(plain), fine)
     choices = []
     for way, (samples, edges) in ways.items():
-        variance = between(fine, radii, noise_and_difference(radii, samples, weights, at_first_vertex, alike)[0])
+        variance = noise_and_difference(radii, samples, weights, at_first_vertex, alike)[0]
+        if more_noise:
+            variance = np.maximum(variance + more_noise[way], LEAST_NOISE * variance)
+        variance = between(fine, radii, variance)
         bias = blur + edges
         predicted = bias + variance / iterations(fine, way)
         at = int(np.argmin(predicted))
