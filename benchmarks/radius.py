@@ -21,6 +21,8 @@ from scene_files import OpenScene, open_scene, scaled_size
 from turns import Contender, take_turns
 
 STEP = 2**0.5
+ONE_PATH = {"variance": True, "camera_paths": 1}
+"""What all renderings have in common: the automatic one must owe nothing to another number of camera paths."""
 FEWEST_ITERATIONS = 12
 TRIMMED = " trimmed"
 COLUMNS = ("scene", "bdd", "time", "automatic", "best radius trimmed", "auto / best trimmed", "choice / best trimmed", "best radius",
@@ -80,7 +82,7 @@ def sweep(opened: OpenScene, references: References, bdd: int, times: list[float
     tried: dict[float, list[Contender]] = {}
     chosen_for_free: dict[float, list[Contender]] = {}
     for seconds in times:
-        maker = SessionMaker(Method("automatic", "bdpm", {"bdd": bdd, "variance": True}), opened, seconds)
+        maker = SessionMaker(Method("automatic", "bdpm", {**ONE_PATH, "bdd": bdd}), opened, seconds)
         tried[seconds] = [Contender.begin(f"automatic for {seconds:g} s", maker.make, seed) for seed in range(pilots)]
         for pilot in tried[seconds]:
             take_turns([pilot], 0)
@@ -127,7 +129,7 @@ def law(contender: Contender, references: References) -> ErrorLaw:
 def sweep_around(centre: float, radii: int, bdd: int, opened: OpenScene, seconds: float) -> list[SessionMaker]:
     """Sessions with ``radii`` radii around one, factor sqrt 2."""
     around = centre * STEP ** (np.arange(radii) - (radii - 1) // 2)
-    parameters = [{"bdd": bdd, "initial_radius": radius, "variance": True} for radius in around.tolist()]
+    parameters = [{**ONE_PATH, "bdd": bdd, "initial_radius": radius} for radius in around.tolist()]
     return [SessionMaker(Method(f"{given['initial_radius']:.4g}", "bdpm", given), opened, seconds) for given in parameters]
 
 
