@@ -36,7 +36,7 @@ class Unidirectional:
     """Stands for an integrator whose sessions are `PathSession`s."""
 
     def __init__(self, **parameters):
-        self.parameters = auto(**parameters)
+        self.parameters = auto(**{"camera_paths": 1, **parameters})
 
     def session(self, scene, sensor, seed, spp):
         from mis_integrators.integrators.unidirectional import PathSession          # of the active variant
@@ -132,6 +132,26 @@ def test_the_cheaper_wins(rgb, monkeypatch):
     assert cheap["choice"] == "path" and dear["choice"] != "path"
     assert cheap["choice.relmse.path"] < cheap["choice.relmse.bdpm bdd=0"]
     assert dear["choice.relmse.path"] > dear["choice.relmse.bdpm bdd=0"]
+
+
+@pytest.mark.parametrize("seconds, samples", [(1000.0, 8), (None, 1)])
+def test_a_path_of_given_time_keeps_the_processor_busy(rgb, monkeypatch, seconds, samples):
+    """A launch of one sample a pixel is too small on small films; what is predicted of `path` is the same, however many it takes together."""
+    monkeypatch.setitem(costs.PRICES, "path", {"camera": 1e-4, "light": 0, "gathered": 0, "pixel": 0})
+    scene = tray("lambertian", "rectangle")
+    monkeypatch.setattr("mis_integrators.integrators.unidirectional.BUSY", 8 * int(np.prod(scene.sensors()[0].film().size())))
+    session = auto().session(scene, spp=0 if seconds else 8)
+    if seconds:
+        session.plan_time(seconds)
+    session.iterate()
+    trial = next(trial for trial in session.decision.trials if trial.name == "path")
+    assert session.decision.plugin == "path" and session.samples_per_iteration == samples
+    segments = trial.cost / samples / 1e-4
+    assert 1 < segments < 4
+    one = auto(camera_paths=1).session(scene, spp=8)
+    one.iterate()
+    single = next(trial for trial in one.decision.trials if trial.name == "path")
+    assert trial.variance * samples == pytest.approx(single.variance, rel=0.3)
 
 
 def test_longer_renders_try_more(rgb):

@@ -192,7 +192,7 @@ def _try_path(path, segments, stride, pixels, mean):
         values += list(np.broadcast_to(np.array(channel_mean(radiance)), together * pixels).reshape(together, pixels))
     path.sampler.seed(0, 1)
     variance = usual_mean(relative_weights(mean) * np.var(values, axis=0, ddof=1))
-    return Trial("path", {}, path, 0.0, variance, costs.cost("path", costs.events(path, segments, None, 0.0)) * path.samples_per_iteration)
+    return Trial("path", {}, path, 0.0, variance / path.samples_per_iteration, costs.cost("path", costs.events(path, segments, None, 0.0)) * path.samples_per_iteration)
 
 
 def _worse(trials, budget):
