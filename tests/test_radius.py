@@ -154,7 +154,18 @@ def test_noise_of_small_disks_is_what_large_ones_saw():
     seen = np.array([0.0, 0.0, 1.0])
     radii = np.array([1.0, 2.0, 4.0])
     assert radius.noise_of_photons(radii, seen, 0.0) == pytest.approx([16.0, 4.0, 1.0])
-    assert radius.noise_of_photons(radii, seen, 0.0, alike=True) == pytest.approx([0.0, 4.0, 1.0])
+    assert radius.noise_of_photons(radii, seen, 0.0, [radius.FEW_MET] * 3) == pytest.approx([0.0, 4.0, 1.0])
+    assert radius.noise_of_photons(radii, seen, 0.0, [0, radius.FEW_MET, 10 ** 6]) == pytest.approx([16.0, 4.0, 1.0])
+
+
+def test_disks_that_met_no_photons_are_not_without_noise():
+    """Caustic photons so rare that a short pilot's small disks meet none: their radii are not the best for that."""
+    rng = np.random.default_rng(6)
+    met = rng.uniform(size=(3, 1, PIXELS)) < 1e-3 * 4.0 ** np.arange(len(RADII))[:, None] / 4.0 ** (len(RADII) - 1)
+    samples = met * (RADII[-1] / RADII)[:, None] ** 2 * 1000.0
+    assert not samples[:, 0].any() and samples[:, -1].any()
+    choice = radius.best_radius(RADII, samples, None, np.ones(PIXELS), lambda *_: 100.0, alike=True)
+    assert choice.radius > RADII[-1] / 2
 
 
 def test_steadied_means_do_not_know_their_own_noise():

@@ -28,6 +28,8 @@ g(u) = (acos u - u sqrt(1 - u^2)) / pi, and the ratio is the integral of g(u)^2 
 LEAST_BIAS, MOST_BIAS = 0.003, 1.0
 """Squared relative bias that disks of the ladder's largest radius can have, however little of it a short pilot sees. (In Cornell boxes, a
 corridor, rooms lit through a door or a window it is 0.002 to 0.04.)"""
+FEW_MET = 64
+"""Merge disks that met photons, fewer than which tell nothing of the noise of that radius."""
 RARE_PIXELS = 0.001
 """Share of the pixels, the noisiest, without which noise is judged."""
 LEAST_NOISE = 0.1
@@ -77,15 +79,20 @@ def steadied(samples, cells):
     return cell[cells] + real[cells] * (means - cell[cells])
 
 
-def noise_of_photons(radii, variance, floor, alike=False):
+def noise_of_photons(radii, variance, floor, met=None):
     """V(R), no smaller than what larger radii say: the noise of photons falls with the area of the disk, above a `floor` that is not theirs.
     Small disks seldom meet the rare bright photons that large ones have seen.
 
-    Where photons are `alike`, as those of a caustic, only the next larger radius has a say: what larger disks spill from the caustic onto its dark
-    surroundings is far noisier, relative to them, than anything that small disks do.
+    Where photons are alike, as those of a caustic, `met` says how many disks of each radius met any. Then only the next larger radius has a say: what
+    larger disks spill from the caustic onto its dark surroundings is far noisier, relative to them, than anything that small disks do. But a radius
+    with fewer than `FEW_MET` knows nothing of its noise, and has that of the next larger one.
     """
     photons = np.maximum(variance - floor, 0) * radii ** 2
-    seen = np.maximum(photons, np.append(photons[1:], photons[-1])) if alike else np.maximum.accumulate(photons[::-1])[::-1]
+    if met is None:
+        return floor + np.maximum.accumulate(photons[::-1])[::-1] / radii ** 2
+    seen = photons.copy()
+    for r in range(len(radii) - 2, -1, -1):
+        seen[r] = max(photons[r], photons[r + 1] if met[r] >= FEW_MET else seen[r + 1])
     return floor + seen / radii ** 2
 
 
@@ -111,7 +118,8 @@ def noise_and_difference(radii, samples, weights, at_first_vertex=True, alike=Fa
     noise is the photons', because the vertices that gather are those which the camera sees; `alike`: see `noise_of_photons`.
     """
     variance = np.array([usual_mean(values) for values in weights * samples.var(axis=0, ddof=1)])
-    variance = noise_of_photons(radii, variance, 0.0 if at_first_vertex else variance.min(), alike)
+    met = np.count_nonzero(samples, axis=(0, 2)) if alike else None
+    variance = noise_of_photons(radii, variance, 0.0 if at_first_vertex else variance.min(), met)
     steps = np.diff(samples, axis=1)                                      # (iterations, radii - 1, pixels)
     difference, error = with_error(steps, steps, weights)
     return variance, np.concatenate([[0.0], difference]), np.concatenate([[0.0], error])
