@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
 
@@ -17,6 +18,8 @@ from references import find_references
 from reports import Row, console, save, show, tell
 from scene_files import open_scene, scaled_size
 
+LATE = 1.15
+"""Times the usual seconds, beyond which a render is not one of equal time."""
 COLUMNS = ("method", "iterations", "seconds", "first", "relMSE", "relMSE ratio", "trimmed ratio", "MSE ratio", "FLIP", "bias share",
            "cost ratio", "settings")
 
@@ -138,14 +141,24 @@ def told_apart(row: Row, better: Row) -> bool:
     return ratio_interval(mine, other).low > 1
 
 
+def too_late(row: Row, rows: Sequence[Row]) -> bool:
+    """Whether the single iteration of a method took longer than others' renders of the scene: its error is not one at equal time."""
+    return row["iterations"] <= 1 and row["seconds"] > LATE * float(np.median([other["seconds"] for other in rows]))
+
+
+def winner(rows: Sequence[Row]) -> Row:
+    """The least error of those of one scene that kept to the time."""
+    return min((row for row in rows if not too_late(row, rows)), key=lambda row: row["trimmed ratio"])
+
+
 def winners(rows: list[Row]) -> list[Row]:
     """One row a scene: its least error, in ratios to the base, and the methods that are about as good or cannot be told apart."""
     found: list[Row] = []
     for scene in dict.fromkeys(row["scene"] for row in rows):
         mine = [row for row in rows if row["scene"] == scene]
-        best = min(mine, key=lambda row: row["trimmed ratio"])
+        best = winner(mine)
         close = [row["method"] for row in mine
-                 if row is not best and (row["trimmed ratio"] <= CLOSE * best["trimmed ratio"] or not told_apart(row, best))]
+                 if row is not best and not too_late(row, mine) and (row["trimmed ratio"] <= CLOSE * best["trimmed ratio"] or not told_apart(row, best))]
         found.append({"scene": scene, "best": best["method"], "error over path's": best["trimmed ratio"], "about as good": ", ".join(close) or "-"})
     return found
 

@@ -10,7 +10,7 @@ from typing import Mapping, Sequence
 import mitsuba as mi
 import numpy as np
 
-from compare import told_apart
+from compare import told_apart, too_late, winner
 from measuring import Measurement
 from methods import Method
 from mis_integrators.analysis import charts
@@ -71,7 +71,7 @@ def summary(rows: Sequence[Row], failures: dict[str, dict[str, str]], what: str)
     lines, ratios = [], {label: [] for label in labels}
     for scene in dict.fromkeys(row["scene"] for row in rows):
         mine = {row["method"]: row for row in rows if row["scene"] == scene}
-        best = min(mine.values(), key=lambda row: row["trimmed ratio"])
+        best = winner(list(mine.values()))
         cells = []
         for label in labels:
             row = mine.get(label)
@@ -79,8 +79,9 @@ def summary(rows: Sequence[Row], failures: dict[str, dict[str, str]], what: str)
                 cells.append(f'<td title="{html.escape(failures.get(scene, {}).get(label, ""))}">cannot</td>')
                 continue
             ratios[label].append(row["trimmed ratio"])
+            late = too_late(row, list(mine.values()))
             kind = "win" if row is best else "worse" if row["trimmed ratio"] > 3 else ""
-            almost = " ≈" if row is not best and not told_apart(row, best) else ""
+            almost = f" in {row['seconds']:.1f} s" if late else " ≈" if row is not best and not told_apart(row, best) else ""
             cells.append(f'<td class="{kind}" title="{_interval(row, "trimmed ratio")}">{_short(row["trimmed ratio"])}{almost}</td>')
         lines.append(f'<tr><td><a href="#{scene}">{scene}</a></td><td class="text">{chip(best["method"], style[best["method"]])}</td>'
                      f'<td>{1 / best["trimmed ratio"]:.1f} ×</td>{"".join(cells)}</tr>')
@@ -89,7 +90,7 @@ def summary(rows: Sequence[Row], failures: dict[str, dict[str, str]], what: str)
     head = "".join(f"<th>{chip(label, style[label])}</th>" for label in labels)
     return f"""<p>Error of each method {html.escape(what)}, over that of <b>{base}</b> in the same run: below 1 is better. Relative mean
 square error without the worst 0.1 % of the pixels; green: least error; red: more than three times {base}'s; ≈: not told apart from the winner
-(95 %, by pairs of seeds). Tooltips: 95 % intervals.</p>
+(95 %, by pairs of seeds). With seconds: one iteration takes longer than that, so it cannot win. Tooltips: 95 % intervals.</p>
 <div class="wide"><table><tr><th>scene</th><th class="text">winner</th><th>less error<br>than {base}</th>{head}</tr>
 {"".join(lines)}<tr class="total"><td>geometric mean</td><td></td><td></td>{total}</tr></table></div>"""
 
@@ -110,7 +111,7 @@ def pictures(measurement: Measurement, rows: Sequence[Row], folder: Path) -> str
     framed = references.mean / white
     for (y, x), colour in zip(windows, FRAMES):
         framed[y:y + ZOOM, [x, min(x + ZOOM, framed.shape[1]) - 1]] = framed[[y, min(y + ZOOM, framed.shape[0]) - 1], x:x + ZOOM] = colour
-    best = min(rows, key=lambda row: row["trimmed ratio"])
+    best = winner(rows)
     cards = [_card("reference", "", framed, None, references.mean / white, windows, folder / f"{name}_reference",
                    f"{references.origin}; frames: enlarged parts")]
     for measured, row, error_map in zip(measurement.methods, rows, maps):

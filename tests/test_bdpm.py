@@ -519,8 +519,8 @@ def test_rare_photons_get_no_smallest_radius(rgb):
     scene = box_scene(16)
     session = bdpm(bdd=0, photon_count=1, initial_radius=0.0).session(scene, seed=1, spp=4)
     pilot = Pilot(session)
-    pilot.ladder, pilot.photons, pilot.direct = np.array([0.01 * 2 ** i for i in range(7)]), {"indirect": 0.0}, [np.ones((1, 256))] * 4
-    pilot.samples = {key: [np.zeros((7, 1, 256))] * 4 for key in pilot.samples}
+    pilot.ladder, pilot.photons, pilot.direct = np.array([0.01 * 2 ** i for i in range(7)]), {"indirect": 0.0}, [np.ones((2, 256))] * 4
+    pilot.samples = {key: [np.zeros((7, 2, 256))] * 4 for key in pilot.samples}
     pilot.decide(100)
     assert session.radii["indirect"] == pytest.approx(0.16)
 

@@ -114,11 +114,14 @@ def test_winner_and_those_that_cannot_be_told_apart(module):
     compare = module("compare")
 
     def of(method, *values):
-        return {"scene": "s", "method": method, "trimmed ratio": np.mean(values), "trimmed by seed": " ".join(map(str, values))}
+        return {"scene": "s", "method": method, "trimmed ratio": np.mean(values), "trimmed by seed": " ".join(map(str, values)),
+                "iterations": 5, "seconds": 1.0}
     rows = [of("path", 1, 1.01, 0.99), of("a", 0.5, 0.51, 0.49), of("b", 0.55, 0.56, 0.54), of("c", 0.2, 2.0, 0.4), of("d", 0.7, 0.72, 0.69)]
     assert compare.told_apart(rows[2], rows[1]) and not compare.told_apart(rows[3], rows[1])
     (winner,) = compare.winners(rows)
     assert winner["best"] == "a" and winner["about as good"] == "b, c"
+    late = [{**of("e", 0.1, 0.1, 0.1), "iterations": 1, "seconds": 1.3}, {**of("f", 0.3, 0.3, 0.3), "iterations": 1, "seconds": 1.1}]
+    assert compare.winners(rows + late)[0]["best"] == "f"
 
 
 # --- The commands ---------------------------------------------------------------------------------------
