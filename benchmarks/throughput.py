@@ -169,7 +169,7 @@ def radius_for(session, photons_a_gather: float) -> tuple[float, int, int, float
     photons = session._photons(0, spectral)
     seed, first, stride = session._seed(0, 1), mi.UInt32(0), 1
     *_, vertices, _ = session._trace_camera(
-        session.scene, session.sensor, seed, first, stride, session.chunk, session.vertex_capacity, spectral
+        session.scene, session.sensor, seed, first, stride, session.chunk, session.samples_per_iteration, session.vertex_capacity, spectral
     )
     radius = session.integrator.initial_radius
     for _ in range(3):

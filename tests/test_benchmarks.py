@@ -14,6 +14,7 @@ from mis_integrators.analysis.fronts import pareto_front
 from mis_integrators.analysis.metrics import References
 from mis_integrators.analysis.stability import Point, breaks, choose, judge
 from mis_integrators.analysis.zooms import telling_windows
+from test_bdpm import box_scene
 
 SCENES = Path(__file__).parent.parent / "scenes"
 
@@ -122,6 +123,13 @@ def test_winner_and_those_that_cannot_be_told_apart(module):
     assert winner["best"] == "a" and winner["about as good"] == "b, c"
     late = [{**of("e", 0.1, 0.1, 0.1), "iterations": 1, "seconds": 1.3}, {**of("f", 0.3, 0.3, 0.3), "iterations": 1, "seconds": 1.1}]
     assert compare.winners(rows + late)[0]["best"] == "f"
+
+
+def test_radius_for_a_number_of_photons(module):
+    """Throughput is measured at the same number of photons a gather everywhere."""
+    session = mi.load_dict({"type": "bdpm", "bdd": 0, "initial_radius": 0.1, "photon_count": 20000}).session(box_scene(16))
+    radius, photons, vertices, found = module("throughput").radius_for(session, 10.0)
+    assert found == pytest.approx(10, rel=0.2) and 0.001 < radius < 1 and photons > 1000 and 0 < vertices <= 256
 
 
 # --- The commands ---------------------------------------------------------------------------------------
