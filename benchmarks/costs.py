@@ -50,7 +50,7 @@ def run(options: argparse.Namespace) -> None:
 def measured(opened) -> list[dict]:
     """One row a method and radius: events a pixel, and cost in units of a segment of `path`."""
     scene, sensor = opened.scene, opened.sensor
-    first = mi.load_dict({"type": "bdpm", **opened.inherited})
+    first = mi.load_dict({"type": "bdpm", "camera_paths": 1, **opened.inherited})
     segments = mean_segments(scene, sensor, 1, 1, int(np.prod(opened.size)), first.max_depth, first.rr_depth)
     sessions = []
     for plugin, parameters in METHODS:
