@@ -71,7 +71,8 @@ def summary(rows: Sequence[Row], failures: dict[str, dict[str, str]], what: str)
     lines, ratios = [], {label: [] for label in labels}
     for scene in dict.fromkeys(row["scene"] for row in rows):
         mine = {row["method"]: row for row in rows if row["scene"] == scene}
-        best = winner(list(mine.values()))
+        here = list(mine.values())
+        best = winner(here)
         cells = []
         for label in labels:
             row = mine.get(label)
@@ -79,7 +80,7 @@ def summary(rows: Sequence[Row], failures: dict[str, dict[str, str]], what: str)
                 cells.append(f'<td title="{html.escape(failures.get(scene, {}).get(label, ""))}">cannot</td>')
                 continue
             ratios[label].append(row["trimmed ratio"])
-            late = too_late(row, list(mine.values()))
+            late = too_late(row, here)
             kind = "win" if row is best else "worse" if row["trimmed ratio"] > 3 else ""
             almost = f" in {row['seconds']:.1f} s" if late else " ≈" if row is not best and not told_apart(row, best) else ""
             cells.append(f'<td class="{kind}" title="{_interval(row, "trimmed ratio")}">{_short(row["trimmed ratio"])}{almost}</td>')

@@ -97,11 +97,11 @@ class Measured:
         means = self.pictures.mean(axis=1)
         return means.mean(), means.std(ddof=1) / len(means) ** 0.5
 
-    def noise(self, brightness):
+    def noise(self, brightness, left_out=NOISIEST):
         """Logarithm of the mean relative variance of an iteration without the noisiest pixels, and its standard error (over iterations)."""
         squares = ((self.pictures - self.mean) / brightness) ** 2
         variances = squares.mean(axis=0)
-        values = squares[:, variances <= np.quantile(variances, 1 - NOISIEST)].mean(axis=1)
+        values = squares[:, variances <= np.quantile(variances, 1 - left_out)].mean(axis=1)
         return math.log(values.mean()), values.std(ddof=1) / values.mean() / len(values) ** 0.5
 
     def tail(self, brightness):

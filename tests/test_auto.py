@@ -17,7 +17,7 @@ from foggy import world as foggy_world
 from mis_integrators.integrators import costs
 from mis_integrators.transport.census import mean_segments
 from test_against_path import MONO, RGB, SPECTRAL, caustic_scene
-from test_bdpm import glossy_box, last_words
+from test_bdpm import always_choose_camera_paths, glossy_box, last_words
 from worlds import diffuse, film, look, path, tray
 
 
@@ -173,11 +173,7 @@ def test_a_short_render_does_not_spend_its_time_on_trials(rgb, seconds, tried):
 
 def test_camera_paths_of_the_chosen_are_its_own(rgb, monkeypatch):
     """Those that its pilot found worth while, which make an iteration dearer by what they cost."""
-    def three(pilot, *_):
-        pilot.camera_paths = 3
-        pilot.session.send(3)
-        return 0.0
-    monkeypatch.setattr("mis_integrators.integrators.pilot.choose_camera_paths", three)
+    always_choose_camera_paths(monkeypatch, 3)
     session = auto().session(caustic_scene("point"))
     session.plan_time(1000.0)
     session.iterate()

@@ -582,10 +582,18 @@ def test_noise_of_several_camera_paths_is_foreseen(rgb, plugin, given, camera_pa
     assert 1 / 1.3 < session.forecast.variance / usual_mean(measured) < 1.3
 
 
+def always_choose_camera_paths(monkeypatch, camera_paths):
+    """Every pilot that may choose a number of camera paths chooses this one."""
+    def choose(pilot, *_):
+        pilot.camera_paths = camera_paths
+        pilot.session.send(camera_paths)
+        return 0.0
+    monkeypatch.setattr("mis_integrators.integrators.pilot.choose_camera_paths", choose)
+
+
 def test_a_timed_render_chooses_its_camera_paths(rgb, monkeypatch):
     """What is chosen is rendered with, said, and rendered with again by whoever is told."""
-    monkeypatch.setattr("mis_integrators.integrators.pilot.choose_camera_paths", lambda pilot, *_: (
-        setattr(pilot, "camera_paths", 4), pilot.session.send(4), 0.0)[-1])
+    always_choose_camera_paths(monkeypatch, 4)
     scene = glossy_box()
     timed = bdpm(bdd=0, camera_paths=0, photon_count=3000, initial_radius=0.0).session(scene, seed=4)
     timed.plan_time(1000.0)

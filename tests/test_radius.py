@@ -136,7 +136,7 @@ def test_choice_is_nearly_the_best(reach, corrects, count):
     ratios, ways = [], []
     for seed in range(12):
         plain, corrected = pilot(3, seed, reach, noise, curvature)
-        chosen, way, *_ = radius.best_radius(RADII, plain, corrected, np.ones(PIXELS), lambda r, corrected: count * np.ones_like(r))
+        chosen, way, *_ = radius.best_radius(radius.expect(RADII, plain, corrected, np.ones(PIXELS)), lambda r, corrected: count * np.ones_like(r))
         ratios.append(true_error(chosen, way) / best)
         ways.append(way)
     assert np.exp(np.mean(np.log(ratios))) < 1.25
@@ -145,7 +145,8 @@ def test_choice_is_nearly_the_best(reach, corrects, count):
 
 def test_more_iterations_mean_smaller_radii():
     plain, corrected = pilot(4, 0, curvature=0.05)
-    chosen = [radius.best_radius(RADII, plain, corrected, np.ones(PIXELS), lambda r, way, n=n: n * np.ones_like(r))[0] for n in (1, 30, 1000)]
+    expected = radius.expect(RADII, plain, corrected, np.ones(PIXELS))
+    chosen = [radius.best_radius(expected, lambda r, way, n=n: n * np.ones_like(r))[0] for n in (1, 30, 1000)]
     assert chosen[0] > chosen[1] > chosen[2]
 
 
@@ -164,7 +165,7 @@ def test_disks_that_met_no_photons_are_not_without_noise():
     met = rng.uniform(size=(3, 1, PIXELS)) < 1e-3 * 4.0 ** np.arange(len(RADII))[:, None] / 4.0 ** (len(RADII) - 1)
     samples = met * (RADII[-1] / RADII)[:, None] ** 2 * 1000.0
     assert not samples[:, 0].any() and samples[:, -1].any()
-    choice = radius.best_radius(RADII, samples, None, np.ones(PIXELS), lambda *_: 100.0, alike=True)
+    choice = radius.best_radius(radius.expect(RADII, samples, None, np.ones(PIXELS), alike=True), lambda *_: 100.0)
     assert choice.radius > RADII[-1] / 2
 
 

@@ -5,8 +5,8 @@ One small room (`extremes.py`); what is varied are its numbers and the methods'.
 - every pixel of every iteration is a number;
 - no light is lost or made: the mean is that of `path`, up to `SLACK` and up to what a single strategy at that radius is off by, significantly;
 - the 99.99th percentile of the deviations of an iteration's pixels is at most `TAIL` times that of each single strategy;
-- the mean relative variance is at most `NOISE` times that of each strategy that is mixed (without the noisiest pixels, as below; so not compared with
-  a strategy whose percentile is beyond `TAIL` times that of the mixture, whose noise is in rare values);
+- the mean relative variance is at most `NOISE` times that of each strategy that is mixed, without the noisiest pixels, as below; but where the
+  strategy's percentile is beyond `TAIL` times that of the mixture, its noise is in rare values, and all pixels count;
 - along a ladder in steps of two, the mean relative variances of neighbours (without the noisiest 2 % of the pixels: rare events are the
   percentile's) differ by less than a factor `JUMP`.
 
@@ -120,13 +120,13 @@ def tail_too_long(mixed, singles):
 
 
 def too_noisy(mixed, singles, tail, tails):
-    """In words, where a logarithm of a variance (with its standard error) is beyond `NOISE` times that of a strategy that is mixed; `tail`, `tails`: their
-    percentiles."""
+    """In words, where the logarithm of the variance is beyond `NOISE` times that of a strategy that is mixed. `mixed`, `singles`: of the usual and of all
+    pixels (with their standard errors); `tail`, `tails`: their percentiles."""
     for bdd, single in enumerate(singles):
-        if tails[bdd][0] - tail[0] - threshold() * math.hypot(tail[1], tails[bdd][1]) > math.log(TAIL):
-            continue
-        if mixed[0] - single[0] - threshold() * math.hypot(mixed[1], single[1]) > math.log(NOISE):
-            return f"variance {math.exp(mixed[0] - single[0]):.2f} times that of bdd={bdd}"
+        rare = tails[bdd][0] - tail[0] - threshold() * math.hypot(tail[1], tails[bdd][1]) > math.log(TAIL)
+        (mine, my_error), (its, its_error) = mixed[rare], single[rare]
+        if mine - its - threshold() * math.hypot(my_error, its_error) > math.log(NOISE):
+            return f"variance {math.exp(mine - its):.2f} times that of bdd={bdd}{' in all pixels' if rare else ''}"
     return None
 
 
@@ -176,10 +176,10 @@ def wrongs(rooms, point, multiple, folder):
     wrong = [f"{mixed}: {words}" for mixed in MIXED if (words := tail_too_long(tails[mixed], [tails[single] for single in SINGLE]))]
     wrong += [f"{mixed}: {words}" for mixed in MIXED
               if (words := lost_light(found[mixed].light(), [found[s].light() for s in SINGLE], truth))]
-    noise = {method: m.noise(truth.brightness) for method, m in found.items()}
+    noise = {method: (m.noise(truth.brightness), m.noise(truth.brightness, 0)) for method, m in found.items()}
     wrong += [f"{mixed}: {words}" for mixed, strategies in zip(MIXED, (2, 3))
               if (words := too_noisy(noise[mixed], [noise[s] for s in SINGLE[:strategies]], tails[mixed], [tails[s] for s in SINGLE]))]
-    print(point, {m: " ".join(f"{what} {math.exp(log):.3g} +- {error:.0%}" for what, (log, error) in (("tail", tails[m]), ("variance", noise[m])))
+    print(point, {m: " ".join(f"{what} {math.exp(log):.3g} +- {error:.0%}" for what, (log, error) in (("tail", tails[m]), ("variance", noise[m][0]), ("of all", noise[m][1])))
                   for m in found})
     return wrong
 

@@ -54,7 +54,7 @@ class BDPMAuto(IterativeIntegrator):
     def new_session(self, scene, sensor, seed, iterations):
         if has_media(scene):
             volumetric = mi.load_dict({"type": "volpath_multiview", **handed_on(self)})
-            return volumetric.session(scene, sensor, seed, (iterations or 0) * (self.camera_paths or 1))
+            return volumetric.session(scene, sensor, seed, (iterations or 0) * self.fewest_camera_paths)
         return AutoSession(self, scene, sensor, seed, iterations)
 
 

@@ -63,6 +63,11 @@ class IterativeIntegrator(mi.AdjointIntegrator):
         lines = ",\n".join(f"  {name} = {value}" for name, value in self.settings().items())
         return f"{type(self).__name__}[\n{lines}\n]"
 
+    @property
+    def fewest_camera_paths(self):
+        """The parameter `camera_paths`; where it is automatic, one: until more turn out to be worth while."""
+        return self.camera_paths or 1
+
     def settings(self):
         """Parameter names and values."""
         return {"max_depth": self.max_depth, "rr_depth": self.rr_depth, "hide_emitters": self.hide_emitters,
@@ -73,7 +78,7 @@ class IterativeIntegrator(mi.AdjointIntegrator):
         sensor = self._sensor(scene, sensor)
         self.check(scene, sensor)
         self.check_path_number([sensor])
-        return self.new_session(scene, sensor, scalar_seed(seed), self.planned_iterations(spp, self.camera_paths or 1))
+        return self.new_session(scene, sensor, scalar_seed(seed), self.planned_iterations(spp, self.fewest_camera_paths))
 
     def check_path_number(self, sensors):
         """Raises `ValueError` where an iteration would have more camera paths than can be numbered."""
@@ -142,7 +147,7 @@ class IterativeSession:
     def __init__(self, integrator, scene, sensor, seed, iterations):
         self.integrator, self.scene, self.sensor, self.seed = integrator, scene, sensor, seed
         self.iterations_planned = iterations
-        self.samples_per_iteration = integrator.camera_paths or 1
+        self.samples_per_iteration = integrator.fewest_camera_paths
         self.accumulator = Accumulator(integrator.variance)
         self.variant = mi.variant()
         settle(scene)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -12,7 +14,7 @@ import numpy as np
 
 from ..transport.camera_pass import film_sample_count, film_size
 from ..transport.gather import mean_photon_count
-from ..transport.radius import LARGEST_SHARE, best_radius, ladder, middling, relative_weights, steadied, usual_mean
+from ..transport.radius import LARGEST_SHARE, Expected, best_radius, expect, ladder, middling, relative_weights, steadied, usual_mean
 from ..transport.recording import lanes
 from ..transport.spectra import channel_mean
 
@@ -79,7 +81,7 @@ def choose_radii(session):
     pilot.decide(left / guess)
     seconds, spent = rehearse(session, guess, left)
     count = max(left / seconds * pilot.cost_of_choice(), 1)
-    if not session.integrator.camera_paths and left / seconds > LONG:
+    if may_choose_camera_paths(session) and left / seconds > LONG:
         spent += choose_camera_paths(pilot, seconds, count, left)
     before = dict(session.radii), dict(session.corrected)
     choices = pilot.decide(count, min(spent / left, 1))
@@ -90,6 +92,11 @@ def choose_radii(session):
     return pilot.forecast(choices, count)
 
 
+def may_choose_camera_paths(session):
+    """Whether the number of camera paths a pixel is the pilot's to choose: what one costs is known in renders of a given time only."""
+    return session.seconds is not None and not session.integrator.camera_paths
+
+
 def choose_camera_paths(pilot, seconds, count, left):
     """Sets how many camera paths each pixel has in an iteration, where one takes so many `seconds` and there is time for `count` of them; returns the
     seconds that this took. What camera paths cost is measured where they may pay; the session keeps the iterations if they have the right number."""
@@ -97,7 +104,8 @@ def choose_camera_paths(pilot, seconds, count, left):
     if pilot.ladder is None:
         return 0.0
     pilot.camera_share = LEAST_CAMERA_SHARE
-    if min(pilot.error(number, count) for number in NUMBERS_OF_PATHS) > WORTH_TRYING * pilot.error(1, count):
+    hoped = {number: pilot.error(number, count) for number in NUMBERS_OF_PATHS}
+    if min(hoped.values()) > WORTH_TRYING * hoped[1]:
         return 0.0
     session.send(2)
     of_two, spent = rehearse(session, 2 * seconds, left)
@@ -150,8 +158,7 @@ class Forecast:
 def pilot_pixels(session):
     """`(stride, count, copies)`: the pilot's pixels are numbers 0, stride, 2 stride, ... of the film's, and so many camera paths go through each."""
     pixels = film_sample_count(session.sensor)
-    may_choose = session.seconds is not None and not session.integrator.camera_paths
-    copies = 2 if may_choose or session.samples_per_iteration > 1 else 1
+    copies = 2 if may_choose_camera_paths(session) or session.samples_per_iteration > 1 else 1
     count = min(pixels, PILOT_PATHS // copies)
     stride = pixels // count
     width, _ = film_size(session.sensor)
@@ -167,6 +174,17 @@ def neighbourhoods(session, stride, count):
     row, column = np.divmod(np.arange(count) * stride, width)
     cells = (row // side) * math.ceil(width / side) + column // side
     return np.unique(cells, return_inverse=True)[1]
+
+
+class Noise(NamedTuple):
+    """What a pilot knows of biases and variances, relative by `relative_weights`."""
+
+    expected: dict[str, Expected]
+    """By kind of photons."""
+    of_a_path: dict[str, dict[bool, np.ndarray]]
+    """By kind of photons and whether they are corrected at edges: variance between camera paths that share photons, one a radius."""
+    direct: float
+    """Variance of the light of a camera path that does not come from photons."""
 
 
 class Pilot:
@@ -281,9 +299,7 @@ class Pilot:
 
     def _variance(self, choices, camera_paths):
         """Relative variance of an iteration with these choices, direct light included."""
-        of_a_path = np.var(self.direct, axis=0, ddof=1).mean(axis=0) if len(self.direct) > 1 else np.full(self.pixels, np.inf)
-        direct = usual_mean(relative_weights(self.mean()) * of_a_path)
-        return direct / camera_paths + sum(choice.variance for choice in choices.values())
+        return self.noise.direct / camera_paths + sum(choice.variance for choice in choices.values())
 
     def gathered(self, kind, radius):
         """Photons of a kind within `radius` of a vertex, on average."""
@@ -319,22 +335,32 @@ class Pilot:
 
     def _best_radii(self, camera_paths, count, reluctance=None):
         """The `Choice` for each kind of photons, in iterations of so many camera paths a pixel."""
-        session, mean = self.session, self.mean()
-        weights, choices = relative_weights(mean), {}
+        session, choices = self.session, {}
+        for kind, expected in self.noise.expected.items():
+            more_noise = {way: noise * (1 / camera_paths - 1 / self.copies) for way, noise in self.noise.of_a_path[kind].items()}
+            choices[kind] = best_radius(
+                expected, lambda radius, corrected, kind=kind: np.maximum(count / self._cost(kind, corrected, radius, camera_paths), 1),
+                None if reluctance is None else (session.radii[kind], session.corrected[kind]), reluctance or 0.0, more_noise)
+        return choices
+
+    @cached_property
+    def noise(self):
+        """The `Noise` of all iterations so far; they are over when this is asked for."""
+        mean = self.mean()
+        weights, expected, of_a_path = relative_weights(mean), {}, {}
         for kind, ways in self.ways.items():
             samples = {way: np.array(self.samples[kind, way]) for way in ways}                       # (iterations, radii, copies, pixels)
             means = {way: values.mean(axis=2) for way, values in samples.items()}
-            more_noise = {}
-            if self.copies > 1:
-                for way, values in samples.items():
-                    of_a_path = weights * np.var(values, axis=2, ddof=1).mean(axis=0)
-                    more_noise[way] = np.array([usual_mean(pixels) for pixels in of_a_path]) * (1 / camera_paths - 1 / self.copies)
-            choices[kind] = best_radius(
-                self.ladder, means[False], means.get(True), mean,
-                lambda radius, corrected, kind=kind: np.maximum(count / self._cost(kind, corrected, radius, camera_paths), 1),
-                self.at_first_vertex, kind == "caustic", None if reluctance is None else (session.radii[kind], session.corrected[kind]),
-                reluctance or 0.0, more_noise)
-        return choices
+            expected[kind] = expect(self.ladder, means[False], means.get(True), mean, self.at_first_vertex, kind == "caustic")
+            of_a_path[kind] = {way: self._between_copies(weights, values) for way, values in samples.items()}
+        of_direct = np.var(self.direct, axis=0, ddof=1).mean(axis=0) if len(self.direct) > 1 else np.full(self.pixels, np.inf)
+        return Noise(expected, of_a_path, usual_mean(weights * of_direct))
+
+    def _between_copies(self, weights, samples):
+        """Relative variance between the camera paths of a pixel, one a radius."""
+        if self.copies == 1:
+            return np.zeros(len(self.ladder))
+        return np.array([usual_mean(pixels) for pixels in weights * np.var(samples, axis=2, ddof=1).mean(axis=0)])
 
     def mean(self):
         """The pilot's pixels, gathered at a middling radius: (pixels,), or those that the session is to be judged by."""

@@ -19,11 +19,9 @@ def film_samples(sensor, index, camera_paths: int, rng):
     grid covers the border too, as in Mitsuba's own integrators.
     """
     film = sensor.film()
-    size = mi.ScalarVector2i(film.crop_size())
-    border = film.rfilter().border_size() if film.sample_border() else 0
-    width = size.x + 2 * border
+    width, _ = film_size(sensor)
     pixel = index // camera_paths
-    corner = mi.Vector2i(mi.Int32(pixel % width), mi.Int32(pixel // width)) - border + mi.Vector2i(film.crop_offset())
+    corner = mi.Vector2i(mi.Int32(pixel % width), mi.Int32(pixel // width)) - border_size(film) + mi.Vector2i(film.crop_offset())
     position = mi.Vector2f(corner) + mi.Vector2f(next_2d(rng))
     scale = dr.rcp(mi.ScalarVector2f(film.crop_size()))
     unit = (position - mi.ScalarVector2f(film.crop_offset())) * scale
@@ -34,8 +32,12 @@ def film_samples(sensor, index, camera_paths: int, rng):
 def film_size(sensor):
     """Width and height, in pixels, of what camera paths are sent through: the crop window, with its border where the film samples it."""
     film = sensor.film()
-    border = 2 * film.rfilter().border_size() if film.sample_border() else 0
-    return tuple(int(size) + border for size in film.crop_size())
+    return tuple(int(size) + 2 * border_size(film) for size in film.crop_size())
+
+
+def border_size(film):
+    """Pixels beyond each edge of the crop window that camera paths are sent through, too."""
+    return film.rfilter().border_size() if film.sample_border() else 0
 
 
 def film_sample_count(sensor):

@@ -200,41 +200,62 @@ class Choice(NamedTuple):
     """Of one iteration."""
 
 
-def best_radius(radii, plain, corrected, mean, iterations, at_first_vertex=True, alike=False, used=None, reluctance=0.0, more_noise=None):
-    """The `Choice` that minimises the predicted relative error; `used`, a radius and whether it corrects, if the least error is not below its by more
-    than this share, `reluctance`.
+class Expected(NamedTuple):
+    """What a pilot expects of photons of a kind, in relative terms; by whether estimates are corrected at edges."""
+
+    ladder: np.ndarray
+    fine: np.ndarray
+    """Radii to choose from."""
+    squared_bias: dict[bool, np.ndarray]
+    """At the fine radii. Empty where no photon was met."""
+    variance: dict[bool, np.ndarray]
+    """Of an iteration like the pilot's, at the ladder."""
+
+
+def expect(radii, plain, corrected, mean, at_first_vertex=True, alike=False):
+    """The `Expected` squared biases and variances.
 
     `radii`: the ladder; `plain`, `at_first_vertex`, `alike`: see `noise_and_difference`; `corrected`: the same samples corrected at edges, or `None`;
-    `mean`: (pixels,) mean radiance; `iterations(R, corrected)`: how many iterations there will be, so that larger gathers and the correction are
-    charged for; `more_noise`: by whether it corrects, how much more variance than that of the samples an iteration has, one a radius (less, if
-    negative), because it averages another number of camera paths. Where no photon was met, nothing speaks for any radius, and it is a middling one.
+    `mean`: (pixels,) mean radiance.
     """
-    if not np.any(plain):
-        return Choice(float(radii[middling(radii)]), False, 0.0, 0.0)
-    weights = relative_weights(mean)
     fine = np.exp(np.linspace(np.log(radii[0]), np.log(radii[-1]), 16 * len(radii)))
-    ways, best = {False: (plain, 0.0)}, plain
+    if not np.any(plain):
+        return Expected(radii, fine, {}, {})
+    weights = relative_weights(mean)
+    ways, edges, best = {False: plain}, {False: 0.0}, plain
     if corrected is not None:
         added, lacking, doubt = light_lost_at_edges(plain, corrected, weights)
         wrong = {False: lacking ** 2 + doubt ** 2, True: (1 - lacking) ** 2 + doubt ** 2}
-        ways = {way: (samples, between(fine, radii, added * wrong[way])) for way, samples in ((False, plain), (True, corrected))}
+        ways, edges = {False: plain, True: corrected}, {way: between(fine, radii, added * wrong[way]) for way in wrong}
         best = plain + lacking[:, None] * (corrected - plain)
     _, difference, error = noise_and_difference(radii, best, weights, at_first_vertex)
     blur = expected_squared_bias(radii, difference, error, len(plain), fine)
+    return Expected(radii, fine, {way: blur + edges[way] for way in ways},
+                    {way: noise_and_difference(radii, samples, weights, at_first_vertex, alike)[0] for way, samples in ways.items()})
+
+
+def best_radius(expected, iterations, used=None, reluctance=0.0, more_noise=None):
+    """The `Choice` that minimises the predicted relative error; `used`, a radius and whether it corrects, if the least error is not below its by more
+    than this share, `reluctance`.
+
+    `expected`: an `Expected`; `iterations(R, corrected)`: how many iterations there will be, so that larger gathers and the correction are charged for;
+    `more_noise`: by whether it corrects, how much more variance than that of the pilot an iteration has, one a radius (less, if negative), because it
+    averages another number of camera paths. Where no photon was met, nothing speaks for any radius, and it is a middling one.
+    """
+    radii, fine = expected.ladder, expected.fine
     choices = []
-    for way, (samples, edges) in ways.items():
-        variance = noise_and_difference(radii, samples, weights, at_first_vertex, alike)[0]
+    for way, bias in expected.squared_bias.items():
+        variance = expected.variance[way]
         if more_noise:
             variance = np.maximum(variance + more_noise[way], LEAST_NOISE * variance)
         variance = between(fine, radii, variance)
-        bias = blur + edges
         predicted = bias + variance / iterations(fine, way)
         at = int(np.argmin(predicted))
         choices.append((float(predicted[at]), Choice(float(fine[at]), way, float(bias[at]), float(variance[at]))))
         if used is not None and used[1] == way:
             at = int(np.argmin(np.abs(np.log(fine / used[0]))))
             choices.append((float(predicted[at]) * (1 - reluctance), Choice(used[0], way, float(bias[at]), float(variance[at]))))
-    return min(choices)[1]
+    return min(choices)[1] if choices else Choice(float(radii[middling(radii)]), False, 0.0, 0.0)
 
 
 def between(wanted, radii, values):
