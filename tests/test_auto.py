@@ -17,7 +17,7 @@ from foggy import world as foggy_world
 from mis_integrators.integrators import costs
 from mis_integrators.transport.census import mean_segments
 from test_against_path import MONO, RGB, SPECTRAL, caustic_scene
-from test_bdpm import always_choose_camera_paths, glossy_box, last_words
+from test_bdpm import always_choose_camera_paths, box_scene, glossy_box, last_words
 from worlds import diffuse, film, look, path, tray
 
 
@@ -159,6 +159,28 @@ def test_longer_renders_try_more(rgb):
     scene = glossy_box()
     short, long = (sum(name.startswith("choice.relmse") for name in decided(scene, spp).settings) for spp in (4, 4000))
     assert short <= 2 < long
+
+
+@pytest.mark.parametrize("price, spp, tried", [(1e-4, 24, {"bdpm_opt2"}), (1e4, 24, set()), (1e-4, 4, set())])
+def test_weights_are_worth_more_time_where_path_keeps_up(rgb, monkeypatch, price, spp, tried):
+    """One mixture is tried beyond the pilot's usual share, if there is some time left, where camera paths find much of the light by themselves."""
+    monkeypatch.setitem(costs.PRICES, "path", {"camera": price, "light": 0, "gathered": 0, "pixel": 0})
+    metal = {"type": "sphere", "center": [0, -1.3, 0.4], "radius": 0.3, "bsdf": {"type": "roughconductor", "alpha": 0.3}}
+    settings = decided(box_scene(metal=metal), spp).settings
+    errors = {name.removeprefix("choice.relmse.") for name in settings if name.startswith("choice.relmse.")}
+    assert errors == {"path", "bdpm bdd=0"} | tried
+    assert any(("30%" if price < 1 and not tried else "5%") in reason for name, reason in settings.items() if name.startswith("choice.because"))
+
+
+@pytest.mark.parametrize("material, first", [({"type": "roughdielectric", "alpha": 0.1}, "bdpm_opt3"), ({"type": "roughplastic"}, "bdpm_opt2"),
+                                             ({"type": "dielectric"}, "bdpm_opt2")])
+def test_rough_glass_is_for_three_strategies(rgb, material, first):
+    """Its two sides are in the way of what photons are good at."""
+    from mis_integrators.integrators.choice import PHOTON_MAPPERS, later_candidates
+    from mis_integrators.transport.traits import SceneTraits
+    scene = mi.load_dict({"type": "scene", "ball": {"type": "sphere", "bsdf": material}, "sky": {"type": "constant"}})
+    candidates = later_candidates(SceneTraits(scene))
+    assert candidates[0][0] == first and {name for name, _ in candidates} == {name for name, _ in PHOTON_MAPPERS}
 
 
 @pytest.mark.parametrize("seconds, tried", [(0.5, False), (1000.0, True)])

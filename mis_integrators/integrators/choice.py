@@ -21,10 +21,15 @@ from . import costs
 from .pilot import FEWEST_ITERATIONS, PILOT_INDEX, UNPLANNED_ITERATIONS, pilot_pixels
 from .unidirectional import PathSession
 
-PHOTON_MAPPERS = (("bdpm", {"bdd": 0}), ("bdpm_opt2", {}), ("bdpm", {"bdd": 1}), ("bdpm_opt3", {}))
-"""In the order in which they are tried while the pilot's share of the time lasts: those first that are most often the best."""
+PHOTON_MAPPERS = FIRST, OPT2, LATER, OPT3 = ("bdpm", {"bdd": 0}), ("bdpm_opt2", {}), ("bdpm", {"bdd": 1}), ("bdpm_opt3", {})
+"""The first is tried in any case."""
 PILOT_SHARE = 0.05
 """Share of the planned time that the pilot may have; `path` and the first photon mapper are tried however long that takes."""
+KEEPS_UP = 4
+"""Where the error expected of `path` is at most so many times that of the first photon mapper, camera paths find much of the light by themselves, and what
+spoils photon maps are highlights on glossy surfaces: optimal weights are likely to be the best."""
+WORTH_SHARE = 0.3
+"""The share of the time that is left that a trial may then take. If it is won, nothing of it was in vain."""
 LIKE_THE_FIRST = 2.5
 """What trying another photon mapper takes, in the seconds that the first one took (optimal weights have to learn first): 1.6 to 3."""
 PATH_TRIALS = 12
@@ -85,7 +90,7 @@ def choose(integrator, scene, sensor, seed, iterations, seconds):
     """The `Decision` for a render of so many iterations, or of so many seconds (either may be `None`)."""
     began = time.perf_counter()
     path = PathSession(integrator, scene, sensor, seed, iterations)
-    plugin, parameters = PHOTON_MAPPERS[0]
+    plugin, parameters = FIRST
     first = new_session(plugin, parameters, integrator, scene, sensor, seed, iterations)
     if not first.kinds():
         return Decision("path", {}, path, [_no_photons(integrator, first)])
@@ -106,7 +111,8 @@ def choose(integrator, scene, sensor, seed, iterations, seconds):
         reasons.append(blind)
     else:
         trials.insert(0, _try_path(path, segments, stride, pixels, forecast.mean))
-    for plugin, parameters in PHOTON_MAPPERS[1:]:
+    weighting = not blind and trials[0].error(budget) < KEEPS_UP * trials[1].error(budget)
+    for plugin, parameters in later_candidates(first.traits):
         name = name_of(plugin, parameters)
         if plugin.startswith("bdpm_opt") and not first.traits.has_rough:
             reasons.append(f"not {name}: all smooth surfaces are diffuse, where one strategy does as well")
@@ -115,12 +121,14 @@ def choose(integrator, scene, sensor, seed, iterations, seconds):
             reasons.append(f"not {name}: merging at the second vertex does not pay, let alone at the third")
             continue
         if seconds is None:
-            left = PILOT_SHARE * budget - spent - FEWEST_ITERATIONS * usual * 0.5
+            whole, gone, takes = budget, spent, FEWEST_ITERATIONS * usual * 0.5
         else:
-            left = PILOT_SHARE * seconds - (time.perf_counter() - began) - LIKE_THE_FIRST * first_seconds
-        if left < 0:
-            reasons.append(f"not {name}: trying it would take more than {PILOT_SHARE:.0%} of the time")
+            whole, gone, takes = seconds, time.perf_counter() - began, LIKE_THE_FIRST * first_seconds
+        likely = weighting and plugin.startswith("bdpm_opt")
+        if gone + takes > PILOT_SHARE * whole and not (likely and takes < WORTH_SHARE * (whole - gone)):
+            reasons.append(f"not {name}: trying it would take more than {WORTH_SHARE if likely else PILOT_SHARE:.0%} of the time")
             continue
+        weighting &= not likely
         session = new_session(plugin, parameters, integrator, scene, sensor, seed, max(int(budget / usual), 1), (first.traits, first.lights))
         session.judged_by, session.seconds, session.begun = forecast.mean, seconds, began
         session.start()
@@ -137,6 +145,12 @@ def choose(integrator, scene, sensor, seed, iterations, seconds):
             trial.session = None                              # its photons' and kernels' memory is free to go
     errors = {trial.name: float(trial.error(budget)) for trial in trials}
     return Decision(best.plugin, best.parameters, best.session, reasons, errors, trials, usual)
+
+
+def later_candidates(traits):
+    """Photon mappers, those first that are most often the best. Within and behind rough glass camera paths meet it twice before photons are of use: three
+    strategies."""
+    return (OPT3, OPT2, LATER) if traits.has_rough_glass else (OPT2, LATER, OPT3)
 
 
 def new_session(plugin, parameters, integrator, scene, sensor, seed, iterations, survey=None):

@@ -90,9 +90,9 @@ class SceneTraits:
     """What a scene is made of.
 
     Attributes: `bounds` (bounding box), `has_delta` (perfectly specular or null scattering somewhere), `has_mixed` (BSDFs with both a
-    smooth and a delta part), `has_rough` (smooth scattering that is not Lambertian), `has_lambertian`, `has_perturbed` (bump or
-    normal maps), `has_light_surfaces` (emitters that a ray can meet: area lights, environments), `lambertian`, `perturbed`
-    (registry tables for BSDF pointers).
+    smooth and a delta part), `has_rough` (smooth scattering that is not Lambertian), `has_rough_glass` (rough refraction), `has_lambertian`,
+    `has_perturbed` (bump or normal maps), `has_light_surfaces` (emitters that a ray can meet: area lights, environments), `lambertian`,
+    `perturbed` (registry tables for BSDF pointers).
     """
 
     def __init__(self, scene):
@@ -109,6 +109,7 @@ class SceneTraits:
         self.perturbed = registry_table(bsdfs, mi.BSDFPtr, perturbed, mi.Bool)
         # Nested BSDFs count on their own, so a perturbed (bump- or normal-mapped) Lambertian shows through its wrapper.
         self.has_rough = any((f & flag.Smooth) and not l for f, l in zip(flags, lambertian))
+        self.has_rough_glass = any(f & flag.GlossyTransmission for f in flags)
         self.lambertian = registry_table(bsdfs, mi.BSDFPtr, lambertian, mi.Bool)
         delta = mi.EmitterFlags.DeltaPosition | mi.EmitterFlags.DeltaDirection
         self.has_light_surfaces = any(not (e.flags() & delta) for e in scene.emitters())
