@@ -12,7 +12,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from . import checkpoint, cluster, loading, output
+from . import again, checkpoint, cluster, loading, output
 from .checkpoint import Checkpoint, CheckpointError
 from .opening import Request
 from .options import parse, versions
@@ -53,9 +53,14 @@ def main(arguments: list[str] | None = None) -> int:
 def _run(options: argparse.Namespace, interrupt: Interrupt) -> int:
     _check_output(options.output)
     try:
+        learned, different = again.follow(options.like, options) if options.like else ({}, None)
+        if different and not options.quiet:
+            print(f"mis-render: {different}; this image may differ", file=sys.stderr)
         needs_views = "--all-views" if options.all_views else "--frames" if options.frames else None
         opened = _request(options).open(needs_views)
         session: Any = opened.session
+        if learned:
+            session.recall(learned)
         loaded = opened.loaded
         identity = opened.identity() if options.checkpoint else {}
         keep_variance = bool(options.checkpoint or options.target_error)
@@ -75,6 +80,7 @@ def _run(options: argparse.Namespace, interrupt: Interrupt) -> int:
         raise Failure(EXIT_CLUSTER, str(error)) from error
 
     metadata = _metadata(options, loaded, session, clock)
+    metadata[again.ATTRIBUTE] = again.note(options, session, opened.session.learned)
     if target:
         target.update(session)
         metadata["relativeError"] = target.error

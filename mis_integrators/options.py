@@ -43,12 +43,15 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     add("--target-error", type=_positive_number, metavar="E",
         help="stop when the estimated relative error of the image is E or less, such as 0.05: the root mean square over the pixels of standard "
         "deviation over brightness, without the worst 0.1 %% of the pixels; --spp or --time are then upper bounds, and there is none without them")
-    add("--seed", type=_seed, default=0, metavar="S", help="seed of the random numbers (default: 0)")
+    add("--like", type=Path, metavar="FILE.exr",
+        help="render again what this image of mis-render shows: with its integrator, parameters, seed and samples, and what was found out for it, such "
+        "as merge radii; the scene must be the same")
+    add("--seed", type=_seed, metavar="S", help="seed of the random numbers (default: 0)")
     add("--sensor", type=_integer, default=None, metavar="N", help="index of the sensor (default: 0)")
     add("--all-views", action="store_true",
         help="render all views of the scene together (all sensors, and the children of a batch) into a contact sheet")
     add("--frames", action="store_true", help="also write each view, FILE.000.png and so on: frames of an animation")
-    add("--variant", default="llvm_ad_rgb", choices=mi.variants(), metavar="V", help="Mitsuba's variant (default: llvm_ad_rgb)")
+    add("--variant", choices=mi.variants(), metavar="V", help="Mitsuba's variant (default: llvm_ad_rgb)")
     add("--checkpoint", type=_positive_number, metavar="SECONDS",
         help="keep what has been rendered in FILE.checkpoint, every so many seconds and at the end")
     add("--resume", action="store_true",
@@ -72,7 +75,15 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
         parser.error(f"argument -o: {options.output} does not end in .exr")
     if options.all_views and options.sensor is not None:
         parser.error("argument --sensor: not allowed with argument --all-views")
+    if options.like:
+        for flag in ("-i plugin", "-D variables", "-P parameters", "--spp", "--time", "--target-error", "--seed", "--sensor", "--all-views", "--variant"):
+            if getattr(options, flag.split()[-1].lstrip("-").replace("-", "_")) not in (None, False, []):
+                parser.error(f"argument {flag.split()[0]}: not allowed with argument --like")
+        if options.like.resolve() == options.output.resolve():
+            parser.error(f"argument -o: {options.output} is the image of --like")
     options.sensor = options.sensor or 0
+    options.seed = options.seed or 0
+    options.variant = options.variant or "llvm_ad_rgb"
     if options.resume and not options.checkpoint:
         options.checkpoint = 60.0
     return options

@@ -583,7 +583,8 @@ def test_noise_of_several_camera_paths_is_foreseen(rgb, plugin, given, camera_pa
 
 
 def always_choose_camera_paths(monkeypatch, camera_paths):
-    """Every pilot that may choose a number of camera paths chooses this one."""
+    """Every pilot that may choose a number of camera paths chooses this one, however short the render."""
+    monkeypatch.setattr("mis_integrators.integrators.pilot.LONG", 0)
     def choose(pilot, *_):
         pilot.camera_paths = camera_paths
         pilot.session.send(camera_paths)

@@ -55,7 +55,7 @@ class FakeSession:
     iterations_planned = 5
     samples_per_iteration = 2
     channels = ["R", "G", "B", "var.R"]
-    settings = {"initial_radius": 0.5}
+    settings, learned = {"initial_radius": 0.5}, {}
 
     def __init__(self, seconds=0.0, on_iteration=lambda iterations: None):
         self.iterations, self.planned_seconds = 0, None

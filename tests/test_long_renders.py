@@ -14,8 +14,11 @@ import numpy as np
 import pytest
 from lamplit import LAMP, ROOT, SCENE, command, read, render, run, same, write_scene
 
+from test_bdpm import always_choose_camera_paths
+
 from mis_integrators import checkpoint, cli, fingerprint, loading, output, stopping
 from mis_integrators.checkpoint import Checkpoint, CheckpointError
+from mis_integrators.integrators import costs
 from mis_integrators.session import make_session
 from mis_integrators.sums import Iterations, Sums
 
@@ -198,6 +201,58 @@ def test_finished_render_is_extended(scene, tmp_path, capsys):
     capsys.readouterr()
     assert render(scene, *out, "--spp", 8, "--checkpoint", 100) == 4
     assert "--resume" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("arguments, price", [
+    (["-i", "bdpm", "-P", "bdd=0", "-D", "size=16"], None), (["-i", "bdpm_auto", "-P", "max_depth=4"], 1e-6), (["-i", "bdpm_auto", "-P", "max_depth=4"], 1e6),
+    (["-i", "bdpm_opt2", "-P", "mix_diffuse=true"], None), (["-i", "volpath_multiview"], None), (["-i", "path"], None)])
+def test_image_is_rendered_again_from_itself(scene, tmp_path, monkeypatch, arguments, price):
+    """Whatever the clock decided: camera paths, radii, the method, the number of iterations."""
+    always_choose_camera_paths(monkeypatch, 3)
+    if price:
+        monkeypatch.setitem(costs.PRICES, "path", {"camera": price, "light": 0, "gathered": 0, "pixel": 0})
+    one, other = tmp_path / "a.exr", tmp_path / "b.exr"
+    assert render(scene, *arguments, "--time", 0.2, "--seed", 7, "-o", one) == 0
+    monkeypatch.undo()
+    assert render(scene, "--like", one, "-o", other) == 0
+    (told, image), (again, same_image) = read(one), read(other)
+    told, again = ({name: value for name, value in header.items() if isinstance(value, (int, float, str)) and not name.endswith("Time")}
+                   for header in (told, again))
+    del told["again"], again["again"]
+    assert told == again
+    assert same(image, same_image) and told["seed"] == 7
+    if "bdpm" in arguments:
+        assert told["camera_paths"] == 3 and told["spp"] == 3 * told["iterations"]
+
+
+@pytest.mark.parametrize("plugin, price, paths", [("bdpm", None, 3), ("bdpm_auto", 1e6, 3), ("bdpm_auto", 1e-6, 4)])
+def test_samples_asked_for_are_made_whatever_was_learned(scene, tmp_path, monkeypatch, plugin, price, paths):
+    """A timed render that takes several camera paths an iteration goes on to a number of samples."""
+    always_choose_camera_paths(monkeypatch, 3)
+    film = loading.load(scene, {}, plugin, {}).scene.sensors()[0].film()
+    monkeypatch.setattr("mis_integrators.integrators.unidirectional.BUSY", 4 * int(np.prod(film.size())))
+    if price:
+        monkeypatch.setitem(costs.PRICES, "path", {"camera": price, "light": 0, "gathered": 0, "pixel": 0})
+    out = ["-i", plugin, "-o", tmp_path / "a.exr"]
+    assert render(scene, *out, "--time", 0.01, "--checkpoint", 100) == 0
+    header, _ = read(tmp_path / "a.exr")
+    assert header["camera_paths"] == paths and header["spp"] == paths * header["iterations"]
+    assert render(scene, *out, "--spp", header["spp"] + 3 * paths, "--resume") == 0
+    longer, _ = read(tmp_path / "a.exr")
+    assert longer["spp"] - header["spp"] == 3 * paths and longer["iterations"] == header["iterations"] + 3
+
+
+@pytest.mark.parametrize("image, arguments, code, message", [
+    ("picture.exr", [], 1, "not an image of mis-render"), ("scene.xml", [], 1, "not an image"), ("none.exr", [], 1, "cannot be read"),
+    ("picture.exr", ["--seed", 3], 2, "argument --seed: not allowed with argument --like"), ("a.exr", [], 2, "is the image of --like")])
+def test_what_cannot_be_rendered_again(scene, tmp_path, capsys, image, arguments, code, message):
+    mi.Bitmap(np.zeros((4, 4, 3), np.float32)).write(str(tmp_path / "picture.exr"))
+    try:
+        found = render(scene, "--like", tmp_path / image, "-o", tmp_path / "a.exr", *arguments)
+    except SystemExit as exit:
+        found = exit.code
+    error = capsys.readouterr().err
+    assert found == code and message in error and (code == 2 or error.count("\n") == 1)
 
 
 def test_sigterm_is_like_ctrl_c(scene, tmp_path):

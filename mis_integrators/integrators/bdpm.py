@@ -289,6 +289,7 @@ class BDPMSession(IterativeSession):
     def recall(self, learned):
         if learned:
             self.radii, self.corrected = dict(learned["radii"]), dict(learned["corrected"])
+            self.resize(learned["camera_paths"])
             self.send(learned["camera_paths"])
 
     def _iteration(self, iteration):

@@ -103,6 +103,7 @@ class AutoSession(IterativeSession):
             session = new_session(learned["plugin"], learned["parameters"], self.integrator, self.scene, self.sensor, self.seed,
                                   self.iterations_planned)
             session.recall(learned["session"])
+            self.iterations_planned = session.iterations_planned
             self._take(Decision(learned["plugin"], learned["parameters"], session, learned["reasons"], learned["errors"]))
 
     def _iteration(self, iteration):

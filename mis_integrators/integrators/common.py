@@ -186,6 +186,12 @@ class IterativeSession:
     def recall(self, learned):
         """Takes over what another session of the same render has `learned`; before the first iteration."""
 
+    def resize(self, camera_paths):
+        """Makes iterations of another number of camera paths a pixel; about as many samples as before are planned."""
+        if self.iterations_planned:
+            self.iterations_planned = math.ceil(self.iterations_planned * self.samples_per_iteration / camera_paths)
+        self.samples_per_iteration = camera_paths
+
     @property
     def settings(self):
         """Names and values that reproduce the image, together with the scene."""

@@ -35,6 +35,14 @@ class PathSession(IterativeSession):
     def settings(self):
         return {**super().settings, "integrator": "path"}
 
+    @property
+    def learned(self):
+        return {"camera_paths": self.samples_per_iteration}
+
+    def recall(self, learned):
+        self.resize(learned["camera_paths"])
+        self.split_paths(CHUNK)
+
     def trace(self, iteration, chunk, first, stride, paths, spectral, variation=0):
         """Radiance and alpha of camera paths `first`, `first + stride`, ..., and their positions on the film. Where `first` and `variation` are
         arrays, each lane has its own, and the paths of one number differ with the variation."""
