@@ -30,19 +30,19 @@ PLUGINS = {
 }
 SLACK, BLUR = 0.002, 0.03
 """Relative to the brightness of a region and of the image together: single precision; what merging at such a radius may take from shapes' edges."""
-DEPTH = 4
+DEPTH, MOST = 4, 480
 
 
 # --- Random scenes ------------------------------------------------------------------------------------
 
 
 def compare(scene, plugin, whole):
-    """Against `path`, over the image and its quarters, until an error of `whole` in the image would be seen, or 160 iterations are done."""
+    """Against `path`, over the image and its quarters, until an error of `whole` in the image would be seen, or `MOST` iterations are done."""
     common = {"max_depth": DEPTH, "rr_depth": 100}
     loaded = mi.load_dict(scene)
     ours = SessionBatches(mi.load_dict({"type": plugin, **PLUGINS[plugin], **common}), loaded, blocks=2)
     path = PathBatches(mi.load_dict({"type": "path", **common}), loaded, blocks=2, spp=128)
-    estimates = collect_until(ours, path, whole, 3 * whole, start=24, most=160)
+    estimates = collect_until(ours, path, whole, 3 * whole, start=24, most=MOST)
     brightness = estimates[1].mean[0].mean()
     lifted = [Estimate(e.mean + brightness, e.error2, e.freedom) for e in estimates]
     found = differences(*lifted, slack=BLUR if "initial_radius" in PLUGINS[plugin] else SLACK)

@@ -69,6 +69,17 @@ def test_share_lost_at_edges_is_found(reach, seed):
     assert np.all(doubt[-2:] < 0.1)
 
 
+def test_shares_known_from_three_iterations_are_not_believed():
+    """Their standard errors are now and then far too small: how often the share that the largest disks lack is off by more than two of its standard
+    deviations. 2.3 % of the pilots, 10.7 % if the errors were taken as they are. (600 pilots: false-alarm rate below 1e-5.)"""
+    off = 0
+    for seed in range(600):
+        plain, corrected = (samples[..., ::16] for samples in pilot(3, seed, noise=0.3))
+        share, doubt = (values[-1] for values in radius.light_lost_at_edges(plain, corrected, np.ones(PIXELS // 16))[1:])
+        off += abs(share - 1) > 2 * doubt
+    assert off < 0.06 * 600
+
+
 def test_edges_are_believed_in_without_evidence():
     plain, corrected = pilot(3, 0, noise=30)
     _, share, doubt = radius.light_lost_at_edges(plain, corrected, np.ones(PIXELS))
@@ -120,12 +131,12 @@ def test_a_blind_pilot_still_expects_blur():
     assert np.all(np.diff(found) > 0)
 
 
-@pytest.mark.parametrize("reach, corrects", [(np.inf, True), (RADII[1], False)])
+@pytest.mark.parametrize("reach, corrects, curvature, most", [(np.inf, True, 0.08, 1.25), (np.inf, True, 0.01, 1.4), (RADII[1], False, 0.08, 1.25)])
 @pytest.mark.parametrize("count", [10, 100])
-def test_choice_is_nearly_the_best(reach, corrects, count):
-    """The true error of the choice stays within 1.25 times that of the best radius and way, in the geometric mean over twelve pilots of three
-    iterations each."""
-    noise, curvature = 0.02, 0.08
+def test_choice_is_nearly_the_best(reach, corrects, curvature, most, count):
+    """The true error of the choice stays within `most` times that of the best radius and way, in the geometric mean over twelve pilots of three
+    iterations each; also where hardly any blur is left once the edges are corrected, which so few iterations do not tell as well."""
+    noise = 0.02
 
     def true_error(r, way):
         added, lost = losses(r, reach)
@@ -139,7 +150,7 @@ def test_choice_is_nearly_the_best(reach, corrects, count):
         chosen, way, *_ = radius.best_radius(radius.expect(RADII, plain, corrected, np.ones(PIXELS)), lambda r, corrected: count * np.ones_like(r))
         ratios.append(true_error(chosen, way) / best)
         ways.append(way)
-    assert np.exp(np.mean(np.log(ratios))) < 1.25
+    assert np.exp(np.mean(np.log(ratios))) < most
     assert round(np.mean(ways)) == corrects
 
 

@@ -28,6 +28,11 @@ g(u) = (acos u - u sqrt(1 - u^2)) / pi, and the ratio is the integral of g(u)^2 
 LEAST_BIAS, MOST_BIAS = 0.003, 1.0
 """Squared relative bias that disks of the ladder's largest radius can have, however little of it a short pilot sees. (In Cornell boxes, a
 corridor, rooms lit through a door or a window it is 0.002 to 0.04.)"""
+LEAST_CORRECTED = 1e-4
+"""The same where the correction at edges adds what plain estimates lack (1e-4 to 1.6e-3 in Cornell boxes)."""
+UNKNOWN_ERROR = 2
+"""A standard error known from n + 1 iterations counts for 1 + UNKNOWN_ERROR / n times what they say, about as Student's 95 % intervals are wider than
+normal ones."""
 FEW_MET = 64
 """Merge disks that met photons, fewer than which tell nothing of the noise of that radius."""
 RARE_PIXELS = 0.001
@@ -138,6 +143,7 @@ def light_lost_at_edges(plain, corrected, weights):
     squared = np.maximum(expected_products(added, added, weights), 0)
     lost, error = with_error(plain[:, :-1] - plain[:, 1:], added[:, 1:], weights)
     expected = np.maximum(expected_products(np.diff(added, axis=1), added[:, 1:], weights), 1e-12)
+    error *= 1 + UNKNOWN_ERROR / (len(plain) - 1)
     share, variance = shares_by_step(lost / expected, (error / expected) ** 2)
     step = np.concatenate([[max(squared[0], 1e-12)], expected])
     total = np.cumsum(step)
@@ -165,15 +171,15 @@ def squared_bias_over_difference(exponent):
     return at_edges * (by_curvature / at_edges) ** ((exponent - low) / (high - low))
 
 
-def expected_squared_bias(radii, difference, error, iterations, wanted):
+def expected_squared_bias(radii, difference, error, iterations, wanted, least=LEAST_BIAS):
     """Squared bias at the radii `wanted`, from noisy Q at the ladder: the mean over power laws Q = a R^q, each weighted by how well it
-    explains the values (flat in q between 1, edges, and 4, curvature, and in the logarithm of the squared bias at the largest radius).
+    explains the values (flat in q between 1, edges, and 4, curvature, and in the logarithm of the squared bias at the largest radius, `least` or more).
 
     The `error` of Q is itself estimated from a few `iterations`, and often too small by far: misfits follow Student's distribution.
     """
     slopes = np.linspace(AT_EDGES[0], BY_CURVATURE[0], 31)[:, None, None]
     ratio = squared_bias_over_difference(slopes)
-    heights = np.geomspace(LEAST_BIAS, MOST_BIAS, 100)[None, :, None]     # squared bias at the largest radius
+    heights = np.geomspace(least, MOST_BIAS, 100)[None, :, None]     # squared bias at the largest radius
     law = heights / ratio * (radii[1:] / radii[-1]) ** slopes
     spread = np.hypot(error[1:], 0.15 * law) + 1e-12
     freedom = max(iterations - 1, 1)
@@ -222,14 +228,15 @@ def expect(radii, plain, corrected, mean, at_first_vertex=True, alike=False):
     if not np.any(plain):
         return Expected(radii, fine, {}, {})
     weights = relative_weights(mean)
-    ways, edges, best = {False: plain}, {False: 0.0}, plain
+    ways, edges, best, least = {False: plain}, {False: 0.0}, plain, LEAST_BIAS
     if corrected is not None:
         added, lacking, doubt = light_lost_at_edges(plain, corrected, weights)
         wrong = {False: lacking ** 2 + doubt ** 2, True: (1 - lacking) ** 2 + doubt ** 2}
         ways, edges = {False: plain, True: corrected}, {way: between(fine, radii, added * wrong[way]) for way in wrong}
         best = plain + lacking[:, None] * (corrected - plain)
+        least *= (LEAST_CORRECTED / LEAST_BIAS) ** min(max(lacking[-1], 0.0), 1.0)
     _, difference, error = noise_and_difference(radii, best, weights, at_first_vertex)
-    blur = expected_squared_bias(radii, difference, error, len(plain), fine)
+    blur = expected_squared_bias(radii, difference, error, len(plain), fine, least)
     return Expected(radii, fine, {way: blur + edges[way] for way in ways},
                     {way: noise_and_difference(radii, samples, weights, at_first_vertex, alike)[0] for way, samples in ways.items()})
 
