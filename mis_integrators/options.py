@@ -76,9 +76,12 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     if options.all_views and options.sensor is not None:
         parser.error("argument --sensor: not allowed with argument --all-views")
     if options.like:
-        for flag in ("-i plugin", "-D variables", "-P parameters", "--spp", "--time", "--target-error", "--seed", "--sensor", "--all-views", "--variant"):
-            if getattr(options, flag.split()[-1].lstrip("-").replace("-", "_")) not in (None, False, []):
-                parser.error(f"argument {flag.split()[0]}: not allowed with argument --like")
+        told = {"-i": options.plugin, "-D": options.variables or None, "-P": options.parameters or None, "--spp": options.spp, "--time": options.time,
+                "--target-error": options.target_error, "--seed": options.seed, "--sensor": options.sensor, "--all-views": options.all_views or None,
+                "--variant": options.variant}
+        for flag, value in told.items():
+            if value is not None:
+                parser.error(f"argument {flag}: not allowed with argument --like")
         if options.like.resolve() == options.output.resolve():
             parser.error(f"argument -o: {options.output} is the image of --like")
     options.sensor = options.sensor or 0

@@ -32,6 +32,11 @@ def decided(scene, spp=8, **parameters):
     return session
 
 
+def set_price_of_path(monkeypatch, price):
+    """Lets a segment of `path` cost so much, and nothing else of it."""
+    monkeypatch.setitem(costs.PRICES, "path", {"camera": price, "light": 0, "gathered": 0, "pixel": 0})
+
+
 class Unidirectional:
     """Stands for an integrator whose sessions are `PathSession`s."""
 
@@ -126,7 +131,7 @@ def test_path_is_not_chosen_where_it_is_blind(rgb, emitter):
 def test_the_cheaper_wins(rgb, monkeypatch):
     """The same scene, the same pilot: what is chosen follows the costs."""
     def at(price):
-        monkeypatch.setitem(costs.PRICES, "path", {"camera": price, "light": 0, "gathered": 0, "pixel": 0})
+        set_price_of_path(monkeypatch, price)
         return decided(tray("lambertian", "rectangle")).settings
     cheap, dear = at(1e-4), at(1e4)
     assert cheap["choice"] == "path" and dear["choice"] != "path"
@@ -137,7 +142,7 @@ def test_the_cheaper_wins(rgb, monkeypatch):
 @pytest.mark.parametrize("seconds, samples", [(1000.0, 8), (None, 1)])
 def test_a_path_of_given_time_keeps_the_processor_busy(rgb, monkeypatch, seconds, samples):
     """A launch of one sample a pixel is too small on small films; what is predicted of `path` is the same, however many it takes together."""
-    monkeypatch.setitem(costs.PRICES, "path", {"camera": 1e-4, "light": 0, "gathered": 0, "pixel": 0})
+    set_price_of_path(monkeypatch, 1e-4)
     scene = tray("lambertian", "rectangle")
     monkeypatch.setattr("mis_integrators.integrators.unidirectional.BUSY", 8 * int(np.prod(scene.sensors()[0].film().size())))
     session = auto().session(scene, spp=0 if seconds else 8)
@@ -164,7 +169,7 @@ def test_longer_renders_try_more(rgb):
 @pytest.mark.parametrize("price, spp, tried", [(1e-4, 24, {"bdpm_opt2"}), (1e4, 24, set()), (1e-4, 4, set())])
 def test_weights_are_worth_more_time_where_path_keeps_up(rgb, monkeypatch, price, spp, tried):
     """One mixture is tried beyond the pilot's usual share, if there is some time left, where camera paths find much of the light by themselves."""
-    monkeypatch.setitem(costs.PRICES, "path", {"camera": price, "light": 0, "gathered": 0, "pixel": 0})
+    set_price_of_path(monkeypatch, price)
     metal = {"type": "sphere", "center": [0, -1.3, 0.4], "radius": 0.3, "bsdf": {"type": "roughconductor", "alpha": 0.3}}
     settings = decided(box_scene(metal=metal), spp).settings
     errors = {name.removeprefix("choice.relmse.") for name in settings if name.startswith("choice.relmse.")}

@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 from lamplit import LAMP, ROOT, SCENE, command, read, render, run, same, write_scene
 
+from test_auto import set_price_of_path
 from test_bdpm import always_choose_camera_paths
 
 from mis_integrators import checkpoint, cli, fingerprint, loading, output, stopping
 from mis_integrators.checkpoint import Checkpoint, CheckpointError
-from mis_integrators.integrators import costs
 from mis_integrators.session import make_session
 from mis_integrators.sums import Iterations, Sums
 
@@ -210,7 +210,7 @@ def test_image_is_rendered_again_from_itself(scene, tmp_path, monkeypatch, argum
     """Whatever the clock decided: camera paths, radii, the method, the number of iterations."""
     always_choose_camera_paths(monkeypatch, 3)
     if price:
-        monkeypatch.setitem(costs.PRICES, "path", {"camera": price, "light": 0, "gathered": 0, "pixel": 0})
+        set_price_of_path(monkeypatch, price)
     one, other = tmp_path / "a.exr", tmp_path / "b.exr"
     assert render(scene, *arguments, "--time", 0.2, "--seed", 7, "-o", one) == 0
     monkeypatch.undo()
@@ -232,7 +232,7 @@ def test_samples_asked_for_are_made_whatever_was_learned(scene, tmp_path, monkey
     film = loading.load(scene, {}, plugin, {}).scene.sensors()[0].film()
     monkeypatch.setattr("mis_integrators.integrators.unidirectional.BUSY", 4 * int(np.prod(film.size())))
     if price:
-        monkeypatch.setitem(costs.PRICES, "path", {"camera": price, "light": 0, "gathered": 0, "pixel": 0})
+        set_price_of_path(monkeypatch, price)
     out = ["-i", plugin, "-o", tmp_path / "a.exr"]
     assert render(scene, *out, "--time", 0.01, "--checkpoint", 100) == 0
     header, _ = read(tmp_path / "a.exr")
@@ -244,7 +244,8 @@ def test_samples_asked_for_are_made_whatever_was_learned(scene, tmp_path, monkey
 
 @pytest.mark.parametrize("image, arguments, code, message", [
     ("picture.exr", [], 1, "not an image of mis-render"), ("scene.xml", [], 1, "not an image"), ("none.exr", [], 1, "cannot be read"),
-    ("picture.exr", ["--seed", 3], 2, "argument --seed: not allowed with argument --like"), ("a.exr", [], 2, "is the image of --like")])
+    ("picture.exr", ["--seed", 3], 2, "argument --seed: not allowed with argument --like"), ("picture.exr", ["--seed", 0], 2, "argument --seed: not allowed"),
+    ("a.exr", [], 2, "is the image of --like")])
 def test_what_cannot_be_rendered_again(scene, tmp_path, capsys, image, arguments, code, message):
     mi.Bitmap(np.zeros((4, 4, 3), np.float32)).write(str(tmp_path / "picture.exr"))
     try:

@@ -163,7 +163,7 @@ class BDPMSession(IterativeSession):
 
     def send(self, camera_paths):
         """Sends so many camera paths through each pixel from the next iteration on."""
-        self.samples_per_iteration = camera_paths
+        self.resize(camera_paths)
         self.rehearsed.clear()
         self.split_paths(CAMERA_CHUNK)
         self.vertex_capacity = self._vertex_room(self.chunk)
@@ -289,7 +289,6 @@ class BDPMSession(IterativeSession):
     def recall(self, learned):
         if learned:
             self.radii, self.corrected = dict(learned["radii"]), dict(learned["corrected"])
-            self.resize(learned["camera_paths"])
             self.send(learned["camera_paths"])
 
     def _iteration(self, iteration):
