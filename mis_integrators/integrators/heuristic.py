@@ -121,7 +121,7 @@ class HeuristicWeights:
             if kind == "caustic":
                 before *= bounded_power(self.caustic_share, self.beta)
             elif level < self.strategies - 1:
-                q, deeper = self.notebook().read(level, photon_map.notes, index, active)
+                q, deeper = self.notebook().read(level, photon_map.notes, photon_map.place_of_notes(index, active), active)
                 after = add_ratio(deeper, ratio(p, q), self.beta)
             return mi.Spectrum(weight(before, after))
         return weigh

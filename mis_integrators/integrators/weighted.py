@@ -60,7 +60,7 @@ class WeightedSession(BDPMSession):
         notebook, state = weights.notebook(), [vertices[name] for name in STATE]
 
         def weigh(index, f, p, back, active):
-            return weights.merging(level, state, f, p, notebook.read(level, photon_map.notes, index, active))
+            return weights.merging(level, state, f, p, notebook.read(level, photon_map.notes, photon_map.place_of_notes(index, active), active))
         return weigh
 
     def set_up(self):

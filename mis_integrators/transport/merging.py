@@ -61,7 +61,7 @@ def merge(traits, photon_map, camera, radius, wavelengths, light_paths: int, max
         landing = dr.abs(dr.dot(normal, towards)) * dr.rsqrt(length_squared)
         landing = dr.maximum(dr.maximum(landing, shading * landing_least), 1e-6)
         hit &= dr.max(value) > 0
-        state = dr.gather(mi.Vector2u, photon_map.notes, index, hit)
+        state = dr.gather(mi.Vector2u, photon_map.notes, photon_map.place_of_notes(index, hit), hit)
         share = weigh([bits_float(state.x), bits_float(state.y)], p_camera, p_light)
         return (totals[0] + dr.select(hit, value * flux * (share * dr.rcp(landing)), 0),)
 

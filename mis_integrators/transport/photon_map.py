@@ -61,15 +61,20 @@ class Grid:
 
 
 class PhotonMap:
-    """Sorted photons: a `grid`, `start` (first photon of each table entry), `surface`, `power` and `notes` as in `trace_light_paths`."""
+    """Sorted photons: a `grid`, `start` (first photon of each table entry), `surface` and `power` as in `trace_light_paths`. Its `notes` stay
+    where light sub-paths left them, for few of them are ever read: `place` tells of each sorted photon where."""
 
-    def __init__(self, grid, start, surface, power, notes=None):
-        self.grid, self.start, self.surface, self.power, self.notes = grid, start, surface, power, notes
+    def __init__(self, grid, start, surface, power, notes=None, place=None):
+        self.grid, self.start, self.surface, self.power, self.notes, self.place = grid, start, surface, power, notes, place
 
     def arrays(self):
         """What a recorded function can take; `with_grid` makes the map of it again."""
         arrays = {"start": self.start, "surface": self.surface, "power": self.power}
-        return arrays if self.notes is None else {**arrays, "notes": self.notes}
+        return arrays if self.notes is None else {**arrays, "notes": self.notes, "place": self.place}
+
+    def place_of_notes(self, index, active):
+        """Where among the `notes` those of photon `index` are."""
+        return dr.gather(mi.UInt32, self.place, index, active)
 
     @classmethod
     def with_grid(cls, arrays, bbox, cell, capacity: int):
@@ -80,7 +85,7 @@ class PhotonMap:
 def build_photon_map(surface, power, count, bbox, cell, capacity: int, kind: str, notes=None):
     """Sorts photons into a grid of cells of edge `cell` (width one) over `bbox`.
 
-    `kind`: "all", "caustic" or "indirect" selects the photons; `notes` (None: there are none) goes along. Three passes over the
+    `kind`: "all", "caustic" or "indirect" selects the photons; `notes` (None: there are none) stay unsorted. Three passes over the
     photons: count, prefix sum, scatter.
     """
     size = table_size(capacity)
@@ -103,9 +108,12 @@ def build_photon_map(surface, power, count, bbox, cell, capacity: int, kind: str
     dr.scatter(sorted_surface, record, target, active)
     words = photon_words()
     sorted_power = _moved(power, words, capacity, index, target, active)
-    sorted_notes = None if notes is None else _moved(notes, dr.width(notes) // capacity, capacity, index, target, active)
-    dr.eval(sorted_surface, sorted_power, sorted_notes)
-    return PhotonMap(grid, start, sorted_surface, sorted_power, sorted_notes)
+    place = None
+    if notes is not None:
+        place = dr.empty(mi.UInt32, capacity)
+        dr.scatter(place, index, target, active)
+    dr.eval(sorted_surface, sorted_power, place)
+    return PhotonMap(grid, start, sorted_surface, sorted_power, notes, place)
 
 
 def _moved(source, words, capacity, index, target, active):
