@@ -145,7 +145,7 @@ EMITTERS = {
                                  "emitter": {"type": "area", "radiance": grey(1.5)}}},
     "cube": lambda f: {"e": _lamp("cube", 0.6)},
     "textured": lambda f: {"e": _lamp("rectangle", 0.9, radiance=bitmap(np.stack([1 + 0.8 * waves(1, 1), 1 + 0.5 * waves(2, 1),
-                                                                                 0.5 + 0 * waves(1, 1)], axis=-1)))},
+                                                                                 0.5 + 0 * waves(1, 1)], axis=-1), raw=not mi.is_spectral))},
     "constant": lambda f: {"e": {"type": "constant", "radiance": grey(1.0)}},
     "envmap": lambda f: {"e": _envmap(T().rotate(*Z_UP))},
     "envmap rotated": lambda f: {"e": _envmap(T().rotate([0, 0.6, 0.8], 70).rotate(*Z_UP))},

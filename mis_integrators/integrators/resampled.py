@@ -28,7 +28,7 @@ from .common import IterativeIntegrator, IterativeSession
 from .resampled_weights import LENGTHS, ResampledWeights, around, doubt, guessed_weight, tabulate
 
 CHUNK = 1 << 18
-"""Camera paths, and as many light sub-paths, traced at once at most; larger films are traced in parts (bounds memory)."""
+"""Camera paths, and as many light sub-paths, traced at once at most; larger films are traced in parts (bounds memory), which share their proposals."""
 CACHE_SHARE, FEWEST_CACHE_POINTS = 1 / 300, 256
 """Cache points: this share of a part's camera vertices, but at least so many. More of them cost shadow rays."""
 MOST_PAIRS = 1 << 24
@@ -303,20 +303,24 @@ class ResampledSession(IterativeSession):
             if not self._grown("ends", result[4]):
                 return result
 
-    def _chunk(self, iteration, spectral, chunk, first):
-        """Blocks of one part of the paths: of camera paths, and of light that met the sensor (or None)."""
+    def _proposals(self, iteration, spectral, light):
+        """What all camera paths of an iteration draw from: the vertices and starts of M of the sub-paths `light`, and the pmfs."""
+        r, seen, *ends = self._ends_fit(lambda: self._target_pass(
+            self.scene, self.sensor, self._tables, self._seed(iteration, START), *light, self.cache, spectral))
+        return light[0], *ends, self._pmfs(r, seen, ends[-1])
+
+    def _chunk(self, iteration, spectral, light, proposals, chunk, first):
+        """Blocks of one part of the paths: of camera paths, and of light that met the sensor (or None). `light`: the first part's light sub-paths."""
         radiance, alpha, position, camera, count, hits, hit_count = self._camera(iteration, first, spectral)
         block = None
         if self.lit:
-            light = self._light(iteration, chunk, spectral)
-            r, seen, starts, places, found = self._ends_fit(lambda: self._target_pass(
-                self.scene, self.sensor, self._tables, self._seed(iteration, START, chunk), *light, self.cache, spectral))
-            radiance = self._connection_pass(self.scene, self.sensor, self._tables, radiance, camera, count, light[0], starts, places, found,
-                                             self._pmfs(r, seen, found), self._seed(iteration, DRAW, chunk), spectral)
+            radiance = self._connection_pass(self.scene, self.sensor, self._tables, radiance, camera, count, *proposals,
+                                             self._seed(iteration, DRAW, chunk), spectral)
             radiance = self._hit_pass(self._tables, radiance, camera, hits, hit_count)
             dr.eval(radiance)                              # else its sums may still wait when the film's are made
             if self.lens:
-                block = self._sensor_pass(self.scene, self.sensor, self._tables, *light[:2], self._seed(iteration, APERTURE, chunk), spectral)
+                vertices, found, _ = self._light(iteration, chunk, spectral) if chunk else light
+                block = self._sensor_pass(self.scene, self.sensor, self._tables, vertices, found, self._seed(iteration, APERTURE, chunk), spectral)
         if self.integrator.hide_emitters:
             radiance = dr.select(alpha > 0, radiance, 0)       # as `path` does: what is behind nothing but null surfaces is hidden
         return splat_samples(self.sensor.film(), position, radiance, alpha, spectral["matrix"], self.in_chunk(first)), block
@@ -328,7 +332,9 @@ class ResampledSession(IterativeSession):
     def _iteration(self, iteration):
         self.start()
         spectral = shared_wavelengths(self.sensor, mix(self.seed, iteration, WAVELENGTH))
-        block, light = self.sum_of_chunks(partial(self._chunk, iteration, spectral))
+        light = self._light(iteration, 0, spectral) if self.lit else None
+        proposals = self._proposals(iteration, spectral, light) if self.lit else None
+        block, light = self.sum_of_chunks(partial(self._chunk, iteration, spectral, light, proposals))
         return block if light is None else with_colour(block, as_camera_weights(light, block, self.expected_weight))
 
 
