@@ -29,7 +29,7 @@ from extremes import MIXED, SINGLE, SIZE, Measured, Room, Truth, integrator
 
 FALSE_ALARM = 1e-5
 TAIL, JUMP, NOISE = 1.5, 3.0, 1.05
-LONGEST, LARGEST = 4.0, 6.0
+LONGEST, LARGEST = 4.0, 8.0
 SLACK = 0.04
 """Relative to `path`: what the blur of the disks takes from edges."""
 USUAL = {"initial_radius": 0.06, "photon_count": 4000}

@@ -26,6 +26,8 @@ LARGEST_SHARE = 2.0
 larger ones mean that the cache does not know the vertex."""
 WEIGHT_KEPT, SELDOM = 0.4, 0.02
 """Strategies of less than this weight are used at random, with a probability in proportion, but no smaller than the second number."""
+TRUSTED_PHOTONS = 128
+"""Photons in a disk up to which the radiance of typical neighbours is known well enough for the means over directions."""
 SMALLEST_COSINE, SMALLEST_LOBE_COSINE = 1e-6, 0.05
 SMALLEST_DENSITY = 1e-6
 
@@ -166,13 +168,18 @@ class OptimalWeights:
         return recursion.inner_weight(u, 1, recursion.kernel_share(r, node.kernel), 0)
 
     def offset(self, si, bsdf, mask):
-        """G = n F / N_B at the first strategy's vertex, its means those of the typical neighbours of its cell."""
+        """G = n F / N_B at the first strategy's vertex, its means those of the typical neighbours of its cell.
+
+        It is drawn towards that of local weights, zero, the more, the more photons a disk holds. Without noise of photons, deeper strategies may have
+        any weight that makes their contribution the same in all directions; but then what the cells know wrongly is all the noise that there is.
+        """
         f, p = self.lobe(si, bsdf, mask)
         r = recursion.first_ratio(p, self.camera_paths)
         around = self.surroundings.lookup(self.cache.slot(si.p, self.side(si), mask), mask)
         e = sum(share * response(1, self.strategies, self.n, r, typical_node(*radiance, self.albedo), self.albedo)[0]
                 for share, radiance in zip(SHARES, around))
-        return recursion.root_offset(f * (1 - e), e)
+        photons = channel_mean(self.n) * self.cache.level
+        return recursion.root_offset(f * (1 - e), e) * dr.rcp(1 + dr.square(photons / TRUSTED_PHOTONS))
 
     # ------------------------------------------------------------------ camera paths (hooks of `trace_camera_paths`)
 
