@@ -13,7 +13,7 @@ import pytest
 from comparing import Estimate, SessionBatches, agree, assert_same, collect_until, kernels_of, pictures
 from test_against_path import MONO, RGB, SPECTRAL, caustic_scene
 from test_analytic import inside_sphere, series
-from test_bdpm import glossy_box, last_words
+from test_bdpm import box_scene, glossy_box, last_words
 from test_bdpt import JointPaths, room
 from worlds import EMITTERS, POINT_LIKE, T, diffuse, film, has_delta, look, path, ptracer, tray
 from mis_integrators.transport.camera_vertices import STEP, leave, not_left, step_to_hit, step_to_vertex, sum_before
@@ -338,6 +338,21 @@ def test_memory_is_bounded(rgb, monkeypatch):
     width = 50 + session.capacity["ends"]
     assert 1 <= dr.width(session.cache["depth"]) <= 6000 // width < resampled.FEWEST_CACHE_POINTS
     agree(plugin("bdpt_ris", light_paths=50), path(), scene, blocks=1, whole=0.05, block=0.05, most=600)
+
+
+def test_parts_share_their_proposals(rgb, monkeypatch):
+    """A film rendered in parts, the last one incomplete, has the mean of `path`, and draws from one set of pmfs in each iteration."""
+    from mis_integrators.integrators import resampled
+    monkeypatch.setattr(resampled, "CHUNK", 470)
+    scene = box_scene(24)
+    session = plugin("bdpt_ris").session(scene, 0, 1, 0)
+    assert session.chunks == 5 and session.chunk * 5 > session.path_count
+    made, pmfs = [], session._pmfs
+    session._pmfs = lambda *args: made.append(args) or pmfs(*args)
+    for _ in range(3):
+        session.iterate()
+    assert len(made) == 3
+    agree(plugin("bdpt_ris"), path(rr_depth=50), scene, blocks=2, whole=0.02, block=0.05, most=600)
 
 
 @pytest.mark.parametrize("name", ["bdpt", "vcm", "bdpt_ris"])
