@@ -332,8 +332,10 @@ class ResampledSession(IterativeSession):
     def _iteration(self, iteration):
         self.start()
         spectral = shared_wavelengths(self.sensor, mix(self.seed, iteration, WAVELENGTH))
-        light = self._light(iteration, 0, spectral) if self.lit else None
-        proposals = self._proposals(iteration, spectral, light) if self.lit else None
+        light = proposals = None
+        if self.lit:
+            light = self._light(iteration, 0, spectral)
+            proposals = self._proposals(iteration, spectral, light)
         block, light = self.sum_of_chunks(partial(self._chunk, iteration, spectral, light, proposals))
         return block if light is None else with_colour(block, as_camera_weights(light, block, self.expected_weight))
 
