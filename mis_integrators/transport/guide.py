@@ -8,11 +8,15 @@ mixed with the plain densities, which keeps every estimate unbiased however poor
 
 from __future__ import annotations
 
+from functools import partial
+from typing import NamedTuple
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from .camera_rays import sample_camera_ray
+from .entrances import Entrances
 from .packing import from_numpy
 from .random import next_2d, streams
 from .spectra import channel_mean
@@ -24,12 +28,18 @@ DIRECTION_CELLS = POLAR_CELLS * AZIMUTH_CELLS
 POSITION_CELLS = 64
 DEFENSIVE_SHARE = 0.1
 """Share of sub-paths that start anywhere on the scene's disk."""
+ENOUGH_RECORDS = 256
+"""Records of a direction cell at which its own histogram has as large a share as the one over the faces of the box, which serves all of them."""
 PILOT_PATHS = 65536
 PILOT_BOUNCES = 4
+TESTS = 2
+"""Directions in which each place of the pilot looks for an environment, once these are known."""
 PASS_THROUGH = 8
 """Transmissive surfaces that the pilot's visibility test looks straight through (panes, masks)."""
 LEVEL_SHARES = (0.55, 0.25, 0.1, 0.1)
 """Shares of the position histogram at full, half, quarter and eighth resolution."""
+ENTRANCE_LEVELS = (0.4, 0.2, 0.15, 0.15, 0.1)
+"""The same of that over the box."""
 FEWEST_RECORDS = 64
 SPREAD_WAVELENGTHS = 450, 520, 590, 640
 """Wavelengths [nm] at which lights are looked at where no path brings its own."""
@@ -60,12 +70,12 @@ def cell_direction(cell, sample):
     return mi.Vector3f(radius * cos_phi, radius * sin_phi, z)
 
 
-def _smoothed(grids):
+def _smoothed(grids, shares):
     """Square histograms (rows, n, n) mixed with coarser versions of themselves, so that a cell that the pilot happened to miss
     beside cells that it met is not left to the plain density (whose few samples would carry huge flux)."""
     rows, n, _ = grids.shape
-    result = LEVEL_SHARES[0] * grids
-    for level, share in enumerate(LEVEL_SHARES[1:], start=1):
+    result = shares[0] * grids
+    for level, share in enumerate(shares[1:], start=1):
         size = 1 << level
         coarse = grids.reshape(rows, n // size, size, n // size, size).sum(axis=(2, 4))
         padded = np.pad(coarse, ((0, 0), (1, 1), (1, 1)))
@@ -106,11 +116,21 @@ def _sees_sky(scene, ray, active):
     return reached
 
 
+class Place(NamedTuple):
+    """Surfaces that camera paths have met: their BSDFs, the paths' throughput, and where they scatter smoothly."""
+
+    si: mi.SurfaceInteraction3f
+    bsdf: mi.BSDFPtr
+    throughput: mi.Spectrum
+    smooth: mi.Bool
+
+
 class EnvironmentGuide:
     """Densities of position and direction for infinite emitters (`environment` and `directional` kinds).
 
     Attributes: `center`, `radius` of the scene's bounding sphere; `focus_center`, `focus_radius` of the lit places that the
-    pilot met; `direction_share`, the share of environment sub-paths whose direction comes from the emitter's own sampler.
+    pilot met; `entrances` of the light of environments (`None` where the pilot saw next to none); `direction_share`, the share of environment sub-paths
+    whose direction comes from the emitter's own sampler.
     """
 
     def __init__(self, scene, sensor):
@@ -126,6 +146,7 @@ class EnvironmentGuide:
         self.row_count = row
         self._first_row = mi.UInt32(first_rows)
         self.direction_share = 1.0
+        self.entrances = None
         self._learn(sensor)
 
     def _set_sphere(self, center, radius):
@@ -135,6 +156,8 @@ class EnvironmentGuide:
     def tables(self):
         """Every evaluated array that the sampling routines read, for `dr.freeze` to track."""
         arrays = [self.center, self.focus_center, self._first_row, self._pmf, self._cdf, self._guided]
+        if self.entrances is not None:
+            arrays += [self._entering, *self.entrances.tables()]
         return arrays + ([self._direction_pmf, self._direction_cdf] if self.direction_share < 1 else [])
 
     def row_of_emitter(self, index):
@@ -144,38 +167,63 @@ class EnvironmentGuide:
     # ------------------------------------------------------------------ pilot
 
     def _learn(self, sensor):
-        records = [self._numpy(r) for r in self._pilot(sensor)]
-        p, d, row, weight, tested, reached = (np.concatenate(x, axis=-1) for x in zip(*records))
+        places = self._places(sensor)
+        self._learn_directions(places)
+        records = [self._numpy(record) for index, emitter in self.infinite for place, rng in places
+                   for _ in range(TESTS if emitter.is_environment() else 1) for record in [self._look(index, emitter, place, rng)]]
+        p, d, row, weight = (np.concatenate(x, axis=-1) for x in zip(*records))
         useful = (weight > 0) & np.isfinite(weight)
+        p, d, row, weight = p[:, useful], d[:, useful], row[useful], weight[useful]
         cells = POSITION_CELLS ** 2
         pmf = np.zeros((self.row_count, cells))
-        if np.count_nonzero(useful) >= FEWEST_RECORDS:
-            # Heavy records (a glossy peak, a texel of the sun) guide no better than others.
-            weight = np.where(useful, np.minimum(weight, 20 * np.mean(weight[useful])), 0)
-            low, high = _weighted_box(p[:, useful], weight[useful], FOCUS_TAIL)
+        if len(row) >= FEWEST_RECORDS:
+            weight = np.minimum(weight, 20 * np.mean(weight))
+            low, high = _weighted_box(p, weight, FOCUS_TAIL)
+            # An even flux is what merging wants, and heavy records (a glossy peak, a texel of the sun) guide no better than others.
+            weight = np.sqrt(weight)
             center, radius = (low + high) / 2, max(np.linalg.norm(high - low) / 2, 1e-4 * self.radius)
             self.focus_center, self.focus_radius = mi.Point3f([float(x) for x in center]), float(radius) * 1.05
-            cell, inside = self._position_cell(mi.Vector3f(d), mi.Point3f(p))
-            cell, inside = np.array(cell), np.array(inside)
-            keep = useful & inside
-            np.add.at(pmf, (row[keep], cell[keep]), weight[keep])
-        pmf = _smoothed(pmf.reshape(-1, POSITION_CELLS, POSITION_CELLS)).reshape(self.row_count, cells)
+            cell, inside = (np.array(x) for x in self._position_cell(mi.Vector3f(d), mi.Point3f(p)))
+            pmf += np.bincount((row * cells + cell)[inside], weight[inside], pmf.size).reshape(pmf.shape)
+            of_sky = self._environment_rows()[row]
+            if np.count_nonzero(of_sky) >= FEWEST_RECORDS:
+                self.entrances = Entrances(low, high, p[:, of_sky], d[:, of_sky], weight[of_sky], partial(_smoothed, shares=ENTRANCE_LEVELS))
+        pmf = _smoothed(pmf.reshape(-1, POSITION_CELLS, POSITION_CELLS), LEVEL_SHARES).reshape(self.row_count, cells)
         total = pmf.sum(axis=1)
-        self._learn_directions(row, tested, reached)
         pmf /= np.maximum(total, 1e-300)[:, None]
         self._pmf = from_numpy(mi.Float, pmf.ravel())
         self._cdf = from_numpy(mi.Float, np.cumsum(pmf, axis=1).ravel())
-        self._guided = from_numpy(mi.Float, np.where(total > 0, 1 - DEFENSIVE_SHARE, 0.0))
+        guided = np.where(total > 0, 1 - DEFENSIVE_SHARE, 0.0)
+        if self.entrances is not None:
+            met = np.bincount(row, minlength=self.row_count)
+            entering = np.where(self._environment_rows(), (1 - DEFENSIVE_SHARE) * ENOUGH_RECORDS / (ENOUGH_RECORDS + met), 0.0)
+            guided -= np.where(guided > 0, entering, 0)
+            self._entering = from_numpy(mi.Float, entering)
+        self._guided = from_numpy(mi.Float, guided)
 
-    def _learn_directions(self, row, tested, reached):
-        """Direction cells by (radiance without its sharp peaks) x (share of the tests that saw the sky)."""
+    def _environment_rows(self):
+        """Which table rows are an environment's: (row_count,)."""
+        rows = np.zeros(self.row_count, dtype=bool)
+        for index, emitter in self.infinite:
+            if emitter.is_environment():
+                first = int(np.array(self._first_row)[index])
+                rows[first:first + DIRECTION_CELLS] = True
+        return rows
+
+    def _learn_directions(self, places):
+        """Direction cells by (radiance without its sharp peaks) x (share of the places that see the sky there)."""
         environment = next(((i, e) for i, e in self.infinite if e.is_environment()), None)
         if environment is None:
             return
         index, emitter = environment
-        first = int(np.array(self._first_row)[index])
-        tests = np.bincount(row, weights=tested, minlength=self.row_count)[first:first + DIRECTION_CELLS]
-        seen = np.bincount(row, weights=reached, minlength=self.row_count)[first:first + DIRECTION_CELLS]
+        tests, seen = np.zeros(DIRECTION_CELLS), np.zeros(DIRECTION_CELLS)
+        for place, rng in places:
+            towards = mi.warp.square_to_uniform_sphere(next_2d(rng))
+            tested = self._scatters(place, towards)
+            reached = _sees_sky(self.scene, place.si.spawn_ray(towards), tested)
+            cell, tested, reached = self._numpy((direction_cell(towards), tested, reached))
+            tests += np.bincount(cell[tested], minlength=DIRECTION_CELLS)
+            seen += np.bincount(cell[reached], minlength=DIRECTION_CELLS)
         reach = seen / np.maximum(tests, 1)
         draws = 64
         cell = dr.arange(mi.UInt32, DIRECTION_CELLS * draws) // draws
@@ -214,44 +262,48 @@ class EnvironmentGuide:
             si.wavelengths = mi.UnpolarizedSpectrum(*SPREAD_WAVELENGTHS)
         return channel_mean(emitter.eval(si, active)) + dr.zeros(mi.Float, dr.width(towards))
 
-    def _pilot(self, sensor):
-        """Yields records (p, direction to the light, table row, weight, tested, reached) along camera paths.
-
-        A record's weight estimates what light from there adds to the image.
-        """
+    def _places(self, sensor):
+        """Places that matter: the first surfaces of camera paths, a list of `(Place, random numbers)`."""
         rng = streams(dr.arange(mi.UInt32, PILOT_PATHS), mi.UInt32(0x67756964))
         wavelength_sample = 0.5
         ray, throughput = sample_camera_ray(sensor, sensor.shutter_open(), wavelength_sample, next_2d(rng), next_2d(rng))
         throughput = mi.Spectrum(throughput) + dr.zeros(mi.Spectrum, PILOT_PATHS)
         active = dr.full(mi.Bool, True, PILOT_PATHS)
-        context = mi.BSDFContext()
-        for _ in range(PILOT_BOUNCES):
+        places = []
+        for bounce in range(PILOT_BOUNCES):
             si = self.scene.ray_intersect(ray, active)
             active &= si.is_valid()
             bsdf = si.bsdf()
             smooth = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-            records = []
-            for index, emitter in self.infinite:
-                first = int(np.array(self._first_row)[index])
-                ds, weight = emitter.sample_direction(si, next_2d(rng), smooth)
-                tests = [(ds.d, channel_mean(weight), smooth & (ds.pdf > 0))]
-                if emitter.is_environment():
-                    towards = mi.warp.square_to_uniform_sphere(next_2d(rng))
-                    tests.append((towards, self._radiance(emitter, towards, smooth) * (4 * dr.pi), smooth))
-                for towards, light, tested in tests:
-                    response = bsdf.eval(context, si, si.to_local(towards), tested)
-                    tested &= channel_mean(response) > 0
-                    reached = _sees_sky(self.scene, si.spawn_ray(towards), tested)
-                    row = first + (direction_cell(towards) if emitter.is_environment() else dr.zeros(mi.UInt32, PILOT_PATHS))
-                    weight = dr.select(reached, light * channel_mean(throughput * dr.minimum(response, 1)), 0)
-                    records.append((si.p, towards + dr.zeros(mi.Vector3f, PILOT_PATHS), row, weight,
-                                    dr.select(tested, mi.Float(1), 0), dr.select(reached, mi.Float(1), 0)))
-            bs, value = bsdf.sample(context, si, rng.next_float32(), next_2d(rng), active)
-            throughput *= value
+            places.append((Place(si, bsdf, throughput, smooth), streams(dr.arange(mi.UInt32, PILOT_PATHS), mi.UInt32(0x706c6163 + bounce))))
+            bs, value = bsdf.sample(mi.BSDFContext(), si, rng.next_float32(), next_2d(rng), active)
+            throughput = throughput * value
             active &= channel_mean(throughput) > 0
             ray = si.spawn_ray(si.to_world(bs.wo))
-            dr.eval(ray, active, throughput, rng, records)
-            yield from records
+            dr.eval(ray, active, throughput, rng, si, smooth)
+        return places
+
+    @staticmethod
+    def _response(place, towards, active):
+        return channel_mean(place.bsdf.eval(mi.BSDFContext(), place.si, place.si.to_local(towards), active))
+
+    def _scatters(self, place, towards):
+        """On which lanes the place scatters light that comes from there."""
+        return place.smooth & (self._response(place, towards, place.smooth) > 0)
+
+    def _look(self, index, emitter, place, rng):
+        """Records (p, direction to the light, table row, weight) of a place each, where sub-paths of the emitter would come from; the weight estimates what
+        light from there adds to the image."""
+        if emitter.is_environment():
+            towards, pdf, row, _ = self.sample_direction(emitter, mi.UInt32(index), place.si, next_2d(rng), rng.next_float32(), place.smooth)
+            light = self._radiance(emitter, towards, place.smooth) * dr.select(pdf > 0, dr.rcp(pdf), 0)
+        else:
+            ds, irradiance = emitter.sample_direction(place.si, next_2d(rng), place.smooth)
+            towards, light, row = ds.d, channel_mean(irradiance), self.row_of_emitter(mi.UInt32(index))
+        response = self._response(place, towards, place.smooth)
+        reached = _sees_sky(self.scene, place.si.spawn_ray(towards), place.smooth & (response > 0) & (light > 0))
+        weight = dr.select(reached, light * channel_mean(place.throughput) * dr.minimum(response, 1), 0)
+        return place.si.p, towards + dr.zeros(mi.Vector3f, PILOT_PATHS), row + dr.zeros(mi.UInt32, PILOT_PATHS), weight
 
     # ------------------------------------------------------------------ densities
 
@@ -274,7 +326,16 @@ class EnvironmentGuide:
         offset = p - self.center
         offset -= towards * dr.dot(offset, towards)
         on_disk = dr.squared_norm(offset) <= self.radius ** 2
-        return guided * probability / cell_area + dr.select(on_disk, (1 - guided) / (dr.pi * self.radius ** 2), 0)
+        density = guided * probability / cell_area
+        if self.entrances is not None:
+            entering = self._entering_share(towards, row, active)
+            density += entering * self.entrances.density(towards, p, active)
+            guided += entering
+        return density + dr.select(on_disk, (1 - guided) / (dr.pi * self.radius ** 2), 0)
+
+    def _entering_share(self, towards, row, active):
+        """Share of the sub-paths of a row that start where faces are lit; none where these look away."""
+        return dr.select(self.entrances.lit(towards), dr.gather(mi.Float, self._entering, row, active), 0)
 
     def sample_position(self, towards, row, sample, jitter, extra, active):
         """Origin of a sub-path that travels against `towards`, and its density per unit area.
@@ -290,6 +351,7 @@ class EnvironmentGuide:
         cell = dr.binary_search(0, cells - 1, lambda i: dr.gather(mi.Float, self._cdf, base + i, active) <= sample.x)
         upper = dr.gather(mi.Float, self._cdf, base + cell, active)
         lower = dr.select(cell > 0, dr.gather(mi.Float, self._cdf, base + dr.maximum(cell, 1) - 1, active), 0)
+        own_jitter = jitter
         if jitter is None:
             leftover = dr.clip((sample.x - lower) / dr.maximum(upper - lower, 1e-20), 0, 0.9999999)
             jitter = mi.Point2f(leftover, sample.y)
@@ -298,6 +360,9 @@ class EnvironmentGuide:
         on_grid = self.focus_center + self.focus_radius * (u * frame.s + v * frame.t)
         disk = mi.warp.square_to_uniform_disk_concentric(sample)
         on_disk = self.center + self.radius * (disk.x * frame.s + disk.y * frame.t)
+        if self.entrances is not None:
+            enters = ~use_grid & (extra < guided + self._entering_share(towards, row, active))
+            on_disk = dr.select(enters, self.entrances.sample(towards, sample, own_jitter, active & enters), on_disk)
         p = dr.select(use_grid, on_grid, on_disk)
         density = self.position_density(towards, row, p, active)
         p += towards * (1.01 * self.radius - dr.dot(p - self.center, towards))

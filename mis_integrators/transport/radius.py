@@ -61,8 +61,8 @@ def middling(radii):
 
 def relative_weights(mean):
     """Weights 1 / (mean^2 + 0.1 <mean>^2) of squared errors: relative error, without letting dark pixels rule. The overall mean <mean>
-    leaves out the brightest twentieth (visible lamps)."""
-    usual = np.mean(np.minimum(mean, np.quantile(mean, 0.95)))
+    leaves out the brightest tenth (visible lamps, the sky in windows)."""
+    usual = np.mean(np.minimum(mean, np.quantile(mean, 0.9)))
     return 1 / (mean ** 2 + 0.1 * usual ** 2 + 1e-30)
 
 

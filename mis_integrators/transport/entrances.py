@@ -1,0 +1,100 @@
+"""Through which parts of the faces of a box light from far away comes in.
+
+A window is where it is, whatever the direction of the light: one histogram over the six faces serves all directions, and learns from few
+records what one histogram for each direction does not.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from .packing import from_numpy
+
+FACE_CELLS = 64
+"""Cells along each edge of a face."""
+FACES = 6
+"""Numbers 2 a (the lower face across axis a) and 2 a + 1 (the upper one)."""
+LEAST_EXTENT = 0.02
+"""Least edge of the box, in units of its longest."""
+
+
+class Entrances:
+    """A density of lines: in each direction over the plane across it, proportional to a histogram over the faces of the box `low` to `high` at the place
+    where a line comes out of the box towards the light.
+
+    Parameters: `low`, `high`, arrays (3,); `points`, `towards` (3, n): places, most of them in the box, and directions in which they see light; `weights` (n,); `smooth`: what
+    smooths histograms (FACES, FACE_CELLS, FACE_CELLS).
+    """
+
+    def __init__(self, low, high, points, towards, weights, smooth):
+        extent = np.maximum(high - low, LEAST_EXTENT * max(np.max(high - low), 1e-6))
+        centre = (low + high) / 2
+        self._low, self._extent = (dr.opaque(mi.Vector3f, [float(x) for x in v]) for v in (centre - extent / 2, extent))
+        face, cell, inside = (np.array(x) for x in self._exit(mi.Vector3f(towards), mi.Point3f(points)))
+        cells = FACE_CELLS ** 2
+        histogram = np.bincount((face * cells + cell)[inside], weights[inside], FACES * cells).reshape(FACES, FACE_CELLS, FACE_CELLS)
+        histogram = smooth(histogram).reshape(FACES, cells)
+        histogram /= max(histogram.sum(), 1e-300)
+        self._light = from_numpy(mi.Float, histogram.ravel())
+        self._of_face = from_numpy(mi.Float, histogram.sum(axis=1))
+        self._cdf = from_numpy(mi.Float, (np.cumsum(histogram, axis=1) / np.maximum(histogram.sum(axis=1, keepdims=True), 1e-300)).ravel())
+        axes = np.array([[1, 2], [0, 2], [0, 1]])
+        self._cell_area = from_numpy(mi.Float, np.prod(extent[axes], axis=1) / cells)                   # one an axis
+
+    def tables(self):
+        """Every evaluated array that `density` and `sample` read, for `dr.freeze` to track."""
+        return [self._low, self._extent, self._light, self._of_face, self._cdf, self._cell_area]
+
+    def _exit(self, towards, p):
+        """Face and cell at which the lines along `towards` through `p` come out of the box, and whether they meet it."""
+        slope = dr.rcp(dr.select(dr.abs(towards) > 1e-9, towards, 1e-9))
+        near, far = (self._low - p) * slope, (self._low + self._extent - p) * slope
+        near, far = dr.minimum(near, far), dr.maximum(near, far)
+        leaves = dr.min(far)
+        meets = dr.max(near) < leaves
+        axis = dr.select(far.x <= leaves, mi.UInt32(0), dr.select(far.y <= leaves, mi.UInt32(1), mi.UInt32(2)))
+        upper = dr.select(axis == 0, towards.x, dr.select(axis == 1, towards.y, towards.z)) > 0
+        place = (p + leaves * towards - self._low) / self._extent
+        u, v = dr.select(axis == 0, place.y, place.x), dr.select(axis == 2, place.y, place.z)
+        column, line = (dr.clip(mi.Int32(dr.floor(x * FACE_CELLS)), 0, FACE_CELLS - 1) for x in (u, v))
+        return 2 * axis + dr.select(upper, mi.UInt32(1), 0), mi.UInt32(line * FACE_CELLS + column), meets
+
+    def _faces(self, towards):
+        """For each axis: the face that looks `towards` the light, and cosine times histogram of it."""
+        faces = [2 * axis + dr.select(towards[axis] > 0, mi.UInt32(1), 0) for axis in range(3)]
+        return faces, [dr.abs(towards[axis]) * dr.gather(mi.Float, self._of_face, face) for axis, face in enumerate(faces)]
+
+    def lit(self, towards):
+        """Whether the faces that look `towards` the light let in any."""
+        return sum(self._faces(towards)[1]) > 0
+
+    def density(self, towards, p, active=True):
+        """Density of the line along `towards` through `p`, per unit area across it."""
+        face, cell, meets = self._exit(towards, p)
+        light = dr.gather(mi.Float, self._light, face * FACE_CELLS ** 2 + cell, active & meets)
+        total = sum(self._faces(towards)[1])
+        return dr.select(meets & (total > 0), light * dr.rcp(dr.gather(mi.Float, self._cell_area, face // 2, active) * total), 0)
+
+    def sample(self, towards, sample, jitter, active=True):
+        """A point where a line along `towards` comes out of the box, from two uniform numbers; `jitter`: two more that place it within its cell, or `None`
+        (then what those two leave over does)."""
+        faces, lights = self._faces(towards)
+        u = sample.x * sum(lights)
+        second, third = u >= lights[0], u >= lights[0] + lights[1]
+        u = dr.select(third, u - lights[0] - lights[1], dr.select(second, u - lights[0], u))
+        u *= dr.rcp(dr.maximum(dr.select(third, lights[2], dr.select(second, lights[1], lights[0])), 1e-30))
+        axis = dr.select(third, mi.UInt32(2), dr.select(second, mi.UInt32(1), mi.UInt32(0)))
+        face = dr.select(third, faces[2], dr.select(second, faces[1], faces[0]))
+        cells = FACE_CELLS ** 2
+        cell = dr.binary_search(0, cells - 1, lambda i: dr.gather(mi.Float, self._cdf, face * cells + i, active) <= u)
+        if jitter is None:
+            upper = dr.gather(mi.Float, self._cdf, face * cells + cell, active)
+            lower = dr.gather(mi.Float, self._cdf, face * cells + cell - 1, active & (cell > 0))
+            jitter = mi.Point2f(dr.clip((u - lower) / dr.maximum(upper - lower, 1e-20), 0, 0.9999999), sample.y)
+        a = (mi.Float(cell % FACE_CELLS) + jitter.x) * (1 / FACE_CELLS)
+        b = (mi.Float(cell // FACE_CELLS) + jitter.y) * (1 / FACE_CELLS)
+        across = mi.Float(face % 2)
+        place = mi.Vector3f(dr.select(axis == 0, across, a), dr.select(axis == 1, across, dr.select(axis == 0, a, b)), dr.select(axis == 2, across, b))
+        return mi.Point3f(self._low + place * self._extent)
