@@ -29,6 +29,8 @@ from ..weights import resampling
 
 LENGTHS = 16
 """Lengths of light sub-paths whose shares are told apart; longer ones count with the last."""
+MANY = 100
+"""Light sub-paths from which on Q_s / (M Q), at most 1 / M, is not worth a lookup."""
 UNEXPECTED = 0.1
 """A cache point's light is unexpected if the points around it have less than this share of its own pmf for it."""
 LEAST_DOUBT = 0.05
@@ -68,7 +70,9 @@ class ResampledWeights:
         if not self.aware:
             return mi.Float(1)
         record = dr.gather(mi.Vector4f, self.records, row, active)
-        share = dr.gather(mi.Float, self.shares, row * LENGTHS + dr.minimum(dr.maximum(s, 1), LENGTHS) - 1, active)
+        share = mi.Float(0)
+        if self.M < MANY:
+            share = dr.gather(mi.Float, self.shares, row * LENGTHS + dr.minimum(dr.maximum(s, 1), LENGTHS) - 1, active)
         spare = record.z * r + record.y
         ratio = resampling.doubtful_ratio(record.x * r + spare, spare, record.w)
         return dr.clip(resampling.gain(ratio, share, self.M, self.N), LEAST_GAIN * (1 - 1 / self.M), MOST_GAIN * self.N)
@@ -124,9 +128,14 @@ def guessed_weight(z, sent):
 def around(p, n, neighbors, normal_cost):
     """Places of the other cache points that each of C is nearest to (C x `neighbors`, or as many as there are): those that `CacheGrid` would mix
     with it. NumPy arrays `p`, `n` (C x 3); `normal_cost` as of `CacheGrid` [length^2]."""
-    cost = np.sum(p ** 2, axis=1)[:, None] + np.sum(p ** 2, axis=1) - 2 * p @ p.T + normal_cost * (1 - n @ n.T)
+    p, n = (p - p.mean(axis=0)).astype(np.float32), n.astype(np.float32)
+    cost = np.sum(p ** 2, axis=1) - 2 * p @ p.T - np.float32(normal_cost) * n @ n.T          # but for what is the same in a row
     np.fill_diagonal(cost, np.inf)
-    return np.argsort(cost, axis=1)[:, :min(neighbors, len(p) - 1)]
+    near = np.empty((len(p), min(neighbors, len(p) - 1)), dtype=np.intp)
+    for place in range(near.shape[1]):
+        near[:, place] = cost.argmin(axis=1)
+        cost[np.arange(len(p)), near[:, place]] = np.inf
+    return near
 
 
 def doubt(near, r, seen):

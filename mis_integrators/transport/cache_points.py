@@ -1,7 +1,7 @@
 """Which cache points a place in the scene listens to: a table over the cells of a grid and the six directions that a surface can face.
 
 A cache point knows something about light that surfaces near it with a similar normal share. The nearest ones are found once for each
-cell and facing, by brute force; after that a look-up is one gather, cheap enough for path loops. What it returns is a function of place and normal
+cell and facing; after that a look-up is one gather, cheap enough for path loops. What it returns is a function of place and normal
 alone, constant within a cell: weights made of it are the same for every technique that makes a path.
 """
 
@@ -11,12 +11,14 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .packing import to_numpy
+from .packing import from_numpy, to_numpy
 
 CELLS = 1 << 14
 """Cells of the grid at most; times six facings and the number of neighbours, four bytes each."""
 FINENESS = 0.75
 """Edge of a cell over the cache points' spacing, unless that makes too many cells."""
+BLOCK = 4
+"""Edge of a block of cells that are searched together, in cells."""
 FACINGS = 6
 NORMAL_COST = 8.0
 """Squared distance, in units of the cache points' spacing, that a cache point facing the other way seems farther; a right angle: half of it."""
@@ -50,8 +52,12 @@ class CacheGrid:
         self._scale = dr.opaque(mi.Float, 1 / edge)
         self._cells = dr.opaque(mi.Point3u, self.resolution)         # as literals they would have path kernels compiled anew for each seed
         self.rows = FACINGS * int(np.prod(self.resolution))
-        self.table, self.spread = _nearest(self, mi.Point3f(points), mi.Normal3f(normals), len(p), dr.opaque(mi.Float, edge))
-        dr.eval(self.table, self.spread)
+        nx, ny, nz = self.resolution
+        x, y, z = np.tile(np.arange(nx), ny * nz), np.tile(np.repeat(np.arange(ny), nx), nz), np.repeat(np.arange(nz), nx * ny)
+        centres = (np.stack([x, y, z], axis=1) + 0.5) * edge + low
+        blocks = ((z // BLOCK) * ny + y // BLOCK) * nx + x // BLOCK
+        table, spread = _nearest(centres, blocks, p, to_numpy(normals).astype(np.float64).T, neighbors, self.normal_cost)
+        self.table, self.spread = from_numpy(mi.UInt32, table.ravel()), from_numpy(mi.Float, spread)
 
     def tables(self):
         """Every evaluated array that `row` and its users read, for `dr.freeze` to track."""
@@ -76,36 +82,34 @@ def facing(n):
     return 2 * axis + dr.select(component < 0, mi.UInt32(1), mi.UInt32(0))
 
 
-@dr.syntax
-def _nearest(grid, points, normals, count: int, edge):
-    """Neighbour table and spread of all rows, by trying every cache point for each; `edge`: opaque."""
-    rows = dr.arange(mi.UInt32, grid.rows)
-    cell = rows // FACINGS
-    direction = rows % FACINGS
-    nx, ny, _ = grid._cells
-    centre = mi.Point3f(mi.Float(cell % nx) + 0.5, mi.Float((cell // nx) % ny) + 0.5, mi.Float(cell // (nx * ny)) + 0.5) * edge + grid._low
-    sign = dr.select(direction % 2 == 1, mi.Float(-1), mi.Float(1))
-    axis = mi.Vector3f(dr.select(direction // 2 == 0, sign, 0), dr.select(direction // 2 == 1, sign, 0),
-                       dr.select(direction // 2 == 2, sign, 0))
-    cost_unit = dr.opaque(mi.Float, grid.normal_cost)
-    last = dr.opaque(mi.UInt32, count)
-    best = [mi.Float(dr.inf) for _ in range(grid.neighbors)]
-    found = [mi.UInt32(0) for _ in range(grid.neighbors)]
-    index = mi.UInt32(0)
-    while index < last:
-        p = dr.gather(mi.Point3f, points, index)
-        n = dr.gather(mi.Normal3f, normals, index)
-        cost = dr.squared_norm(p - centre) + cost_unit * (1 - dr.dot(n, axis))
-        candidate = mi.UInt32(index)
-        for place in dr.hint(range(grid.neighbors), mode='scalar'):
-            nearer = cost < best[place]
-            best[place], cost = dr.select(nearer, cost, best[place]), dr.select(nearer, best[place], cost)
-            found[place], candidate = dr.select(nearer, candidate, found[place]), dr.select(nearer, found[place], candidate)
-        index += 1
-    table = dr.empty(mi.UInt32, grid.rows * grid.neighbors)
-    spread = mi.Float(0)
-    for place in dr.hint(range(grid.neighbors), mode='scalar'):
-        taken = found[place] if place < count else found[place % count]
-        dr.scatter(table, taken, rows * grid.neighbors + place)
-        spread += dr.squared_norm(dr.gather(mi.Point3f, points, taken) - centre) / grid.neighbors
-    return table, spread
+def _nearest(centres, blocks, p, n, neighbors, normal_cost):
+    """Table and spread of all rows, NumPy arrays (rows, neighbors) and (rows,).
+
+    `centres` (cells, 3) of the cells, `blocks` (cells,) numbers of the blocks that they belong to, `p`, `n` (C, 3) of the cache points. Only points that
+    can be among the nearest somewhere in a block are tried for its cells."""
+    wanted = min(neighbors, len(p))
+    table, spread = np.empty((len(centres), FACINGS, wanted), dtype=np.uint32), np.empty((len(centres), FACINGS, wanted))
+    order = np.argsort(blocks, kind="stable")
+    members = np.split(order, np.flatnonzero(np.diff(blocks[order])) + 1)
+    middles = np.array([(centres[cells].min(axis=0) + centres[cells].max(axis=0)) / 2 for cells in members])
+    reach = np.array([np.linalg.norm(centres[cells] - middle, axis=1).max() for cells, middle in zip(members, middles)])[:, None]
+    distance = np.sqrt(_squared(middles, p))
+    for direction in range(FACINGS):
+        turned = normal_cost * (1 - n[:, direction // 2] * (-1 if direction % 2 else 1))
+        at_most = np.partition((distance + reach) ** 2 + turned, wanted - 1, axis=1)[:, wanted - 1:wanted]
+        possible = np.maximum(distance - reach, 0) ** 2 + turned <= at_most * (1 + 1e-6)
+        for cells, candidates in zip(members, map(np.flatnonzero, possible)):
+            squared = _squared(centres[cells], p[candidates])
+            cost = squared + turned[candidates]
+            lines = np.arange(len(cells))
+            for place in range(wanted):
+                nearest = cost.argmin(axis=1)
+                table[cells, direction, place], spread[cells, direction, place] = candidates[nearest], squared[lines, nearest]
+                cost[lines, nearest] = np.inf
+    places = np.arange(neighbors) % wanted                       # fewer cache points than neighbours repeat
+    return table[:, :, places].reshape(-1, neighbors), spread[:, :, places].mean(axis=2).ravel()
+
+
+def _squared(a, b):
+    """Squared distances between points (n, 3) and (m, 3): (n, m)."""
+    return sum((a[:, None, axis] - b[None, :, axis]) ** 2 for axis in range(3))
