@@ -201,7 +201,7 @@ class ResampledSession(IterativeSession):
         """Weight w_t of a connection among all techniques of its joint path."""
         cosine = dr.abs(dr.dot(z["n"], sent.d))
         row = weights.row(z["p"], dr.mulsign(z["n"], dr.dot(z["n"], sent.d)))
-        own = weights.gain(sent.mean * weights.softened(row, cosine, dr.square(sent.distance)), row, sent.vertices, active)
+        own = weights.gain(sent.mean * weights.softened(cosine, dr.square(sent.distance)), row, sent.vertices, active)
         nearer = sum_before(camera, z, z["parent"], sent.across * cosine, sent.mean * dr.rcp(dr.maximum(sent.across, 1e-20)),
                             scattered_mean(value, z["n"], sent.d), back, segments, weights, active)
         return own * dr.rcp(dr.maximum(own + forward * cosine * sent.behind + nearer, 1e-20))

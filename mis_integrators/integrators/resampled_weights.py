@@ -8,7 +8,7 @@ evaluate one function: a technique that joins a light sub-path Y to the camera v
 where the parts are the cached pmfs' visible, blind and uniform ones (`proposals`), and the second case has a probability e. The five numbers of z and the
 lengths' shares Q_s/Q are looked up by place and by the side from which the light comes (`CacheGrid.row`); they are averages over the N_c cache points
 there, made once before the first iteration. So the weights depend neither on an iteration's light sub-paths nor on its pmfs, and the sum of
-the techniques stays unbiased. h^2 is the mean squared distance of the cache points: the cached pmf, made for their places, does not know that G has
+the techniques stays unbiased. h is the spacing of the cache points: the cached pmf, made for their places, does not know that G has
 a pole at z. Left out are visibility (the ends of a joint path see each other), the camera's BSDF of `f_y_f_yz`, the guess of the weight that the pmfs
 contain (`guessed_weight`), and delta functions' weights; colours enter by channel means.
 """
@@ -58,12 +58,11 @@ class ResampledWeights:
         """Row of a place, `n` its normal on the light's side."""
         return self.grid.row(p, n) if self.aware else mi.UInt32(0)
 
-    def softened(self, row, geometry, squared):
+    def softened(self, geometry, squared):
         """The geometric term without its pole; unchanged for lights infinitely far away."""
         if not self.aware:
             return geometry
-        spread = dr.gather(mi.Float, self.grid.spread, row)
-        return geometry * dr.rcp(1 + spread * dr.rcp(squared))
+        return geometry * dr.rcp(1 + self.grid.squared_spacing * dr.rcp(squared))
 
     def gain(self, r, row, s, active=True):
         """p_t / p of the technique that joins a light sub-path of `s` vertices, which sends r = q*/p, to a camera vertex of that row."""
@@ -92,7 +91,7 @@ class ResampledWeights:
         made = across * dr.abs(dr.dot(si.n, ds.d))
         strength = dr.select(self.lights.untold(ds.emitter, active), self.lights.total_power, channel_mean(flux))
         row = self.row(si.p, dr.mulsign(si.n, dr.dot(si.n, ds.d)))
-        better = self.gain(strength * self.softened(row, made, dr.select(infinite, dr.inf, dr.square(ds.dist))), row, mi.UInt32(1), active)
+        better = self.gain(strength * self.softened(made, dr.select(infinite, dr.inf, dr.square(ds.dist))), row, mi.UInt32(1), active)
         met = self.lights.can_be_met(ds.emitter, active)
         return [dr.select(reachable, better * theory.reciprocal(made), 0),
                 dr.select(reachable & met, theory.reciprocal(start * across), 0), strength]
@@ -104,7 +103,7 @@ class ResampledWeights:
 
     def arrived(self, state, density, si, squared, depth):
         row = self.row(si.p, dr.mulsign(si.n, dr.dot(si.n, si.to_world(si.wi))))
-        better = self.gain(state[2] * self.softened(row, density, squared), row, depth)
+        better = self.gain(state[2] * self.softened(density, squared), row, depth)
         return [dr.select(density > 0, better * theory.reciprocal(density), 0), state[1], state[2]]
 
     # ------------------------------------------------------------------ techniques

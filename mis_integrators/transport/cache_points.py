@@ -30,9 +30,8 @@ class CacheGrid:
     Parameters: `points`, `normals` (`Point3f`, `Normal3f` of width C >= 1, evaluated; unit normals on the side that the camera path came from),
     `neighbors` (N_c; if C is smaller, neighbours repeat).
 
-    Attributes: `table` (uint32, indices of cache points: entry `rows()` times N_c and on, nearest first), `spread` (float, one a row: mean squared
-    distance of the row's neighbours from the cell's centre [length^2]), `rows` (number of rows), `spacing` (of the cache points [length]), `normal_cost` (what a right angle
-    between normals costs [length^2]).
+    Attributes: `table` (uint32, indices of cache points: entry `rows` times N_c and on, nearest first), `rows` (number of rows), `spacing` (of the
+    cache points [length]) and `squared_spacing` (opaque, [length^2]), `normal_cost` (what a right angle between normals costs [length^2]).
     """
 
     def __init__(self, points, normals, neighbors):
@@ -48,6 +47,7 @@ class CacheGrid:
         while np.prod(np.maximum(np.ceil(size / edge), 1)) > CELLS:
             edge *= 1.05
         self.resolution = [int(n) for n in np.maximum(np.ceil(size / edge), 1)]
+        self.squared_spacing = dr.opaque(mi.Float, self.spacing ** 2)
         self._low = dr.opaque(mi.Point3f, [float(x) for x in low])
         self._scale = dr.opaque(mi.Float, 1 / edge)
         self._cells = dr.opaque(mi.Point3u, self.resolution)         # as literals they would have path kernels compiled anew for each seed
@@ -56,12 +56,11 @@ class CacheGrid:
         x, y, z = np.tile(np.arange(nx), ny * nz), np.tile(np.repeat(np.arange(ny), nx), nz), np.repeat(np.arange(nz), nx * ny)
         centres = (np.stack([x, y, z], axis=1) + 0.5) * edge + low
         blocks = ((z // BLOCK) * ny + y // BLOCK) * nx + x // BLOCK
-        table, spread = _nearest(centres, blocks, p, to_numpy(normals).astype(np.float64).T, neighbors, self.normal_cost)
-        self.table, self.spread = from_numpy(mi.UInt32, table.ravel()), from_numpy(mi.Float, spread)
+        self.table = from_numpy(mi.UInt32, _nearest(centres, blocks, p, to_numpy(normals).astype(np.float64).T, neighbors, self.normal_cost).ravel())
 
     def tables(self):
-        """Every evaluated array that `row` and its users read, for `dr.freeze` to track."""
-        return [self.table, self.spread, self._low, self._scale, self._cells]
+        """Every evaluated array that `row` and the grid's users read, for `dr.freeze` to track."""
+        return [self.table, self.squared_spacing, self._low, self._scale, self._cells]
 
     def row(self, p, n):
         """Row of a point on a surface with normal `n`, on the side at hand; places outside the grid belong to its border."""
@@ -83,12 +82,12 @@ def facing(n):
 
 
 def _nearest(centres, blocks, p, n, neighbors, normal_cost):
-    """Table and spread of all rows, NumPy arrays (rows, neighbors) and (rows,).
+    """The table, a NumPy array (rows, neighbors).
 
     `centres` (cells, 3) of the cells, `blocks` (cells,) numbers of the blocks that they belong to, `p`, `n` (C, 3) of the cache points. Only points that
     can be among the nearest somewhere in a block are tried for its cells."""
     wanted = min(neighbors, len(p))
-    table, spread = np.empty((len(centres), FACINGS, wanted), dtype=np.uint32), np.empty((len(centres), FACINGS, wanted))
+    table = np.empty((len(centres), FACINGS, wanted), dtype=np.uint32)
     order = np.argsort(blocks, kind="stable")
     members = np.split(order, np.flatnonzero(np.diff(blocks[order])) + 1)
     middles = np.array([(centres[cells].min(axis=0) + centres[cells].max(axis=0)) / 2 for cells in members])
@@ -99,15 +98,12 @@ def _nearest(centres, blocks, p, n, neighbors, normal_cost):
         at_most = np.partition((distance + reach) ** 2 + turned, wanted - 1, axis=1)[:, wanted - 1:wanted]
         possible = np.maximum(distance - reach, 0) ** 2 + turned <= at_most * (1 + 1e-6)
         for cells, candidates in zip(members, map(np.flatnonzero, possible)):
-            squared = _squared(centres[cells], p[candidates])
-            cost = squared + turned[candidates]
-            lines = np.arange(len(cells))
+            cost = _squared(centres[cells], p[candidates]) + turned[candidates]
             for place in range(wanted):
                 nearest = cost.argmin(axis=1)
-                table[cells, direction, place], spread[cells, direction, place] = candidates[nearest], squared[lines, nearest]
-                cost[lines, nearest] = np.inf
-    places = np.arange(neighbors) % wanted                       # fewer cache points than neighbours repeat
-    return table[:, :, places].reshape(-1, neighbors), spread[:, :, places].mean(axis=2).ravel()
+                table[cells, direction, place] = candidates[nearest]
+                cost[np.arange(len(cells)), nearest] = np.inf
+    return table[:, :, np.arange(neighbors) % wanted].reshape(-1, neighbors)          # fewer cache points than neighbours repeat
 
 
 def _squared(a, b):

@@ -52,7 +52,7 @@ def step_to_vertex(soften, left, density, cosine, squared):
     """The fields of `STEP` at a vertex that was sampled with `density` per solid angle (zero: by a delta function) and meets the ray under `cosine`."""
     forward, back, scattered, row, there = left
     near = dr.select(density > 0, squared * dr.rcp(dr.maximum(density * cosine, 1e-20)), 0)
-    geometry = soften.softened(mi.UInt32(row), there * cosine * dr.rcp(squared), squared)
+    geometry = soften.softened(there * cosine * dr.rcp(squared), squared)
     return [dr.minimum(near, 1e15), geometry, forward, back, scattered, row]
 
 
@@ -60,7 +60,7 @@ def step_to_hit(lights, soften, left, density, origin, ds, light, squared, mask)
     """The fields of `STEP` and `HIT` of emission `light` met in the point or direction `ds`, seen from the vertex `origin`."""
     forward, back, scattered, row, there = left
     start = lights.start_density(origin, ds, mask)
-    geometry = soften.softened(mi.UInt32(row), there, squared)
+    geometry = soften.softened(there, squared)
     near = dr.select(density > 0, dr.rcp(dr.maximum(density, 1e-20)), 0)
     return dict(zip((*STEP, *HIT), (near, geometry, forward, back, scattered, row, channel_mean(light) * dr.rcp(dr.maximum(start, 1e-20)), start,
                                     lights.forward_density(origin, ds, mask))))
@@ -75,7 +75,7 @@ def trace_camera_vertices(scene, sensor, integrator, lights, traits, soften, see
     `subpaths.new_vertices` with the fields of `STEP`; records of `hit_layout`. Counts have width one; if they exceed the capacities the surplus is missing. The
     first vertex has one over the density of camera rays there, over the whole crop window, times `ratio`, as its `near`, and no parent.
 
-    `soften.row(p, n)` numbers places, with the normal on the side of the light; `soften.softened(row, geometry, squared)` may change the geometric
+    `soften.row(p, n)` numbers places, with the normal on the side of the light; `soften.softened(geometry, squared)` may change the geometric
     term of a step that starts there, with its squared distance (infinite for environments).
     """
     path, active, rng, ray, sensor_weight, splat, aperture = start_camera_paths(sensor, seed, first, 1, n_paths, camera_paths, wavelength_sample)
