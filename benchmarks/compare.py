@@ -89,6 +89,7 @@ def _row(measured: Measured, mine: dict, base: dict, measurement: Measurement) -
     relative, cost = mean_interval(mine["relmse"]), ratio_interval(mine["cost"], base["cost"])
     error_ratio = ratio_interval(mine["relmse"], base["relmse"])
     trimmed = ratio_interval(mine["relmse_trimmed"], base["relmse_trimmed"])
+    absolute = ratio_interval(mine["mape"], base["mape"])
     seconds = float(np.mean([last.seconds for last in lasts]))
     return {
         "scene": opened.name,
@@ -110,6 +111,10 @@ def _row(measured: Measured, mine: dict, base: dict, measurement: Measurement) -
         "relMSE trimmed": float(np.mean(mine["relmse_trimmed"])),
         "relMSE median of means": float(np.mean(mine["relmse_median"])),
         "MAPE": float(np.mean(mine["mape"])),
+        "MAPE ratio": absolute.value,
+        "MAPE ratio low": absolute.low,
+        "MAPE ratio high": absolute.high,
+        "MAPE by seed": " ".join(f"{value:.6g}" for value in mine["mape"]),
         "FLIP": float(np.mean(mine["flip"])) if mine["flip"] else None,
         "mean ratio": float(np.mean(mine["mean_ratio"])),
         "bias2": parts and parts.bias2,

@@ -166,15 +166,18 @@ def test_longer_renders_try_more(rgb):
     assert short <= 2 < long
 
 
-@pytest.mark.parametrize("price, spp, tried", [(1e-4, 24, {"bdpm_opt2"}), (1e4, 24, set()), (1e-4, 4, set())])
-def test_weights_are_worth_more_time_where_path_keeps_up(rgb, monkeypatch, price, spp, tried):
-    """One mixture is tried beyond the pilot's usual share, if there is some time left, where camera paths find much of the light by themselves."""
-    set_price_of_path(monkeypatch, price)
+@pytest.mark.parametrize("behind, spp, tried", [(2, 24, {"bdpm_opt2"}), (100, 24, set()), (0.1, 24, set()), (2, 4, set())])
+def test_weights_are_worth_more_time_where_path_keeps_up(rgb, monkeypatch, behind, spp, tried):
+    """One mixture is tried beyond the pilot's usual share, if there is some time left, where camera paths find much of the light by themselves, but not so
+    much that `path` is ahead."""
     metal = {"type": "sphere", "center": [0, -1.3, 0.4], "radius": 0.3, "bsdf": {"type": "roughconductor", "alpha": 0.3}}
+    set_price_of_path(monkeypatch, 1)
+    errors = decided(box_scene(metal=metal), spp).settings
+    set_price_of_path(monkeypatch, behind * errors["choice.relmse.bdpm bdd=0"] / errors["choice.relmse.path"])
     settings = decided(box_scene(metal=metal), spp).settings
     errors = {name.removeprefix("choice.relmse.") for name in settings if name.startswith("choice.relmse.")}
     assert errors == {"path", "bdpm bdd=0"} | tried
-    assert any(("30%" if price < 1 and not tried else "5%") in reason for name, reason in settings.items() if name.startswith("choice.because"))
+    assert any(("30%" if behind == 2 and not tried else "5%") in reason for name, reason in settings.items() if name.startswith("choice.because"))
 
 
 @pytest.mark.parametrize("material, first", [({"type": "roughdielectric", "alpha": 0.1}, "bdpm_opt3"), ({"type": "roughplastic"}, "bdpm_opt2"),

@@ -40,6 +40,7 @@ class ResampledPaths(JointPaths):
         super().__init__(scene, length)
         self.session = plugin(parameters.pop("name", "bdpt_ris"), max_depth=-1, **parameters).session(scene, 0, seed=1, spp=0)
         self.session._prepare()
+        self.session._take_weights(1)
         self.lights, self.traits = self.session.lights, self.session.traits
 
     def keep(self, buffer, states, number, side, state, parent):
@@ -263,6 +264,7 @@ def test_nothing_is_visible(rgb):
         "sensor": {"type": "perspective", "fov": 40, "to_world": look((0, -2, 3), (0, 0, 0)), "film": film(16)}})
     for name in ("bdpt_ris", "pcbpt"):
         session = plugin(name).session(scene, 0, 1, 0)
+        session.iterate()
         session.iterate()
         assert np.all((session.image() >= 0) & (session.image() < 1e-4))      # rays start a little beside their surface
         assert all(np.isfinite(np.array(x)).all() for x in (session.records, session.shares))

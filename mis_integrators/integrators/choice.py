@@ -27,7 +27,8 @@ PILOT_SHARE = 0.05
 """Share of the planned time that the pilot may have; `path` and the first photon mapper are tried however long that takes."""
 KEEPS_UP = 4
 """Where the error expected of `path` is at most so many times that of the first photon mapper, camera paths find much of the light by themselves, and what
-spoils photon maps are highlights on glossy surfaces: optimal weights are likely to be the best."""
+spoils photon maps are highlights on glossy surfaces: optimal weights are likely to be the best. (Where `path` is ahead, they seldom are by more than
+their trial takes.)"""
 WORTH_SHARE = 0.3
 """The share of the time that is left that a trial may then take. If it is won, nothing of it was in vain."""
 LIKE_THE_FIRST = 2.5
@@ -111,7 +112,7 @@ def choose(integrator, scene, sensor, seed, iterations, seconds):
         reasons.append(blind)
     else:
         trials.insert(0, _try_path(path, segments, stride, pixels, forecast.mean))
-    weighting = not blind and trials[0].error(budget) < KEEPS_UP * trials[1].error(budget)
+    weighting = not blind and 1 < trials[0].error(budget) / max(trials[1].error(budget), 1e-30) < KEEPS_UP
     for plugin, parameters in later_candidates(first.traits):
         name = name_of(plugin, parameters)
         if plugin.startswith("bdpm_opt") and not first.traits.has_rough:

@@ -25,7 +25,7 @@ from ..transport.spectra import channel_mean
 from ..transport.subpaths import junction_of, read_vertices, trace_light_subpaths
 from ..transport.traits import SceneTraits
 from .common import IterativeIntegrator, IterativeSession
-from .resampled_weights import LENGTHS, ResampledWeights, around, doubt, guessed_weight, tabulate
+from .resampled_weights import LENGTHS, ResampledWeights, around, doubt, guessed_weight, ignorant, tabulate
 
 CHUNK = 1 << 18
 """Camera paths, and as many light sub-paths, traced at once at most; larger films are traced in parts (bounds memory), which share their proposals."""
@@ -33,8 +33,8 @@ CACHE_SHARE, FEWEST_CACHE_POINTS = 1 / 300, 256
 """Cache points: this share of a part's camera vertices, but at least so many. More of them cost shadow rays."""
 MOST_PAIRS = 1 << 24
 """Pairs of a cache point and a light vertex at most, four bytes each (and some more while they are made); beyond that there are fewer cache points."""
-PILOT_PATHS, MOST_PILOT_SETS = 400, 8
-"""Light sub-paths from which Q and Q_s are estimated before the first iteration, in sets of M; at most so many sets."""
+KNOWN_PATHS, MOST_KNOWN_SETS = 200, 8
+"""Light sub-paths of the first iteration from which Q and Q_s are estimated, in sets of M; at most so many sets."""
 
 
 class ResampledIntegrator(IterativeIntegrator):
@@ -85,8 +85,8 @@ class ResampledSession(IterativeSession):
         self.expected_weight = expected_weight(sensor.film(), integrator.camera_paths)
         self.recorded = recorder()
         self.grid = CacheGrid(mi.Point3f(0), mi.Normal3f(0, 0, 1), integrator.cache_neighbors)
-        self.records, self.shares = dr.ones(mi.Float, 4 * self.grid.rows), dr.ones(mi.Float, LENGTHS * self.grid.rows)
-        self.cache = None
+        self.records, self.shares = ignorant(self.grid)
+        self.cache = self.known = self.first_light = None
         self._freeze()
 
     PASSES = {"_light_pass": ("_trace_light", ("light",)), "_camera_pass": ("_trace_camera", ("camera", "hits")),
@@ -95,9 +95,11 @@ class ResampledSession(IterativeSession):
               "_sensor_pass": ("_join_sensor", ("light",))}
 
     def _freeze(self, grown=None):
-        dr.make_opaque(self.records, self.shares)                 # else their first values, all ones, would be literals of kernels
-        self._tables = [self.traits.lambertian, self.traits.perturbed, self.records, self.shares, *self.grid.tables(), *self.lights.tables()]
+        self._fill_tables()
         self._record(grown)
+
+    def _fill_tables(self):
+        self._tables = [self.traits.lambertian, self.traits.perturbed, self.records, self.shares, *self.grid.tables(), *self.lights.tables()]
 
     def weights(self):
         """The weights of this session."""
@@ -231,19 +233,34 @@ class ResampledSession(IterativeSession):
     # ------------------------------------------------------------------ before the first iteration
 
     def _prepare(self):
-        """Draws the cache points, and estimates Q and Q_s there."""
-        spectral = shared_wavelengths(self.sensor, mix(self.seed, PILOT, WAVELENGTH))
+        """Draws the cache points."""
+        spectral = self._spectral(PILOT)
         traced = self._camera(PILOT, dr.opaque(mi.UInt32, 0), spectral)
-        light = self._light(PILOT, 0, spectral)
         vertices, M = min(int(traced[4][0]), self.capacity["camera"]), self.integrator.light_paths
         wanted = min(max(FEWEST_CACHE_POINTS, int(vertices * CACHE_SHARE)), max(vertices, 1))
-        self.capacity["ends"] = ends_room(np.array(light[2]), M)
+        self.capacity["ends"] = ends_room(np.array(self._first_light()[2]), M)
         self.cache = self._cache_points(traced[3], vertices, max(min(wanted, MOST_PAIRS // (M + self.capacity["ends"])), 1))
         normals = dr.mulsign(self.cache["n"], dr.dot(self.cache["n"], self.cache["towards"]))
         self.grid = CacheGrid(self.cache["p"], normals, self.integrator.cache_neighbors)
-        if self.integrator.aware:
-            self.records, self.shares = tabulate(self.grid, *self._integrals(light, spectral))
+        self.records, self.shares = ignorant(self.grid)
         self._freeze()
+
+    def _first_light(self):
+        """The first iteration's light sub-paths; kept until Q and Q_s are known."""
+        if self.first_light is None:
+            self.first_light = self._light(0, 0, self._spectral(0))
+        return self.first_light
+
+    def _take_weights(self, iteration):
+        """Sets the weights of an iteration. They must not depend on its own light sub-paths: the first one's goes by densities alone, those of all
+        others by what the first one's sub-paths tell of Q and Q_s."""
+        if not self.integrator.aware:
+            return
+        if iteration > 0 and self.known is None:
+            self.known = tabulate(self.grid, *self._integrals(self._first_light(), self._spectral(0)))
+            self.first_light = None
+        self.records, self.shares = self.known if iteration > 0 else ignorant(self.grid)
+        self._fill_tables()
 
     def _cache_points(self, camera, vertices, count):
         """`count` of the camera's vertices, at random (a single one in nothingness if there is none)."""
@@ -263,7 +280,7 @@ class ResampledSession(IterativeSession):
     def _integrals(self, light, spectral):
         """`Q_s`, `Q_blind`, `doubts` and `ends_s` as `tabulate` takes them."""
         M, points, cache = self.integrator.light_paths, dr.width(self.cache["depth"]), self.cache
-        sets = max(min(-(-PILOT_PATHS // M), MOST_PILOT_SETS, self.light_chunk // M), 1)
+        sets = max(min(-(-KNOWN_PATHS // M), MOST_KNOWN_SETS, self.light_chunk // M), 1)
         normals = to_numpy(dr.mulsign(cache["n"], dr.dot(cache["n"], cache["towards"]))).T
         near = around(to_numpy(cache["p"]).T, normals, self.integrator.cache_neighbors, self.grid.normal_cost)
         Q_s, Q_blind, doubts, ends_s = np.zeros((points, LENGTHS)), np.zeros(points), np.zeros(points), np.zeros(LENGTHS)
@@ -280,6 +297,9 @@ class ResampledSession(IterativeSession):
         return Q_s / (sets * M), Q_blind / (sets * M), doubts / sets, ends_s / (sets * M)
 
     # ------------------------------------------------------------------ iterations
+
+    def _spectral(self, iteration):
+        return shared_wavelengths(self.sensor, mix(self.seed, iteration, WAVELENGTH))
 
     def _light(self, iteration, chunk, spectral):
         """What `trace_light_subpaths` returns."""
@@ -331,10 +351,13 @@ class ResampledSession(IterativeSession):
 
     def _iteration(self, iteration):
         self.start()
-        spectral = shared_wavelengths(self.sensor, mix(self.seed, iteration, WAVELENGTH))
+        spectral = self._spectral(iteration)
         light = proposals = None
         if self.lit:
-            light = self._light(iteration, 0, spectral)
+            self._take_weights(iteration)
+            light = self._light(iteration, 0, spectral) if iteration else self._first_light()
+            if not self.integrator.aware or self.known is not None:
+                self.first_light = None                    # nobody will ask for it again
             proposals = self._proposals(iteration, spectral, light)
         block, light = self.sum_of_chunks(partial(self._chunk, iteration, spectral, light, proposals))
         return block if light is None else with_colour(block, as_camera_weights(light, block, self.expected_weight))

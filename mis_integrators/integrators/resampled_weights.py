@@ -5,11 +5,11 @@ evaluate one function: a technique that joins a light sub-path Y to the camera v
 
     q/p = (a + c) r + b  if a cache point of z sees what z sees, else  c r + b,    r = f_y rho G softened,    G softened = G d^2 / (d^2 + h^2)
 
-where the parts are the cached pmfs' visible, blind and uniform ones (`proposals`), and the second case has a probability e. The five numbers of z and the
+where the parts are the cached pmfs' visible, blind and uniform ones (`proposals`), and the second case has a probability e. The four numbers of z and the
 lengths' shares Q_s/Q are looked up by place and by the side from which the light comes (`CacheGrid.row`); they are averages over the N_c cache points
-there, made once before the first iteration. So the weights depend neither on an iteration's light sub-paths nor on its pmfs, and the sum of
-the techniques stays unbiased. h is the spacing of the cache points: the cached pmf, made for their places, does not know that G has
-a pole at z. Left out are visibility (the ends of a joint path see each other), the camera's BSDF of `f_y_f_yz`, the guess of the weight that the pmfs
+there, made once from the light sub-paths of the first iteration (which weights by densities alone). So the weights depend neither on an iteration's own
+light sub-paths nor on its pmfs, and the sum of the techniques stays unbiased. h is the spacing of the cache points: the cached pmf, made for their places,
+does not know that G has a pole at z. Left out are visibility (the ends of a joint path see each other), the camera's BSDF of `f_y_f_yz`, the guess of the weight that the pmfs
 contain (`guessed_weight`), and delta functions' weights; colours enter by channel means.
 """
 
@@ -147,6 +147,11 @@ def doubt(near, r, seen):
     pmf = pmf / np.maximum(pmf.sum(axis=1, keepdims=True), 1e-30)
     expected = sum(pmf[column] for column in near.T) / near.shape[1]
     return np.sum(pmf * (expected < UNEXPECTED * pmf), axis=1)
+
+
+def ignorant(grid):
+    """`(records, shares)` of the rows that have every draw count as one connection, where nothing is known of Q and Q_s."""
+    return tuple(from_numpy(mi.Float, np.tile(values, grid.rows)) for values in ([0.0, 1.0, 0.0, 0.0], np.ones(LENGTHS)))
 
 
 def tabulate(grid, Q_s, Q_blind, doubts, ends_s):
