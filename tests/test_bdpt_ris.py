@@ -308,6 +308,20 @@ def test_same_seed_same_image(rgb):
     assert abs(np.corrcoef(same, other)[0, 1]) < 0.75 and abs(np.corrcoef(same[1:], same[:-1])[0, 1]) < 0.75      # 1e-6 for 30 pairs
 
 
+@pytest.mark.parametrize("light_paths", [30, 300])
+def test_iterations_in_any_order(rgb, light_paths):
+    """What the first iteration's light sub-paths tell of Q is known to all others, and not to itself, whoever renders which first: workers of a cluster, or
+    a render that goes on."""
+    scene, images = box_scene(16), []
+    for order in ((0, 1, 2), (2, 0, 1)):
+        session = plugin("bdpt_ris", light_paths=light_paths).session(scene, 0, 7, 0)
+        for number in order:
+            session.iterate(number)
+        images.append(session.image())
+        assert session.first_light is None
+    np.testing.assert_allclose(*images, rtol=1e-3, atol=1e-5)
+
+
 def test_replays_are_what_was_recorded(monkeypatch):
     """The pass that makes the pmfs has a size that Dr.Jit, left alone, would take for a multiple of its virtual calls' data, and get wrong
     (`transport.recording.lanes`): 192 cache points times 520 light vertices."""

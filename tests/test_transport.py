@@ -473,8 +473,8 @@ def test_position_density(emitter):
     assert (np.abs(observed - expected) < 5.5 * np.sqrt(expected + 1) + 0.06 * expected + 0.003 * n / bins).all()
 
 
-def room_with_window():
-    """A closed room of 6 x 4 x 3 with a window of 1 x 1 in one wall; the camera stands inside, the sun looks in."""
+def room_with_window(sky={"type": "sunsky", "sun_direction": [0.8, 0.1, 0.5], "turbidity": 3.0}):
+    """A closed room of 6 x 4 x 3 with a window of 1 x 1 in one wall; the camera stands inside, the sky (a sun, unless told otherwise) looks in."""
     wall = {"type": "twosided", "bsdf": diffuse(0.7)}
 
     def slab(x0, x1, y0, y1, z0, z1):
@@ -488,16 +488,39 @@ def room_with_window():
         "below": slab(6, 6 + e, 0, 4, 0, 1), "above": slab(6, 6 + e, 0, 4, 2, 3), "one side": slab(6, 6 + e, 0, 1.5, 1, 2),
         "other side": slab(6, 6 + e, 2.5, 4, 1, 2), "ground": {"type": "rectangle", "to_world": T().translate([3, 2, -0.1]).scale(30),
                                                               "bsdf": diffuse(0.2)},
-        "sky": {"type": "sunsky", "sun_direction": [0.8, 0.1, 0.5], "turbidity": 3.0},
+        "sky": sky,
         "sensor": {"type": "perspective", "fov": 70, "to_world": look((0.5, 0.5, 1.5), (5, 3, 1), (0, 0, 1)), "film": film(32)}})
+
+
+def inside_room(scene, ray):
+    """Which light rays end in the room of `room_with_window`."""
+    si = scene.ray_intersect(ray)
+    p = np.array(si.p)
+    return np.array(si.is_valid()) & (p[0] > -1e-3) & (p[0] < 5.999) & (p[1] > -1e-3) & (p[1] < 4.001) & (p[2] > -1e-3) & (p[2] < 3.001)
 
 
 def test_sky_enters_by_the_window():
     """At least 30 % of the light sub-paths of sun and sky enter a room by its one small window (1/300 of the scene's disk)."""
     scene = room_with_window()
     _, ray, flux = emission(scene, 1 << 16)
-    si = scene.ray_intersect(ray)
-    p = np.array(si.p)
-    inside = np.array(si.is_valid()) & (p[0] > -1e-3) & (p[0] < 5.999) & (p[1] > -1e-3) & (p[1] < 4.001) & (p[2] > -1e-3) & (p[2] < 3.001)
-    sent = np.array(flux) > 0
+    inside, sent = inside_room(scene, ray), np.array(flux) > 0
     assert (inside & sent).mean() > 0.3, (inside & sent).mean()
+
+
+def test_windows_are_known_from_all_directions():
+    """What an even sky sends through the window is spread over more sub-paths, counted as that many of equal flux, where the guide knows the faces by which
+    light enters than where it knows each direction by itself; and it is the same flux. (All random numbers are fixed.)"""
+    scene = room_with_window({"type": "constant"})
+    guide = EnvironmentGuide(scene, scene.sensors()[0])
+    count, found = 1 << 18, []
+    for known in (True, False):
+        if not known:
+            guided = np.array(guide._guided)
+            guide._guided = mi.Float(np.where(guided > 0, guided + np.array(guide._entering), 0))
+            guide.entrances = None
+        ray, flux, *_ = Lights(scene, guide=guide).sample_emission(streams(dr.arange(mi.UInt32, count), mi.UInt32(7)), mi.Float(0), [])
+        entering = np.array(dr.mean(flux) + dr.zeros(mi.Float, count)) * inside_room(scene, ray)
+        found.append((entering.sum() ** 2 / np.sum(entering ** 2), *mean_and_error(entering)))
+    (even, mean, error), (uneven, other, other_error) = found
+    assert even > 1.3 * uneven, (even, uneven)
+    assert abs(mean - other) < 5.3 * np.hypot(error, other_error)
