@@ -275,12 +275,13 @@ class EnvironmentGuide:
             active &= si.is_valid()
             bsdf = si.bsdf()
             smooth = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-            places.append((Place(si, bsdf, throughput, smooth), streams(dr.arange(mi.UInt32, PILOT_PATHS), mi.UInt32(0x706c6163 + bounce))))
+            own = streams(dr.arange(mi.UInt32, PILOT_PATHS), dr.opaque(mi.UInt32, 0x706c6163 + bounce))          # a literal would have kernels made anew
+            places.append((Place(si, bsdf, throughput, smooth), own))
             bs, value = bsdf.sample(mi.BSDFContext(), si, rng.next_float32(), next_2d(rng), active)
             throughput = throughput * value
             active &= channel_mean(throughput) > 0
             ray = si.spawn_ray(si.to_world(bs.wo))
-            dr.eval(ray, active, throughput, rng, si, smooth)
+            dr.eval(ray, active, throughput, rng, si, smooth, own)
         return places
 
     @staticmethod
