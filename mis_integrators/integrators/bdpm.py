@@ -9,13 +9,12 @@ import mitsuba as mi
 
 from ..transport.camera_pass import film_sample_count, trace_camera_paths
 from ..transport.coverage import covered_share
-from ..transport.film import shared_wavelengths, splat_samples
+from ..transport.film import splat_samples
 from ..transport.gather import gather_photons
 from ..transport.light_pass import trace_light_paths
 from ..transport.lights import Lights
 from ..transport.packing import rounded_up
 from ..transport.photon_map import PhotonMap, build_photon_map, smallest_cell
-from ..transport.random import mix
 from ..transport.recording import recorder
 from ..transport.traits import SceneTraits, lookup
 from .common import MOST_LIGHT_PATHS, IterativeIntegrator, IterativeSession
@@ -248,10 +247,6 @@ class BDPMSession(IterativeSession):
             radiance = dr.select(alpha > 0, radiance, 0)       # as `path` does: what is behind nothing but null surfaces is hidden
         return splat_samples(sensor.film(), position, radiance, alpha, spectral["matrix"], self.in_chunk(first)), count
 
-    def _spectral(self, iteration):
-        """The wavelengths that all sub-paths of an iteration share, the sample that makes them, and their conversion to colour."""
-        return shared_wavelengths(self.sensor, mix(self.seed, iteration, WAVELENGTH))
-
     # ------------------------------------------------------------------ iterations
 
     def _photons(self, iteration, spectral):
@@ -314,5 +309,5 @@ class BDPMSession(IterativeSession):
         return block
 
 
-LIGHT, CAMERA, WAVELENGTH = range(3)
-"""Purposes of an iteration's random seeds."""
+LIGHT, CAMERA = range(2)
+"""Purposes of an iteration's random seeds, besides `IterativeSession.WAVELENGTH`."""

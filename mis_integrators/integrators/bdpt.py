@@ -8,12 +8,12 @@ import drjit as dr
 import mitsuba as mi
 
 from ..transport.connections import by_path, join, join_sensor, list_pairs, visible
-from ..transport.film import (as_camera_weights, colour_channels, expected_weight, shared_wavelengths, splat_channels, splat_samples,
+from ..transport.film import (as_camera_weights, colour_channels, expected_weight, splat_channels, splat_samples,
                               with_colour)
 from ..transport.lenses import Lens
 from ..transport.lights import Lights
 from ..transport.packing import rounded_up
-from ..transport.random import mix, next_2d, vertex_streams
+from ..transport.random import next_2d, vertex_streams
 from ..transport.recording import lanes, recorder
 from ..transport.spectra import channel_mean
 from ..transport.subpaths import read_vertices, trace_camera_subpaths, trace_light_subpaths
@@ -245,10 +245,6 @@ class BDPTSession(IterativeSession):
                 lit = self._sensor_pass(self.scene, self.sensor, self._tables, light, self._seed(iteration, APERTURE, chunk), spectral)
         return *self._splat(radiance, alpha, position, first, spectral, entries), lit
 
-    def _spectral(self, iteration):
-        """What all sub-paths of an iteration share."""
-        return shared_wavelengths(self.sensor, mix(self.seed, iteration, WAVELENGTH))
-
     def _merge(self, radiance, camera, count, light, spectral):
         """Radiance of camera paths with that of merges added (none here)."""
         return radiance
@@ -270,5 +266,5 @@ class BDPTSession(IterativeSession):
         self.accumulator.put(self._emptied(self.sensor.film()), self.integrator.variance, self.sums.tensors.get("techniques"))
 
 
-LIGHT, CAMERA, WAVELENGTH, APERTURE, THIN = range(5)
-"""Purposes of an iteration's random seeds."""
+LIGHT, CAMERA, APERTURE, THIN = 0, 1, 3, 4
+"""Purposes of an iteration's random seeds, besides `IterativeSession.WAVELENGTH`."""

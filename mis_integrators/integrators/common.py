@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..transport.camera_pass import film_sample_count
-from ..transport.film import Accumulator, variance_channels
+from ..transport.film import Accumulator, shared_wavelengths, variance_channels
 from ..transport.packing import rounded_up
 from ..transport.random import mix
 from ..transport.recording import settle
@@ -238,6 +238,13 @@ class IterativeSession:
     def _run(self, iteration):
         """Adds an iteration to the sums."""
         self.accumulator.add(self._iteration(iteration), iteration)
+
+    WAVELENGTH = 2
+    """Purpose of the random seed of an iteration's wavelengths."""
+
+    def _spectral(self, iteration):
+        """The wavelengths that all sub-paths of an iteration share, the sample that makes them, and their conversion to colour."""
+        return shared_wavelengths(self.sensor, mix(self.seed, iteration, self.WAVELENGTH))
 
     def _seed(self, iteration, *purpose):
         return dr.opaque(mi.UInt32, mix(self.seed, iteration, *purpose))

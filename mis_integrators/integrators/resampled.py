@@ -11,7 +11,7 @@ import numpy as np
 from ..transport.cache_points import CacheGrid
 from ..transport.camera_vertices import STEP, hit_layout, sum_before, trace_camera_vertices
 from ..transport.connections import join_sensor
-from ..transport.film import as_camera_weights, colour_channels, expected_weight, shared_wavelengths, splat_channels, splat_samples, with_colour
+from ..transport.film import as_camera_weights, colour_channels, expected_weight, splat_channels, splat_samples, with_colour
 from ..transport.junctions import scattered_mean
 from ..transport.lenses import Lens
 from ..transport.light_ends import END, LightEnds, list_ends
@@ -242,7 +242,6 @@ class ResampledSession(IterativeSession):
         self.cache = self._cache_points(traced[3], vertices, max(min(wanted, MOST_PAIRS // (M + self.capacity["ends"])), 1))
         normals = dr.mulsign(self.cache["n"], dr.dot(self.cache["n"], self.cache["towards"]))
         self.grid = CacheGrid(self.cache["p"], normals, self.integrator.cache_neighbors)
-        self.records, self.shares = ignorant(self.grid)
         self._freeze()
 
     def _first_light(self):
@@ -297,9 +296,6 @@ class ResampledSession(IterativeSession):
         return Q_s / (sets * M), Q_blind / (sets * M), doubts / sets, ends_s / (sets * M)
 
     # ------------------------------------------------------------------ iterations
-
-    def _spectral(self, iteration):
-        return shared_wavelengths(self.sensor, mix(self.seed, iteration, WAVELENGTH))
 
     def _light(self, iteration, chunk, spectral):
         """What `trace_light_subpaths` returns."""
@@ -363,7 +359,7 @@ class ResampledSession(IterativeSession):
         return block if light is None else with_colour(block, as_camera_weights(light, block, self.expected_weight))
 
 
-LIGHT, CAMERA, WAVELENGTH, APERTURE, START, DRAW = range(6)
-"""Purposes of an iteration's random seeds."""
+LIGHT, CAMERA, APERTURE, START, DRAW = 0, 1, 3, 4, 5
+"""Purposes of an iteration's random seeds, besides `IterativeSession.WAVELENGTH`."""
 PILOT = 1 << 31
 """The number of the iteration that never is: what is made before the first one draws from its seeds."""

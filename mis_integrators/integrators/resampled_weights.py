@@ -9,8 +9,8 @@ where the parts are the cached pmfs' visible, blind and uniform ones (`proposals
 lengths' shares Q_s/Q are looked up by place and by the side from which the light comes (`CacheGrid.row`); they are averages over the N_c cache points
 there, made once from the light sub-paths of the first iteration (which weights by densities alone). So the weights depend neither on an iteration's own
 light sub-paths nor on its pmfs, and the sum of the techniques stays unbiased. h is the spacing of the cache points: the cached pmf, made for their places,
-does not know that G has a pole at z. Left out are visibility (the ends of a joint path see each other), the camera's BSDF of `f_y_f_yz`, the guess of the weight that the pmfs
-contain (`guessed_weight`), and delta functions' weights; colours enter by channel means.
+does not know that G has a pole at z. Left out are visibility (the ends of a joint path see each other), the camera's BSDF of `f_y_f_yz`, the guess of
+the weight that the pmfs contain (`guessed_weight`), and delta functions' weights; colours enter by channel means.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..transport.cache_points import least_columns
 from ..transport.light_ends import END
 from ..transport.light_starts import seen_from
 from ..transport.packing import from_numpy
@@ -130,11 +131,7 @@ def around(p, n, neighbors, normal_cost):
     p, n = (p - p.mean(axis=0)).astype(np.float32), n.astype(np.float32)
     cost = np.sum(p ** 2, axis=1) - 2 * p @ p.T - np.float32(normal_cost) * n @ n.T          # but for what is the same in a row
     np.fill_diagonal(cost, np.inf)
-    near = np.empty((len(p), min(neighbors, len(p) - 1)), dtype=np.intp)
-    for place in range(near.shape[1]):
-        near[:, place] = cost.argmin(axis=1)
-        cost[np.arange(len(p)), near[:, place]] = np.inf
-    return near
+    return least_columns(cost, min(neighbors, len(p) - 1))
 
 
 def doubt(near, r, seen):

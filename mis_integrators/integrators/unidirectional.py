@@ -6,21 +6,22 @@ import drjit as dr
 import mitsuba as mi
 
 from ..transport.camera_pass import film_sample_count, start_camera_paths
-from ..transport.film import shared_wavelengths, splat_samples
-from ..transport.random import mix
+from ..transport.film import splat_samples
 from .common import IterativeSession
 
 BUSY = 1 << 19
 """Camera paths that keep the processor busy: twice as many at once are 3 % faster, 65536 a quarter slower."""
 CHUNK = 1 << 21
 """Camera paths traced at once at most (bounds memory)."""
-PATHS, WAVELENGTH, SAMPLER = range(3)
-"""Purposes of an iteration's random seeds."""
+PATHS, SAMPLER = 0, 2
+"""Purposes of an iteration's random seeds, besides `PathSession.WAVELENGTH`."""
 
 
 class PathSession(IterativeSession):
     """Iterations of `path`: `camera_paths` samples a pixel each, or, if that is 0 and no number of iterations is planned, as many as keep the processor
     busy."""
+
+    WAVELENGTH = 1
 
     def __init__(self, integrator, scene, sensor, seed, iterations):
         super().__init__(integrator, scene, sensor, seed, iterations)
@@ -53,9 +54,6 @@ class PathSession(IterativeSession):
         self.sampler.seed(self._seed(iteration, SAMPLER, chunk), paths)
         radiance, valid, _ = self.path_integrator.sample(self.scene, self.sampler, differential, None, active)
         return dr.select(active, weight * radiance, 0), dr.select(valid, mi.Float(1), 0), position, active
-
-    def _spectral(self, iteration):
-        return shared_wavelengths(self.sensor, mix(self.seed, iteration, WAVELENGTH))
 
     def _iteration(self, iteration):
         spectral = self._spectral(iteration)

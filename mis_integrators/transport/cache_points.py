@@ -99,11 +99,17 @@ def _nearest(centres, blocks, p, n, neighbors, normal_cost):
         possible = np.maximum(distance - reach, 0) ** 2 + turned <= at_most * (1 + 1e-6)
         for cells, candidates in zip(members, map(np.flatnonzero, possible)):
             cost = _squared(centres[cells], p[candidates]) + turned[candidates]
-            for place in range(wanted):
-                nearest = cost.argmin(axis=1)
-                table[cells, direction, place] = candidates[nearest]
-                cost[np.arange(len(cells)), nearest] = np.inf
+            table[cells, direction] = candidates[least_columns(cost, wanted)]
     return table[:, :, np.arange(neighbors) % wanted].reshape(-1, neighbors)          # fewer cache points than neighbours repeat
+
+
+def least_columns(cost, wanted):
+    """Columns of the `wanted` least entries of each row of `cost` (NumPy, at least as wide), least first: (rows, wanted). They are overwritten."""
+    lines, columns = np.arange(len(cost)), np.empty((len(cost), wanted), dtype=np.intp)
+    for place in range(wanted):
+        columns[:, place] = cost.argmin(axis=1)
+        cost[lines, columns[:, place]] = np.inf
+    return columns
 
 
 def _squared(a, b):

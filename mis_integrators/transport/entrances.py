@@ -10,12 +10,15 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .histograms import draw_cell, in_square_cell, smoothed, square_cell
 from .packing import from_numpy
 
 FACE_CELLS = 64
 """Cells along each edge of a face."""
 FACES = 6
 """Numbers 2 a (the lower face across axis a) and 2 a + 1 (the upper one)."""
+LEVEL_SHARES = (0.4, 0.2, 0.15, 0.15, 0.1)
+"""Shares of the histograms at full, half, quarter, ... resolution."""
 LEAST_EXTENT = 0.02
 """Least edge of the box, in units of its longest."""
 
@@ -24,18 +27,18 @@ class Entrances:
     """A density of lines: in each direction over the plane across it, proportional to a histogram over the faces of the box `low` to `high` at the place
     where a line comes out of the box towards the light.
 
-    Parameters: `low`, `high`, arrays (3,); `points`, `towards` (3, n): places, most of them in the box, and directions in which they see light; `weights` (n,); `smooth`: what
-    smooths histograms (FACES, FACE_CELLS, FACE_CELLS).
+    Parameters: `low`, `high`, arrays (3,); `points`, `towards` (3, n): places, most of them in the box, and directions in which they see light; `weights`
+    (n,).
     """
 
-    def __init__(self, low, high, points, towards, weights, smooth):
+    def __init__(self, low, high, points, towards, weights):
         extent = np.maximum(high - low, LEAST_EXTENT * max(np.max(high - low), 1e-6))
         centre = (low + high) / 2
         self._low, self._extent = (dr.opaque(mi.Vector3f, [float(x) for x in v]) for v in (centre - extent / 2, extent))
         face, cell, inside = (np.array(x) for x in self._exit(mi.Vector3f(towards), mi.Point3f(points)))
         cells = FACE_CELLS ** 2
         histogram = np.bincount((face * cells + cell)[inside], weights[inside], FACES * cells).reshape(FACES, FACE_CELLS, FACE_CELLS)
-        histogram = smooth(histogram).reshape(FACES, cells)
+        histogram = smoothed(histogram, LEVEL_SHARES).reshape(FACES, cells)
         histogram /= max(histogram.sum(), 1e-300)
         self._light = from_numpy(mi.Float, histogram.ravel())
         self._of_face = from_numpy(mi.Float, histogram.sum(axis=1))
@@ -58,8 +61,7 @@ class Entrances:
         upper = dr.select(axis == 0, towards.x, dr.select(axis == 1, towards.y, towards.z)) > 0
         place = (p + leaves * towards - self._low) / self._extent
         u, v = dr.select(axis == 0, place.y, place.x), dr.select(axis == 2, place.y, place.z)
-        column, line = (dr.clip(mi.Int32(dr.floor(x * FACE_CELLS)), 0, FACE_CELLS - 1) for x in (u, v))
-        return 2 * axis + dr.select(upper, mi.UInt32(1), 0), mi.UInt32(line * FACE_CELLS + column), meets
+        return 2 * axis + dr.select(upper, mi.UInt32(1), 0), square_cell(u, v, FACE_CELLS), meets
 
     def _faces(self, towards):
         """For each axis: the face that looks `towards` the light, and cosine times histogram of it."""
@@ -88,13 +90,8 @@ class Entrances:
         axis = dr.select(third, mi.UInt32(2), dr.select(second, mi.UInt32(1), mi.UInt32(0)))
         face = dr.select(third, faces[2], dr.select(second, faces[1], faces[0]))
         cells = FACE_CELLS ** 2
-        cell = dr.binary_search(0, cells - 1, lambda i: dr.gather(mi.Float, self._cdf, face * cells + i, active) <= u)
-        if jitter is None:
-            upper = dr.gather(mi.Float, self._cdf, face * cells + cell, active)
-            lower = dr.gather(mi.Float, self._cdf, face * cells + cell - 1, active & (cell > 0))
-            jitter = mi.Point2f(dr.clip((u - lower) / dr.maximum(upper - lower, 1e-20), 0, 0.9999999), sample.y)
-        a = (mi.Float(cell % FACE_CELLS) + jitter.x) * (1 / FACE_CELLS)
-        b = (mi.Float(cell // FACE_CELLS) + jitter.y) * (1 / FACE_CELLS)
+        cell, leftover = draw_cell(self._cdf, face * cells, cells, u, active)
+        a, b = in_square_cell(cell, mi.Point2f(leftover, sample.y) if jitter is None else jitter, FACE_CELLS)
         across = mi.Float(face % 2)
         place = mi.Vector3f(dr.select(axis == 0, across, a), dr.select(axis == 1, across, dr.select(axis == 0, a, b)), dr.select(axis == 2, across, b))
         return mi.Point3f(self._low + place * self._extent)

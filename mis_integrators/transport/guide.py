@@ -2,13 +2,12 @@
 
 A sun, a sky or an environment map sends its sub-paths through the disk of the whole scene's bounding sphere; through a window,
 almost none would enter. A pilot of camera paths asks from which directions, and through which part of the plane across each
-direction, the places that matter are lit. Sub-paths then start mostly there: a histogram over (direction cell, position cell),
-mixed with the plain densities, which keeps every estimate unbiased however poor the pilot.
+direction, the places that matter are lit. Sub-paths then start mostly there: a histogram over (direction cell, position cell), and one over
+the faces of the box around the lit places (`entrances`), mixed with the plain densities, which keeps every estimate unbiased however poor the pilot.
 """
 
 from __future__ import annotations
 
-from functools import partial
 from typing import NamedTuple
 
 import drjit as dr
@@ -17,6 +16,7 @@ import numpy as np
 
 from .camera_rays import sample_camera_ray
 from .entrances import Entrances
+from .histograms import draw_cell, in_square_cell, smoothed, square_cell
 from .packing import from_numpy
 from .random import next_2d, streams
 from .spectra import channel_mean
@@ -38,8 +38,6 @@ PASS_THROUGH = 8
 """Transmissive surfaces that the pilot's visibility test looks straight through (panes, masks)."""
 LEVEL_SHARES = (0.55, 0.25, 0.1, 0.1)
 """Shares of the position histogram at full, half, quarter and eighth resolution."""
-ENTRANCE_LEVELS = (0.4, 0.2, 0.15, 0.15, 0.1)
-"""The same of that over the box."""
 FEWEST_RECORDS = 64
 SPREAD_WAVELENGTHS = 450, 520, 590, 640
 """Wavelengths [nm] at which lights are looked at where no path brings its own."""
@@ -68,22 +66,6 @@ def cell_direction(cell, sample):
     sin_phi, cos_phi = dr.sincos(phi)
     radius = dr.safe_sqrt(1 - z * z)
     return mi.Vector3f(radius * cos_phi, radius * sin_phi, z)
-
-
-def _smoothed(grids, shares):
-    """Square histograms (rows, n, n) mixed with coarser versions of themselves, so that a cell that the pilot happened to miss
-    beside cells that it met is not left to the plain density (whose few samples would carry huge flux)."""
-    rows, n, _ = grids.shape
-    result = shares[0] * grids
-    for level, share in enumerate(shares[1:], start=1):
-        size = 1 << level
-        coarse = grids.reshape(rows, n // size, size, n // size, size).sum(axis=(2, 4))
-        padded = np.pad(coarse, ((0, 0), (1, 1), (1, 1)))
-        m = n // size
-        spread = sum(padded[:, i:i + m, j:j + m] for i in range(3) for j in range(3)) / 9
-        mixed = (0.5 * coarse + 0.5 * spread) / size ** 2
-        result = result + share * np.repeat(np.repeat(mixed, size, axis=1), size, axis=2)
-    return result
 
 
 def _weighted_box(points, weights, tail):
@@ -169,11 +151,12 @@ class EnvironmentGuide:
     def _learn(self, sensor):
         places = self._places(sensor)
         self._learn_directions(places)
-        records = [self._numpy(record) for index, emitter in self.infinite for place, rng in places
-                   for _ in range(TESTS if emitter.is_environment() else 1) for record in [self._look(index, emitter, place, rng)]]
+        records = [self._numpy(self._look(index, emitter, place, rng)) for index, emitter in self.infinite for place, rng in places
+                   for _ in range(TESTS if emitter.is_environment() else 1)]
         p, d, row, weight = (np.concatenate(x, axis=-1) for x in zip(*records))
         useful = (weight > 0) & np.isfinite(weight)
         p, d, row, weight = p[:, useful], d[:, useful], row[useful], weight[useful]
+        of_sky = self._environment_rows()
         cells = POSITION_CELLS ** 2
         pmf = np.zeros((self.row_count, cells))
         if len(row) >= FEWEST_RECORDS:
@@ -185,10 +168,10 @@ class EnvironmentGuide:
             self.focus_center, self.focus_radius = mi.Point3f([float(x) for x in center]), float(radius) * 1.05
             cell, inside = (np.array(x) for x in self._position_cell(mi.Vector3f(d), mi.Point3f(p)))
             pmf += np.bincount((row * cells + cell)[inside], weight[inside], pmf.size).reshape(pmf.shape)
-            of_sky = self._environment_rows()[row]
-            if np.count_nonzero(of_sky) >= FEWEST_RECORDS:
-                self.entrances = Entrances(low, high, p[:, of_sky], d[:, of_sky], weight[of_sky], partial(_smoothed, shares=ENTRANCE_LEVELS))
-        pmf = _smoothed(pmf.reshape(-1, POSITION_CELLS, POSITION_CELLS), LEVEL_SHARES).reshape(self.row_count, cells)
+            entering = of_sky[row]
+            if np.count_nonzero(entering) >= FEWEST_RECORDS:
+                self.entrances = Entrances(low, high, p[:, entering], d[:, entering], weight[entering])
+        pmf = smoothed(pmf.reshape(-1, POSITION_CELLS, POSITION_CELLS), LEVEL_SHARES).reshape(self.row_count, cells)
         total = pmf.sum(axis=1)
         pmf /= np.maximum(total, 1e-300)[:, None]
         self._pmf = from_numpy(mi.Float, pmf.ravel())
@@ -196,7 +179,7 @@ class EnvironmentGuide:
         guided = np.where(total > 0, 1 - DEFENSIVE_SHARE, 0.0)
         if self.entrances is not None:
             met = np.bincount(row, minlength=self.row_count)
-            entering = np.where(self._environment_rows(), (1 - DEFENSIVE_SHARE) * ENOUGH_RECORDS / (ENOUGH_RECORDS + met), 0.0)
+            entering = np.where(of_sky, (1 - DEFENSIVE_SHARE) * ENOUGH_RECORDS / (ENOUGH_RECORDS + met), 0.0)
             guided -= np.where(guided > 0, entering, 0)
             self._entering = from_numpy(mi.Float, entering)
         self._guided = from_numpy(mi.Float, guided)
@@ -313,10 +296,7 @@ class EnvironmentGuide:
         frame = mi.Frame3f(towards)
         offset = (p - self.focus_center) * (1 / self.focus_radius)
         u, v = dr.dot(offset, frame.s), dr.dot(offset, frame.t)
-        n = POSITION_CELLS
-        column = dr.clip(mi.Int32(dr.floor((u + 1) * (0.5 * n))), 0, n - 1)
-        line = dr.clip(mi.Int32(dr.floor((v + 1) * (0.5 * n))), 0, n - 1)
-        return mi.UInt32(line * n + column), (dr.abs(u) <= 1) & (dr.abs(v) <= 1)
+        return square_cell(0.5 * (u + 1), 0.5 * (v + 1), POSITION_CELLS), (dr.abs(u) <= 1) & (dr.abs(v) <= 1)
 
     def position_density(self, towards, row, p, active=True):
         """Density per unit area (across `towards`) of sub-paths along the line through `p`."""
@@ -341,29 +321,21 @@ class EnvironmentGuide:
     def sample_position(self, towards, row, sample, jitter, extra, active):
         """Origin of a sub-path that travels against `towards`, and its density per unit area.
 
-        `extra` chooses between the histogram and the plain disk; `jitter` (a second pair of uniform numbers, or None) places
+        `extra` chooses among the histogram, the faces of the box and the plain disk; `jitter` (a second pair of uniform numbers, or None) places
         the origin inside its cell, else `sample`'s own leftover digits do.
         """
         frame = mi.Frame3f(towards)
         guided = dr.gather(mi.Float, self._guided, row, active)
         use_grid = extra < guided
         cells = POSITION_CELLS ** 2
-        base = row * cells
-        cell = dr.binary_search(0, cells - 1, lambda i: dr.gather(mi.Float, self._cdf, base + i, active) <= sample.x)
-        upper = dr.gather(mi.Float, self._cdf, base + cell, active)
-        lower = dr.select(cell > 0, dr.gather(mi.Float, self._cdf, base + dr.maximum(cell, 1) - 1, active), 0)
-        own_jitter = jitter
-        if jitter is None:
-            leftover = dr.clip((sample.x - lower) / dr.maximum(upper - lower, 1e-20), 0, 0.9999999)
-            jitter = mi.Point2f(leftover, sample.y)
-        u = (mi.Float(cell % POSITION_CELLS) + jitter.x) * (2 / POSITION_CELLS) - 1
-        v = (mi.Float(cell // POSITION_CELLS) + jitter.y) * (2 / POSITION_CELLS) - 1
-        on_grid = self.focus_center + self.focus_radius * (u * frame.s + v * frame.t)
+        cell, leftover = draw_cell(self._cdf, row * cells, cells, sample.x, active)
+        u, v = in_square_cell(cell, mi.Point2f(leftover, sample.y) if jitter is None else jitter, POSITION_CELLS)
+        on_grid = self.focus_center + self.focus_radius * ((2 * u - 1) * frame.s + (2 * v - 1) * frame.t)
         disk = mi.warp.square_to_uniform_disk_concentric(sample)
         on_disk = self.center + self.radius * (disk.x * frame.s + disk.y * frame.t)
         if self.entrances is not None:
             enters = ~use_grid & (extra < guided + self._entering_share(towards, row, active))
-            on_disk = dr.select(enters, self.entrances.sample(towards, sample, own_jitter, active & enters), on_disk)
+            on_disk = dr.select(enters, self.entrances.sample(towards, sample, jitter, active & enters), on_disk)
         p = dr.select(use_grid, on_grid, on_disk)
         density = self.position_density(towards, row, p, active)
         p += towards * (1.01 * self.radius - dr.dot(p - self.center, towards))
@@ -378,11 +350,7 @@ class EnvironmentGuide:
         share = self.direction_share
         own = extra < share
         extra = dr.select(own, extra / share, (extra - share) / (1 - share))
-        cell = dr.binary_search(0, DIRECTION_CELLS - 1,
-                                lambda i: dr.gather(mi.Float, self._direction_cdf, i, active) <= sample.x)
-        upper = dr.gather(mi.Float, self._direction_cdf, cell, active)
-        lower = dr.select(cell > 0, dr.gather(mi.Float, self._direction_cdf, dr.maximum(cell, 1) - 1, active), 0)
-        leftover = dr.clip((sample.x - lower) / dr.maximum(upper - lower, 1e-20), 0, 0.9999999)
+        cell, leftover = draw_cell(self._direction_cdf, mi.UInt32(0), DIRECTION_CELLS, sample.x, active)
         ds.d = dr.select(own, ds.d, cell_direction(cell, mi.Point2f(leftover, sample.y)))
         return ds.d, self.direction_density(emitter.pdf_direction(it, ds, active), ds.d, active), first + direction_cell(ds.d), extra
 
