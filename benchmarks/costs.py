@@ -13,7 +13,7 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
-from mis_integrators.integrators import costs
+from mis_integrators.integrators import costs, light_tracing
 from mis_integrators.integrators.choice import PHOTON_MAPPERS, name_of
 from mis_integrators.integrators.unidirectional import PathSession
 from mis_integrators.transport.census import mean_segments
@@ -21,6 +21,9 @@ from reports import show, tell
 from scene_files import open_scene, scaled_size
 
 METHODS = (("path", {}), *PHOTON_MAPPERS)
+CONNECTED, LIGHT_TRACING = ("pcbpt", "bdpt_ris"), (0.5, 2.0)
+"""Plugins that choose how many light sub-paths they trace, and numbers of those, for each camera path, so that their price shows."""
+PLUGINS = (*dict.fromkeys(plugin for plugin, _ in METHODS), *CONNECTED)
 RADII = (1.0, 2.0)
 """Multiples of the automatic radius, so that the price of a gathered photon shows."""
 ITERATIONS, SKIPPED = 8, 2
@@ -33,9 +36,9 @@ def run(options: argparse.Namespace) -> None:
     for path in options.scenes:
         opened = open_scene(path, scaled_size(path, options.scale))
         tell(opened.name)
-        rows += measured(opened)
-    prices, table = {}, []
-    for plugin in dict.fromkeys(plugin for plugin, _ in METHODS):
+        rows += measured(opened, options.plugins)
+    prices, table = dict(costs.PRICES), []
+    for plugin in options.plugins:
         own = [row for row in rows if row["plugin"] == plugin]
         prices[plugin] = fit(own)
         for row in own:
@@ -47,13 +50,15 @@ def run(options: argparse.Namespace) -> None:
     tell(f"prices written to {TARGET}")
 
 
-def measured(opened) -> list[dict]:
+def measured(opened, plugins) -> list[dict]:
     """One row a method and radius: events a pixel, and cost in units of a segment of `path`."""
     scene, sensor = opened.scene, opened.sensor
     first = mi.load_dict({"type": "bdpm", "camera_paths": 1, **opened.inherited})
     segments = mean_segments(scene, sensor, 1, 1, int(np.prod(opened.size)), first.max_depth, first.rr_depth)
     sessions = []
     for plugin, parameters in METHODS:
+        if plugin not in (*plugins, "path"):
+            continue
         given = {**opened.inherited, **parameters}
         if plugin == "path":
             session = PathSession(first, scene, sensor, 0, None)
@@ -69,6 +74,11 @@ def measured(opened) -> list[dict]:
             session.iterate()
             counted = costs.events(session, segments, session.last_vertex, pilot.forecast.gathered * factor ** 2)
             sessions.append((plugin, f"{name_of(plugin, parameters)} x {factor:g}", session, counted))
+    for plugin in (plugin for plugin in CONNECTED if plugin in plugins):
+        for ratio in LIGHT_TRACING:
+            session = mi.load_dict({"type": plugin, "light_tracing": ratio, **opened.inherited}).session(scene, sensor)
+            session.iterate()
+            sessions.append((plugin, f"{plugin} light_tracing={ratio:g}", session, light_tracing.events(session)))
     seconds = {label: [] for _, label, _, _ in sessions}
     for _ in range(ITERATIONS):
         for _, label, session, _ in sessions:

@@ -133,6 +133,8 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument("--charts", action="store_true", help="draw the shifted densities (needs matplotlib)")
 
     command = _measuring(commands, "costs", costs)
+    command.add_argument("--plugins", nargs="+", choices=costs.PLUGINS, default=costs.PLUGINS, metavar="PLUGIN",
+                         help=f"those whose prices are fitted anew (default: {' '.join(costs.PLUGINS)})")
     command.add_argument("--scale", type=_positive, default=1, help="film size, scene's own = 1 (default: 1)")
 
     command = _measuring(commands, "views", view_counts, scenes=False)

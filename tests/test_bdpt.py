@@ -221,7 +221,7 @@ def test_states_of_traced_subpaths(rgb, kind):
     if kind == "light":
         vertices, found, _ = trace_light_subpaths(scene, lights, traits, weights, mi.UInt32(3), count, capacity, [], 0.0, 0.0, 6, 50)
     else:
-        *_, vertices, found = trace_camera_subpaths(scene, sensor, None, lights, traits, weights, mi.UInt32(3), mi.UInt32(0), 64, 1, 0.5, 6, 50,
+        *_, vertices, found = trace_camera_subpaths(scene, sensor, None, lights, traits, weights, mi.UInt32(3), mi.UInt32(0), mi.UInt32(0), 64, 1, 0.5, 6, 50,
                                                     False, capacity)
     dr.eval(vertices, found)
     found = int(found[0])

@@ -148,7 +148,7 @@ class ResampledPaths(JointPaths):
 @pytest.mark.parametrize("name, bsdf, light, sensor, length, parameters", [
     ("bdpt_ris", "rough", "area", "thinlens", 3, {"resamples": 4}), ("bdpt_ris", "plastic", "point", "orthographic", 3, {"light_paths": 1}),
     ("bdpt_ris", "plastic", "sphere", "perspective", 3, {"cache_neighbors": 1}), ("bdpt_ris", "bump", "constant", "perspective", 2, {}),
-    ("pcbpt", "plastic", "area", "perspective", 3, {})])
+    ("pcbpt", "plastic", "area", "perspective", 3, {"light_tracing": 4})])
 def test_weights_sum_to_one(rgb, name, bsdf, light, sensor, length, parameters):
     """Each technique's weight for the same joint path, from its own code; some in a thousand lose by rounding at grazing angles."""
     by_technique = ResampledPaths(room(bsdf, light, sensor), length, name=name, **parameters).weights()
@@ -361,7 +361,7 @@ def test_parts_share_their_proposals(rgb, monkeypatch):
     from mis_integrators.integrators import resampled
     monkeypatch.setattr(resampled, "CHUNK", 470)
     scene = box_scene(24)
-    session = plugin("bdpt_ris").session(scene, 0, 1, 0)
+    session = plugin("bdpt_ris", light_tracing=1).session(scene, 0, 1, 0)
     assert session.chunks == 5 and session.chunk * 5 > session.path_count
     made, pmfs = [], session._pmfs
     session._pmfs = lambda *args: made.append(args) or pmfs(*args)
@@ -369,6 +369,88 @@ def test_parts_share_their_proposals(rgb, monkeypatch):
         session.iterate()
     assert len(made) == 3
     agree(plugin("bdpt_ris"), path(rr_depth=50), scene, blocks=2, whole=0.02, block=0.05, most=600)
+
+
+def test_pilot_sees_all_of_the_film(rgb, monkeypatch):
+    """Cache points of a film in parts come from all over it, as those of a film in one: heights of first vertices, two samples of the same
+    distribution (Kolmogorov and Smirnov; false alarms 1e-6)."""
+    from mis_integrators.integrators import resampled
+    heights = []
+    for chunk in (1 << 18, 500):
+        monkeypatch.setattr(resampled, "CHUNK", chunk)
+        session = plugin("bdpt_ris", light_tracing=1).session(box_scene(32), 0, 1, 0)
+        session._prepare()
+        first = np.array(session.cache["depth"]) == 1
+        heights.append(np.sort(np.array(session.cache["p"].y)[first]))
+    assert session.chunks == 9
+    a, b = heights
+    both = np.concatenate(heights)
+    apart = np.abs(np.searchsorted(a, both, side="right") / len(a) - np.searchsorted(b, both, side="right") / len(b)).max()
+    assert apart < np.sqrt(-np.log(1e-6 / 2) / 2 * (1 / len(a) + 1 / len(b)))
+
+
+# --- How many light sub-paths -------------------------------------------------------------------------------
+
+
+def test_best_ratio_is_the_best():
+    """Against a search along n; what no light sub-path brings, and what nothing else brings, end at the bounds."""
+    from mis_integrators.integrators.light_tracing import LEAST, MOST, Noise, best_ratio
+    n = np.geomspace(LEAST, MOST, 4001)
+    for light, camera, light_cost, camera_cost in np.exp(np.random.default_rng(1).normal(0, 1, (50, 4))):
+        best = n[np.argmin((camera + light / n) * (camera_cost + n * light_cost))]
+        assert best_ratio(Noise(light, camera), light_cost, camera_cost) == pytest.approx(best, rel=1e-3)
+    assert best_ratio(Noise(0, 1), 1, 1) == LEAST and best_ratio(Noise(1, 0), 1, 1) == MOST and best_ratio(Noise(0, 0), 1, 1) == LEAST
+
+
+@pytest.mark.parametrize("camera_paths", [1, 4])
+def test_noise_is_seen_in_one_iteration(camera_paths):
+    """Camera paths and splats with the same known variances in each pixel, in an image whose brightness varies a hundredfold: each is found to 5 %
+    (five standard errors and more)."""
+    from mis_integrators.integrators.light_tracing import observed_noise
+    from mis_integrators.transport.radius import relative_weights
+    rng, width, height, rate = np.random.default_rng(2), 104, 96, 0.5
+    brightness = np.repeat(np.repeat(np.geomspace(0.1, 10, 13), 8)[None], height, axis=0)
+    line, column = (np.repeat(x.ravel(), camera_paths) for x in np.indices((height, width)))
+    there = brightness[line, column]
+    values = rng.gamma(4, there / 8)                                            # mean half the brightness, standard deviation half of that
+    light, squares = np.zeros((2, height, width))
+    splats = rng.poisson(rate * camera_paths * width * height)
+    y, x = rng.integers(0, height, splats), rng.integers(0, width, splats)
+    value = brightness[y, x] / 2 / rate                                         # their weights sum to `camera_paths`
+    np.add.at(light, (y, x), value)
+    np.add.at(squares, (y, x), value ** 2)
+    noise = observed_noise(np.stack([column, line]), values, camera_paths, light, squares, np.full((height, width), float(camera_paths)))
+    relative = relative_weights(brightness.ravel()) * brightness.ravel() ** 2
+    assert noise.camera == pytest.approx(np.mean(relative) / 16 / camera_paths, rel=0.05)
+    assert noise.light == pytest.approx(np.mean(relative) / 4 / rate / camera_paths, rel=0.05)
+
+
+def test_light_tracing_follows_the_scene(rgb):
+    """Where the noise is caustics, more light sub-paths are traced than camera paths; where almost nothing that they meet is seen but through glass, few.
+    What was chosen is told, and makes the same image in another session that recalls it."""
+    chosen = []
+    for name in ("caustics", "sds"):
+        scene = mi.load_file(str(SCENES / f"{name}.xml"), resx=32, resy=24)
+        session = plugin("bdpt_ris", max_depth=10).session(scene, 0, 1, 0)
+        session.iterate()
+        chosen.append(session.settings["light_tracing"])
+    other = plugin("bdpt_ris", max_depth=10).session(scene, 0, 1, 0)
+    other.recall(session.learned)
+    other.iterate()
+    assert chosen[0] > 2 > 1 > chosen[1] and other.light_chunk == session.light_chunk
+    np.testing.assert_allclose(other.image(), session.image(), rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("ratio", [0.125, 8])
+def test_any_light_tracing_is_unbiased(rgb, monkeypatch, ratio):
+    """Fewer light sub-paths than camera paths, and so many that they are traced in several rounds, of a film in parts."""
+    from mis_integrators.integrators import resampled
+    monkeypatch.setattr(resampled, "CHUNK", 1200)
+    scene = box_scene(24)
+    integrator = plugin("bdpt_ris", light_tracing=ratio, light_paths=50)
+    session = integrator.session(scene, 0, 1, 0)
+    assert session.light_rounds == (8 if ratio == 8 else 1) and float(session.ratio[0]) == pytest.approx(ratio, rel=0.02)
+    agree(integrator, path(rr_depth=50), scene, blocks=2, whole=0.02, block=0.05, most=600)
 
 
 @pytest.mark.parametrize("name", ["bdpt", "vcm", "bdpt_ris"])
@@ -387,7 +469,7 @@ def test_kernels_know_neither_seed_nor_room(rgb, name):
 
 @pytest.mark.parametrize("parameters, words", [
     ({"light_paths": 0}, ("light_paths", "from 1")), ({"resamples": 1.5}, ("resamples", "integer")), ({"cache_neighbors": 17}, ("cache_neighbors", "16")),
-    ({"target": "f"}, ("target", "f_y_rho_g_v")), ({"beta": 2.0}, ("beta", "unknown", "light_paths"))])
+    ({"target": "f"}, ("target", "f_y_rho_g_v")), ({"light_tracing": 9}, ("light_tracing", "0.125")), ({"beta": 2.0}, ("beta", "unknown", "light_paths"))])
 def test_parameters_are_checked(rgb, parameters, words):
     for name in ("pcbpt", "bdpt_ris"):
         with pytest.raises(Exception) as error:

@@ -155,11 +155,11 @@ class BDPTSession(IterativeSession):
                                     spectral["wavelengths"], sensor.shutter_open(), sensor.shutter_open_time(),
                                     self.integrator.max_depth, self.integrator.rr_depth)
 
-    def _trace_camera(self, scene, sensor, tables, seed, first, spectral):
+    def _trace_camera(self, scene, sensor, tables, seed, first, skip, spectral):
         integrator = self.integrator
         ledger = self._ledger() if integrator.techniques else None
         radiance, alpha, position, vertices, count = trace_camera_subpaths(
-            scene, sensor, integrator, self.lights, self.traits, self.weights(spectral), seed, first, self.chunk, integrator.camera_paths,
+            scene, sensor, integrator, self.lights, self.traits, self.weights(spectral), seed, first, skip, self.chunk, integrator.camera_paths,
             spectral["sample"], integrator.max_depth, integrator.rr_depth, integrator.hide_emitters, self.capacity["camera"], ledger,
             self.shortest)
         return radiance, alpha, position, vertices, count, ledger.entries if ledger else None
@@ -230,7 +230,7 @@ class BDPTSession(IterativeSession):
                 break
         while True:
             radiance, alpha, position, camera, count, entries = self._camera_pass(
-                self.scene, self.sensor, self._tables, self._seed(iteration, CAMERA), first, spectral)
+                self.scene, self.sensor, self._tables, self._seed(iteration, CAMERA), first, dr.opaque(mi.UInt32, 0), spectral)
             if not self.bidirectional or not self._grown("camera", count):
                 break
         if self.bidirectional:

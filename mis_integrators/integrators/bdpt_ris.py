@@ -14,7 +14,7 @@ class PCBPT(ResampledIntegrator):
 
     .. pluginparameters::
 
-     * - light_paths, resamples, cache_neighbors, target, camera_paths, variance, max_depth, rr_depth, hide_emitters
+     * - light_paths, resamples, cache_neighbors, target, light_tracing, camera_paths, variance, max_depth, rr_depth, hide_emitters
        -
        - As of :monosp:`bdpt_ris`.
 
@@ -59,6 +59,10 @@ class BDPTRIS(ResampledIntegrator):
        - |string|
        - What the pmfs are proportional to: ``f_y_rho_g_v`` is a light vertex's light at the cache point, visibility included; ``f_y_f_yz`` also has the
          BSDF there. (Default: ``f_y_rho_g_v``)
+     * - light_tracing
+       - |float|
+       - Light sub-paths that are joined to the sensor, for each camera path (N_t); from 0.125 to 8. 0 stands for as many as pay by noise and cost, which a
+         first iteration that is not kept tells (1 in renders of fewer than 8 iterations). (Default: 0)
      * - camera_paths
        - |int|
        - Camera paths per pixel and iteration, which share its light sub-paths and pmfs. (Default: 4)

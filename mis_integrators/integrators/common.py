@@ -231,6 +231,10 @@ class IterativeSession:
             total = blocks if total is None else tuple(None if a is None else a + b for a, b in zip(total, blocks))
         return total
 
+    def all_over_the_film(self):
+        """Numbers `first` and `skip` of a part's camera paths that see all of the film, for pilots: as of `trace_camera_vertices`."""
+        return dr.opaque(mi.UInt32, 0), dr.opaque(mi.UInt32, self.samples_per_iteration * (self.chunks - 1))
+
     def in_chunk(self, first):
         """Which of `chunk` paths from number `first` on there are: the last part may have fewer."""
         return dr.arange(mi.UInt32, self.chunk) + first < self.path_count

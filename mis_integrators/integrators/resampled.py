@@ -25,6 +25,7 @@ from ..transport.spectra import channel_mean
 from ..transport.subpaths import junction_of, read_vertices, trace_light_subpaths
 from ..transport.traits import SceneTraits
 from .common import IterativeIntegrator, IterativeSession
+from .light_tracing import LEAST, MOST, best_ratio, observed_noise, path_costs
 from .resampled_weights import LENGTHS, ResampledWeights, around, doubt, guessed_weight, ignorant, tabulate
 
 CHUNK = 1 << 18
@@ -33,6 +34,8 @@ CACHE_SHARE, FEWEST_CACHE_POINTS = 1 / 300, 256
 """Cache points: this share of a part's camera vertices, but at least so many. More of them cost shadow rays."""
 MOST_PAIRS = 1 << 24
 """Pairs of a cache point and a light vertex at most, four bytes each (and some more while they are made); beyond that there are fewer cache points."""
+FEW = 8
+"""Renders of fewer iterations do not spend one on finding out how many light sub-paths pay."""
 KNOWN_PATHS, MOST_KNOWN_SETS = 200, 8
 """Light sub-paths of the first iteration from which Q and Q_s are estimated, in sets of M; at most so many sets."""
 
@@ -48,10 +51,11 @@ class ResampledIntegrator(IterativeIntegrator):
         self.resamples = parameters.integer("resamples", 1, 1, "from 1 to 1024", high=1024)
         self.cache_neighbors = parameters.integer("cache_neighbors", 3, 1, "from 1 to 16", high=16)
         self.target = parameters.choice("target", "f_y_rho_g_v", ("f_y_rho_g_v", "f_y_f_yz"))
+        self.light_tracing = parameters.number("light_tracing", 0.0, lambda n: n == 0 or LEAST <= n <= MOST, f"0 or from {LEAST:g} to {MOST:g}")
 
     def settings(self):
         return {**super().settings(), "light_paths": self.light_paths, "resamples": self.resamples, "cache_neighbors": self.cache_neighbors,
-                "target": self.target}
+                "target": self.target, "light_tracing": self.light_tracing}
 
     def new_session(self, scene, sensor, seed, iterations):
         return ResampledSession(self, scene, sensor, seed, iterations)
@@ -71,12 +75,11 @@ class ResampledSession(IterativeSession):
         self.traits = SceneTraits(scene)
         self.lights = Lights.seen_by(scene, sensor, integrator.plugin)
         self.split_paths(CHUNK)
-        self.light_chunk = max(self.chunk, integrator.light_paths)
         width, height = sensor.film().crop_size()
         self.pixel_paths = width * height * integrator.camera_paths
-        self.ratio = self.light_chunk * self.chunks / self.pixel_paths
-        self.capacity = {"light": rounded_up(4 * self.light_chunk), "camera": rounded_up(4 * self.chunk), "hits": rounded_up(self.chunk),
-                         "ends": rounded_up(6 * integrator.light_paths)}
+        self.capacity = {"camera": rounded_up(4 * self.chunk), "hits": rounded_up(self.chunk), "ends": rounded_up(6 * integrator.light_paths)}
+        self.light_tracing = integrator.light_tracing or None
+        self._share_light(self.light_tracing or 1.0)
         depth = integrator.max_depth
         self.lit = not self.lights.dark and (depth < 0 or depth >= 2)
         self.lens = Lens(sensor).connects
@@ -86,8 +89,29 @@ class ResampledSession(IterativeSession):
         self.recorded = recorder()
         self.grid = CacheGrid(mi.Point3f(0), mi.Normal3f(0, 0, 1), integrator.cache_neighbors)
         self.records, self.shares = ignorant(self.grid)
-        self.cache = self.known = self.first_light = None
+        self.cache = self.known = self.first_light = self.vertices = None
         self._freeze()
+
+    @property
+    def settings(self):
+        return super().settings if self.light_tracing is None else {**super().settings, "light_tracing": self.light_tracing}
+
+    @property
+    def learned(self):
+        return {} if self.light_tracing is None else {"light_tracing": self.light_tracing}
+
+    def recall(self, learned):
+        self.light_tracing = learned.get("light_tracing", self.light_tracing)
+        self._share_light(self.light_tracing or 1.0)
+        self._freeze()
+
+    def _share_light(self, ratio, vertices=4.0):
+        """Has about `ratio` light sub-paths traced for each camera path, at least M, which have so many `vertices` on average."""
+        wanted = ratio * self.chunk
+        self.light_rounds = max(round(wanted / CHUNK), 1)
+        self.light_chunk = max(round(wanted / self.light_rounds), self.integrator.light_paths)
+        self.capacity["light"] = rounded_up(int(vertices * self.light_chunk))
+        self.ratio = dr.opaque(mi.Float, self.light_chunk * self.light_rounds * self.chunks / self.pixel_paths)
 
     PASSES = {"_light_pass": ("_trace_light", ("light",)), "_camera_pass": ("_trace_camera", ("camera", "hits")),
               "_pilot_pass": ("_pilot_targets", ("light", "ends")), "_target_pass": ("_own_targets", ("light", "ends")),
@@ -99,7 +123,8 @@ class ResampledSession(IterativeSession):
         self._record(grown)
 
     def _fill_tables(self):
-        self._tables = [self.traits.lambertian, self.traits.perturbed, self.records, self.shares, *self.grid.tables(), *self.lights.tables()]
+        self._tables = [self.traits.lambertian, self.traits.perturbed, self.records, self.shares, self.ratio, *self.grid.tables(),
+                        *self.lights.tables()]
 
     def weights(self):
         """The weights of this session."""
@@ -114,9 +139,9 @@ class ResampledSession(IterativeSession):
                                     spectral["wavelengths"], sensor.shutter_open(), sensor.shutter_open_time(), self.integrator.max_depth,
                                     self.integrator.rr_depth)
 
-    def _trace_camera(self, scene, sensor, tables, seed, first, spectral):
+    def _trace_camera(self, scene, sensor, tables, seed, first, skip, spectral):
         integrator = self.integrator
-        return trace_camera_vertices(scene, sensor, integrator, self.lights, self.traits, self.weights(), seed, first, self.chunk,
+        return trace_camera_vertices(scene, sensor, integrator, self.lights, self.traits, self.weights(), seed, first, skip, self.chunk,
                                      integrator.camera_paths, spectral["sample"], self.ratio, integrator.max_depth, integrator.rr_depth,
                                      integrator.hide_emitters, self.capacity["camera"], self.capacity["hits"])
 
@@ -220,7 +245,7 @@ class ResampledSession(IterativeSession):
         return total
 
     def _join_sensor(self, scene, sensor, tables, light, count, seed, spectral):
-        """Block of the light that meets the sensor."""
+        """As `_meet_sensor`."""
         index = lanes(self.capacity["light"])
         active = index < dr.gather(mi.UInt32, count, 0)
         y = read_vertices(light, index, active, states=END)
@@ -228,20 +253,37 @@ class ResampledSession(IterativeSession):
         joined = join_sensor(scene, self.integrator, self.traits, Lens(sensor), y, aperture, mi.Float(sensor.shutter_open()),
                              spectral["wavelengths"], self.integrator.hide_emitters, active)
         value = joined.value * (self.weights().seen_by_sensor(joined, y) / self.ratio)
-        return splat_channels(sensor.film(), joined.film, list(colour_channels(value, spectral["matrix"])), joined.active)
+        return splat_channels(sensor.film(), joined.film, [*colour_channels(value, spectral["matrix"]), dr.square(channel_mean(value))], joined.active)
 
     # ------------------------------------------------------------------ before the first iteration
 
     def _prepare(self):
-        """Draws the cache points."""
+        """Draws the cache points, and finds out how many light sub-paths pay where nobody has said so."""
         spectral = self._spectral(PILOT)
-        traced = self._camera(PILOT, dr.opaque(mi.UInt32, 0), spectral)
+        light = self._light(PILOT, 0, spectral)
+        traced = self._camera(PILOT, *self.all_over_the_film(), spectral)
         vertices, M = min(int(traced[4][0]), self.capacity["camera"]), self.integrator.light_paths
+        self.vertices = int(light[1][0]) / self.light_chunk, vertices / self.chunk
         wanted = min(max(FEWEST_CACHE_POINTS, int(vertices * CACHE_SHARE)), max(vertices, 1))
-        self.capacity["ends"] = ends_room(np.array(self._first_light()[2]), M)
+        self.capacity["ends"] = ends_room(np.array(light[2]), M)
         self.cache = self._cache_points(traced[3], vertices, max(min(wanted, MOST_PAIRS // (M + self.capacity["ends"])), 1))
         normals = dr.mulsign(self.cache["n"], dr.dot(self.cache["n"], self.cache["towards"]))
         self.grid = CacheGrid(self.cache["p"], normals, self.integrator.cache_neighbors)
+        self.records, self.shares = ignorant(self.grid)
+        self._freeze()
+        if self.light_tracing is None and self.lens and (self.iterations_planned or FEW) >= FEW:
+            self._choose_light_tracing(light, traced, spectral)
+
+    def _choose_light_tracing(self, light, traced, spectral):
+        """Sets how many light sub-paths are traced, after an iteration that nobody sees, with one for each camera path."""
+        paths = self.integrator.camera_paths
+        radiance = self._radiance(traced, self._proposals(PILOT, spectral, light), self._seed(PILOT, DRAW), spectral)
+        sensed = np.array(self._meet_sensor(light, self._seed(PILOT, APERTURE), spectral))
+        border, weight = self.sensor.film().rfilter().border_size(), np.array(self.expected_weight)[:, :, 0]
+        corner = to_numpy(traced[2]) - np.array(self.sensor.film().crop_offset())[:, None] + border
+        noise = observed_noise(np.floor(corner).astype(int), np.array(channel_mean(radiance)), paths, sensed[:, :, :3].mean(axis=2), sensed[:, :, 3], weight)
+        self.light_tracing = best_ratio(noise, *path_costs(self.integrator.plugin, self.vertices, paths))
+        self._share_light(self.light_tracing, 1.25 * self.vertices[0])
         self._freeze()
 
     def _first_light(self):
@@ -304,10 +346,10 @@ class ResampledSession(IterativeSession):
             if not self._grown("light", light[1]):
                 return light
 
-    def _camera(self, iteration, first, spectral):
+    def _camera(self, iteration, first, skip, spectral):
         """What `trace_camera_vertices` returns."""
         while True:
-            traced = self._camera_pass(self.scene, self.sensor, self._tables, self._seed(iteration, CAMERA), first, spectral)
+            traced = self._camera_pass(self.scene, self.sensor, self._tables, self._seed(iteration, CAMERA), first, skip, spectral)
             if not self.lit or not (self._grown("camera", traced[4]) or self._grown("hits", traced[6])):
                 return traced
 
@@ -325,18 +367,29 @@ class ResampledSession(IterativeSession):
             self.scene, self.sensor, self._tables, self._seed(iteration, START), *light, self.cache, spectral))
         return light[0], *ends, self._pmfs(r, seen, ends[-1])
 
+    def _radiance(self, traced, proposals, seed, spectral):
+        """Radiance of camera paths (`trace_camera_vertices`) with everything that they meet and are connected to."""
+        radiance, _, _, camera, count, hits, hit_count = traced
+        radiance = self._connection_pass(self.scene, self.sensor, self._tables, radiance, camera, count, *proposals, seed, spectral)
+        radiance = self._hit_pass(self._tables, radiance, camera, hits, hit_count)
+        dr.eval(radiance)                                  # else its sums may still wait when the film's are made
+        return radiance
+
+    def _meet_sensor(self, light, seed, spectral):
+        """Block of the light sub-paths (`trace_light_subpaths`) that meet the sensor: three channels, and the square of their mean."""
+        vertices, found, _ = light
+        return self._sensor_pass(self.scene, self.sensor, self._tables, vertices, found, seed, spectral)
+
     def _chunk(self, iteration, spectral, light, proposals, chunk, first):
         """Blocks of one part of the paths: of camera paths, and of light that met the sensor (or None). `light`: the first part's light sub-paths."""
-        radiance, alpha, position, camera, count, hits, hit_count = self._camera(iteration, first, spectral)
+        traced = self._camera(iteration, first, dr.opaque(mi.UInt32, 0), spectral)
+        radiance, alpha, position, *_ = traced
         block = None
         if self.lit:
-            radiance = self._connection_pass(self.scene, self.sensor, self._tables, radiance, camera, count, *proposals,
-                                             self._seed(iteration, DRAW, chunk), spectral)
-            radiance = self._hit_pass(self._tables, radiance, camera, hits, hit_count)
-            dr.eval(radiance)                              # else its sums may still wait when the film's are made
-            if self.lens:
-                vertices, found, _ = self._light(iteration, chunk, spectral) if chunk else light
-                block = self._sensor_pass(self.scene, self.sensor, self._tables, vertices, found, self._seed(iteration, APERTURE, chunk), spectral)
+            radiance = self._radiance(traced, proposals, self._seed(iteration, DRAW, chunk), spectral)
+            for part in range(chunk * self.light_rounds, (chunk + 1) * self.light_rounds) if self.lens else ():
+                met = self._meet_sensor(self._light(iteration, part, spectral) if part else light, self._seed(iteration, APERTURE, part), spectral)
+                block = met if block is None else block + met
         if self.integrator.hide_emitters:
             radiance = dr.select(alpha > 0, radiance, 0)       # as `path` does: what is behind nothing but null surfaces is hidden
         return splat_samples(self.sensor.film(), position, radiance, alpha, spectral["matrix"], self.in_chunk(first)), block
@@ -356,7 +409,7 @@ class ResampledSession(IterativeSession):
                 self.first_light = None                    # nobody will ask for it again
             proposals = self._proposals(iteration, spectral, light)
         block, light = self.sum_of_chunks(partial(self._chunk, iteration, spectral, light, proposals))
-        return block if light is None else with_colour(block, as_camera_weights(light, block, self.expected_weight))
+        return block if light is None else with_colour(block, as_camera_weights(light[:, :, :3], block, self.expected_weight))
 
 
 LIGHT, CAMERA, APERTURE, START, DRAW = 0, 1, 3, 4, 5

@@ -127,10 +127,10 @@ class VCMSession(BDPTSession):
         self.radius = 1e-3 * float(dr.norm(self.traits.bounds.extents()))
         if not self.bidirectional:
             return
-        first = dr.opaque(mi.UInt32, 0)
         spectral = {**spectral, "radius": dr.opaque(mi.Float, self.radius)}
         while True:
-            *_, camera, count, _ = self._camera_pass(self.scene, self.sensor, self._tables, self._seed(PILOT_INDEX, 0), first, spectral)
+            *_, camera, count, _ = self._camera_pass(self.scene, self.sensor, self._tables, self._seed(PILOT_INDEX, 0), *self.all_over_the_film(),
+                                                     spectral)
             if not self._grown("camera", count):
                 break
         vertices = read_vertices(camera, dr.arange(mi.UInt32, int(count[0])), True, ("p", "number"))

@@ -73,6 +73,12 @@ def start_camera_paths(sensor, seed, first, stride: int, n_paths: int, camera_pa
     return path, active, rng, mi.Ray3f(ray), weight, splat, aperture
 
 
+def all_over_the_film(first, skip, n_paths: int, camera_paths: int):
+    """What `start_camera_paths` takes as `first` to leave out `skip` numbers after each pixel's `camera_paths`: a part of the paths that sees all
+    of the film."""
+    return first + dr.arange(mi.UInt32, n_paths) // camera_paths * skip
+
+
 def behind_emitters(scene, integrator, hit, ray, active):
     """Camera rays that meet an emitter's shape, and their hits, moved on to what is behind it (`hide_emitters`)."""
     on_light = active & hit.is_valid() & (hit.shape.emitter() != None)  # noqa: E711 (array comparison)

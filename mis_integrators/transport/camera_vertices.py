@@ -8,7 +8,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from .camera_pass import behind_emitters, start_camera_paths, within_crop
+from .camera_pass import all_over_the_film, behind_emitters, start_camera_paths, within_crop
 from .junctions import Junction, scattered_mean
 from .lenses import Lens
 from .packing import Store
@@ -67,9 +67,9 @@ def step_to_hit(lights, soften, left, density, origin, ds, light, squared, mask)
 
 
 @dr.syntax
-def trace_camera_vertices(scene, sensor, integrator, lights, traits, soften, seed, first, n_paths: int, camera_paths: int, wavelength_sample,
-                          ratio: float, max_depth: int, rr_depth: int, hide_emitters: bool, capacity: int, hit_capacity: int):
-    """Traces `n_paths` camera paths, numbers `first`, `first + 1`, ... of `film_samples`.
+def trace_camera_vertices(scene, sensor, integrator, lights, traits, soften, seed, first, skip, n_paths: int, camera_paths: int, wavelength_sample,
+                          ratio, max_depth: int, rr_depth: int, hide_emitters: bool, capacity: int, hit_capacity: int):
+    """Traces `n_paths` camera paths, numbers `first`, `first + 1`, ... of `film_samples`, but without `skip` of them after each pixel's.
 
     Returns `(radiance, alpha, splat position, vertices, count, hits, hit count)`: the light that the camera's rays meet at once; vertices as of
     `subpaths.new_vertices` with the fields of `STEP`; records of `hit_layout`. Counts have width one; if they exceed the capacities the surplus is missing. The
@@ -78,6 +78,7 @@ def trace_camera_vertices(scene, sensor, integrator, lights, traits, soften, see
     `soften.row(p, n)` numbers places, with the normal on the side of the light; `soften.softened(geometry, squared)` may change the geometric
     term of a step that starts there, with its squared distance (infinite for environments).
     """
+    first = all_over_the_film(first, skip, n_paths, camera_paths)
     path, active, rng, ray, sensor_weight, splat, aperture = start_camera_paths(sensor, seed, first, 1, n_paths, camera_paths, wavelength_sample)
     lens = Lens(sensor)
     inside = within_crop(sensor.film(), splat)

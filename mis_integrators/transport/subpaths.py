@@ -25,7 +25,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from .camera_pass import behind_emitters, start_camera_paths, within_crop
+from .camera_pass import all_over_the_film, behind_emitters, start_camera_paths, within_crop
 from .junctions import Junction, scattered_mean
 from .lenses import Lens
 from .light_pass import lane_count, scatter_light
@@ -108,6 +108,7 @@ def trace_light_subpaths(scene, lights, traits, weights, seed, n_paths: int, cap
     lanes = lane_count(n_paths)
     lane = dr.arange(mi.UInt32, lanes)
     rng = streams(lane, seed)
+    count, stride = dr.opaque(mi.UInt32, n_paths), dr.opaque(mi.UInt32, lanes)
     store = Store(vertices=new_vertices(traits, capacity, weights.states), room=dr.opaque(mi.UInt32, capacity), count=dr.zeros(mi.UInt32, 1),
                   lengths=dr.zeros(mi.UInt32, n_paths))
     next_path = mi.UInt32(lane)
@@ -124,9 +125,9 @@ def trace_light_subpaths(scene, lights, traits, weights, seed, n_paths: int, cap
     origin = dr.zeros(mi.Point3f, lanes)
     active = dr.full(mi.Bool, False, lanes)
 
-    while dr.hint(active | (next_path < n_paths), label="light sub-paths"):
+    while dr.hint(active | (next_path < count), label="light sub-paths"):
         # ---- Start the lane's next path where one has ended
-        begin = ~active & (next_path < n_paths)
+        begin = ~active & (next_path < count)
         source = dr.zeros(mi.DirectionSample3f)
         unreachable = mi.Bool(False)
         if begin:
@@ -141,7 +142,7 @@ def trace_light_subpaths(scene, lights, traits, weights, seed, n_paths: int, cap
             eta = mi.Float(1)
             active = dr.max(flux) > 0
             path = mi.UInt32(next_path)
-            next_path += lanes
+            next_path += stride
 
         hit = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
         active &= hit.is_valid()
@@ -180,15 +181,16 @@ def trace_light_subpaths(scene, lights, traits, weights, seed, n_paths: int, cap
 
 
 @dr.syntax
-def trace_camera_subpaths(scene, sensor, integrator, lights, traits, weights, seed, first, n_paths: int, camera_paths: int, wavelength_sample,
+def trace_camera_subpaths(scene, sensor, integrator, lights, traits, weights, seed, first, skip, n_paths: int, camera_paths: int, wavelength_sample,
                           max_depth: int, rr_depth: int, hide_emitters: bool, capacity: int, ledger=None, shortest: int = 2):
-    """Traces `n_paths` camera paths, numbers `first`, `first + 1`, ... of `film_samples`, with the light that they meet and that next-event
-    estimation finds at each smooth vertex, weighted.
+    """Traces `n_paths` camera paths, numbers `first`, `first + 1`, ... of `film_samples`, but without `skip` of them after each pixel's, with the light
+    that they meet and that next-event estimation finds at each smooth vertex, weighted.
 
     Returns `(radiance, alpha, splat position, vertices, count)`: the kept vertices are those that a light sub-path, of at least `shortest` segments
     with what joins the two, may be joined with; `count` as in `trace_light_subpaths`. `ledger`, if given, learns every contribution:
     `met(path, depth, value, share, mask)` and `direct(...)`, with the length of the joint path in segments, and the weight apart.
     """
+    first = all_over_the_film(first, skip, n_paths, camera_paths)
     path, active, rng, ray, sensor_weight, splat, aperture = start_camera_paths(sensor, seed, first, 1, n_paths, camera_paths, wavelength_sample)
     lens = Lens(sensor)
     inside = within_crop(sensor.film(), splat)

@@ -1,0 +1,88 @@
+"""How many light sub-paths are worth joining to the sensor, for each camera path: as many as have the least error in a given time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..transport.radius import relative_weights
+from . import costs
+
+LEAST, MOST = 1 / 8, 8.0
+"""Bounds of the ratio. What one iteration tells of noise is itself noisy, and weights shift light to the technique that has more samples."""
+TILE = 8
+"""Pixels along the edge of a square whose brightness and noise are looked at together: a single iteration knows little of one pixel."""
+
+
+RARE_TILES = 0.02
+"""Share of them that is left out, one at least: a single path that meets a lamp by way of glass would outweigh all others."""
+
+
+@dataclass
+class Noise:
+    """Relative variances of a pixel, in an iteration with one light sub-path for each camera path."""
+
+    light: float
+    """Of what light sub-paths bring to the sensor."""
+    camera: float
+    """Of everything else: connections, emission met."""
+
+
+def best_ratio(noise, light_cost, camera_cost):
+    """Light sub-paths for each camera path: n that makes (camera + light / n) (camera_cost + n light_cost) least, n^2 = light camera_cost / (camera light_cost),
+    within the bounds. `light_cost`, `camera_cost`: of a light sub-path and of a camera path, in the same unit."""
+    square = noise.light * camera_cost / max(noise.camera * light_cost, 1e-30)
+    return float(np.clip(np.sqrt(square), LEAST, MOST))
+
+
+def path_costs(plugin, vertices, camera_paths):
+    """Costs of a light sub-path and of a camera path of `plugin`, which have so many `vertices` (a pair) on average: a segment more than those."""
+    price, (light, camera) = costs.PRICES[plugin], vertices
+    return price["light"] * (1 + light), price["camera"] * (1 + camera) + price["pixel"] / camera_paths
+
+
+def events(session):
+    """Events a pixel of an iteration of a session that connects to resampled light sub-paths, in the order of `costs.EVENTS`; it has rendered one."""
+    (light, camera), paths = session.vertices, session.integrator.camera_paths
+    return paths * (1 + camera), paths * session.light_tracing * (1 + light), 0.0, 1.0
+
+
+def observed_noise(corner, values, camera_paths, light, squares, weight):
+    """The `Noise` of one iteration.
+
+    NumPy arrays: `corner` (2 x paths): pixels of camera paths, column and line; `values` (paths): their radiance, the `camera_paths` of a pixel one after the
+    other; `light`, `squares` (height x width): in each pixel the sums of filter weight times light that meets the sensor, and times the square of that;
+    `weight` (height x width): the expected sum of filter weights. Where a pixel has one camera path, its neighbour's stands for a second.
+
+    Light that all camera paths of an iteration draw from makes their noise alike; that part is not seen.
+    """
+    height, width = weight.shape
+    columns = -(-width // TILE)
+    count = columns * -(-height // TILE)
+
+    def tiles(column, line):
+        return np.minimum(line // TILE, -(-height // TILE) - 1) * columns + np.minimum(column // TILE, columns - 1)
+
+    together = max(camera_paths, 2)
+    groups = len(values) // together
+    group = values[:groups * together].reshape(groups, together)
+    column, line = np.maximum(corner[:, :groups * together:together], 0)
+    tile = tiles(column, line)
+    number = np.bincount(tile, minlength=count)
+    met = number > 0
+    camera = np.bincount(tile, group.var(axis=1, ddof=1), count)[met] / number[met] / camera_paths
+    brightness = np.bincount(tile, group.mean(axis=1), count)[met] / number[met]
+    line, column = np.indices(weight.shape)
+    tile = tiles(column.ravel(), line.ravel())
+    number = np.bincount(tile, minlength=count)[met]
+    weight = np.maximum(weight, 1e-6)
+    brightness += np.bincount(tile, (light / weight).ravel(), count)[met] / number
+    sensed = np.bincount(tile, (squares / weight).ravel(), count)[met] / number / camera_paths
+    relative = relative_weights(brightness)
+    return Noise(_usual(relative * sensed), _usual(relative * camera))
+
+
+def _usual(noise):
+    """Mean of the tiles' noise without the largest `RARE_TILES`."""
+    return float(np.mean(np.sort(noise)[:-max(round(RARE_TILES * len(noise)), 1)] if len(noise) > 1 else noise))
