@@ -10,7 +10,10 @@ from ..transport.radius import relative_weights
 from . import costs
 
 LEAST, MOST = 1 / 8, 8.0
-"""Bounds of the ratio. What one iteration tells of noise is itself noisy, and weights shift light to the technique that has more samples."""
+"""Bounds of the ratio."""
+MOST_CHOSEN = 1.0
+"""The most that a pilot chooses. More light sub-paths take time from the rare paths that it does not see: with 2.6 of them the squared error of `caustics` at
+equal time was 1.2 times as large as with one, and in a window's light nothing was gained."""
 TILE = 8
 """Pixels along the edge of a square whose brightness and noise are looked at together: a single iteration knows little of one pixel."""
 
@@ -31,9 +34,9 @@ class Noise:
 
 def best_ratio(noise, light_cost, camera_cost):
     """Light sub-paths for each camera path: n that makes (camera + light / n) (camera_cost + n light_cost) least, n^2 = light camera_cost / (camera light_cost),
-    within the bounds. `light_cost`, `camera_cost`: of a light sub-path and of a camera path, in the same unit."""
+    from `LEAST` to `MOST_CHOSEN`. `light_cost`, `camera_cost`: of a light sub-path and of a camera path, in the same unit."""
     square = noise.light * camera_cost / max(noise.camera * light_cost, 1e-30)
-    return float(np.clip(np.sqrt(square), LEAST, MOST))
+    return float(np.clip(np.sqrt(square), LEAST, MOST_CHOSEN))
 
 
 def path_costs(plugin, vertices, camera_paths):

@@ -79,7 +79,7 @@ class ResampledSession(IterativeSession):
         self.pixel_paths = width * height * integrator.camera_paths
         self.capacity = {"camera": rounded_up(4 * self.chunk), "hits": rounded_up(self.chunk), "ends": rounded_up(6 * integrator.light_paths)}
         self.light_tracing = integrator.light_tracing or None
-        self._share_light(self.light_tracing or 1.0)
+        self._share_light(1.0)
         depth = integrator.max_depth
         self.lit = not self.lights.dark and (depth < 0 or depth >= 2)
         self.lens = Lens(sensor).connects
@@ -102,14 +102,13 @@ class ResampledSession(IterativeSession):
 
     def recall(self, learned):
         self.light_tracing = learned.get("light_tracing", self.light_tracing)
-        self._share_light(self.light_tracing or 1.0)
-        self._freeze()
 
     def _share_light(self, ratio, vertices=4.0):
-        """Has about `ratio` light sub-paths traced for each camera path, at least M, which have so many `vertices` on average."""
+        """Has about `ratio` light sub-paths traced for each camera path, enough in any case for what is drawn from and for Q; they have so many `vertices`
+        on average."""
         wanted = ratio * self.chunk
         self.light_rounds = max(round(wanted / CHUNK), 1)
-        self.light_chunk = max(round(wanted / self.light_rounds), self.integrator.light_paths)
+        self.light_chunk = max(round(wanted / self.light_rounds), self.integrator.light_paths, KNOWN_PATHS)
         self.capacity["light"] = rounded_up(int(vertices * self.light_chunk))
         self.ratio = dr.opaque(mi.Float, self.light_chunk * self.light_rounds * self.chunks / self.pixel_paths)
 
@@ -258,7 +257,8 @@ class ResampledSession(IterativeSession):
     # ------------------------------------------------------------------ before the first iteration
 
     def _prepare(self):
-        """Draws the cache points, and finds out how many light sub-paths pay where nobody has said so."""
+        """Draws the cache points, and finds out how many light sub-paths pay where nobody has said so. All sessions of a render see the same here, whatever
+        they have been told."""
         spectral = self._spectral(PILOT)
         light = self._light(PILOT, 0, spectral)
         traced = self._camera(PILOT, *self.all_over_the_film(), spectral)
@@ -272,19 +272,21 @@ class ResampledSession(IterativeSession):
         self.records, self.shares = ignorant(self.grid)
         self._freeze()
         if self.light_tracing is None and self.lens and (self.iterations_planned or FEW) >= FEW:
-            self._choose_light_tracing(light, traced, spectral)
+            self.light_tracing = self._best_light_tracing(light, traced, spectral)
+        ratio = self.light_tracing if self.lens else 0.0
+        if ratio is not None:
+            self._share_light(ratio, 1.25 * self.vertices[0])
+            self._freeze()
 
-    def _choose_light_tracing(self, light, traced, spectral):
-        """Sets how many light sub-paths are traced, after an iteration that nobody sees, with one for each camera path."""
+    def _best_light_tracing(self, light, traced, spectral):
+        """How many light sub-paths pay for each camera path, by an iteration that nobody sees, with one."""
         paths = self.integrator.camera_paths
         radiance = self._radiance(traced, self._proposals(PILOT, spectral, light), self._seed(PILOT, DRAW), spectral)
         sensed = np.array(self._meet_sensor(light, self._seed(PILOT, APERTURE), spectral))
         border, weight = self.sensor.film().rfilter().border_size(), np.array(self.expected_weight)[:, :, 0]
         corner = to_numpy(traced[2]) - np.array(self.sensor.film().crop_offset())[:, None] + border
         noise = observed_noise(np.floor(corner).astype(int), np.array(channel_mean(radiance)), paths, sensed[:, :, :3].mean(axis=2), sensed[:, :, 3], weight)
-        self.light_tracing = best_ratio(noise, *path_costs(self.integrator.plugin, self.vertices, paths))
-        self._share_light(self.light_tracing, 1.25 * self.vertices[0])
-        self._freeze()
+        return best_ratio(noise, *path_costs(self.integrator.plugin, self.vertices, paths))
 
     def _first_light(self):
         """The first iteration's light sub-paths; kept until Q and Q_s are known."""
