@@ -90,9 +90,9 @@ def test_census(rgb):
 
 
 def test_prices(rgb):
-    """Every candidate has a price for every event, and more of anything is dearer."""
+    """Whatever counts costs has a price for every event, and more of anything is dearer."""
     from mis_integrators.integrators.choice import PHOTON_MAPPERS
-    assert set(costs.PRICES) == {"path", *(plugin for plugin, _ in PHOTON_MAPPERS)}
+    assert set(costs.PRICES) == {"path", *(plugin for plugin, _ in PHOTON_MAPPERS), "pcbpt", "bdpt_ris"}        # the last two: `light_tracing`
     for plugin in costs.PRICES:
         few, many = costs.cost(plugin, (1.0, 1.0, 1.0, 1.0)), costs.cost(plugin, (2.0, 2.0, 2.0, 1.0))
         assert 0 < few < many
