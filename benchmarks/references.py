@@ -14,6 +14,7 @@ import OpenEXR
 import mis_integrators
 from mis_integrators.analysis.metrics import References
 from mis_integrators.output import write_exr
+from mis_integrators.transport.traits import has_media
 from methods import Method, SessionMaker, parse_method
 from scene_files import OpenScene, fingerprint
 
@@ -41,9 +42,9 @@ def add_folder(command: argparse.ArgumentParser) -> None:
 
 
 def recipe(opened: OpenScene) -> dict:
-    """How the references of a scene are made, ``method``, and the methods that must agree, ``opinions``: path unless `references.json` knows
-    better."""
-    return RECIPE.get(opened.name, {"method": "path", "opinions": []})
+    """How the references of a scene are made, ``method``, and the methods that must agree, ``opinions``: path, where there are media volpath, unless
+    `references.json` knows better."""
+    return RECIPE.get(opened.name, {"method": "volpath" if has_media(opened.scene) else "path", "opinions": []})
 
 
 def find_references(
