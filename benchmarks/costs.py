@@ -51,7 +51,7 @@ def run(options: argparse.Namespace) -> None:
 
 
 def measured(opened, plugins) -> list[dict]:
-    """One row a method and radius: events a pixel, and cost in units of a segment of `path`."""
+    """One row a method and radius, or number of light sub-paths: events a pixel, and cost in units of a segment of `path`."""
     scene, sensor = opened.scene, opened.sensor
     first = mi.load_dict({"type": "bdpm", "camera_paths": 1, **opened.inherited})
     segments = mean_segments(scene, sensor, 1, 1, int(np.prod(opened.size)), first.max_depth, first.rr_depth)
@@ -74,7 +74,7 @@ def measured(opened, plugins) -> list[dict]:
             session.iterate()
             counted = costs.events(session, segments, session.last_vertex, pilot.forecast.gathered * factor ** 2)
             sessions.append((plugin, f"{name_of(plugin, parameters)} x {factor:g}", session, counted))
-    for plugin in (plugin for plugin in CONNECTED if plugin in plugins):
+    for plugin in filter(plugins.__contains__, CONNECTED):
         for ratio in LIGHT_TRACING:
             session = mi.load_dict({"type": plugin, "light_tracing": ratio, **opened.inherited}).session(scene, sensor)
             session.iterate()

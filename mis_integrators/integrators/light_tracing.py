@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..transport.radius import relative_weights
+from ..transport.radius import relative_weights, usual_mean
 from . import costs
 
 LEAST, MOST = 1 / 8, 8.0
@@ -16,8 +16,6 @@ MOST_CHOSEN = 1.0
 equal time was 1.2 times as large as with one, and in a window's light nothing was gained."""
 TILE = 8
 """Pixels along the edge of a square whose brightness and noise are looked at together: a single iteration knows little of one pixel."""
-
-
 RARE_TILES = 0.02
 """Share of them that is left out, one at least: a single path that meets a lamp by way of glass would outweigh all others."""
 
@@ -64,28 +62,20 @@ def observed_noise(corner, values, camera_paths, light, squares, weight):
     columns = -(-width // TILE)
     count = columns * -(-height // TILE)
 
-    def tiles(column, line):
-        return np.minimum(line // TILE, -(-height // TILE) - 1) * columns + np.minimum(column // TILE, columns - 1)
+    def tile_means(column, line, *values):
+        """Means over the tiles, `nan` where there is nothing."""
+        tile = np.clip(line, 0, height - 1) // TILE * columns + np.clip(column, 0, width - 1) // TILE
+        number = np.bincount(tile, minlength=count)
+        return [np.divide(np.bincount(tile, value, count), number, np.full(count, np.nan), where=number > 0) for value in values]
 
     together = max(camera_paths, 2)
     groups = len(values) // together
     group = values[:groups * together].reshape(groups, together)
-    column, line = np.maximum(corner[:, :groups * together:together], 0)
-    tile = tiles(column, line)
-    number = np.bincount(tile, minlength=count)
-    met = number > 0
-    camera = np.bincount(tile, group.var(axis=1, ddof=1), count)[met] / number[met] / camera_paths
-    brightness = np.bincount(tile, group.mean(axis=1), count)[met] / number[met]
+    camera, seen = tile_means(*corner[:, :groups * together:together], group.var(axis=1, ddof=1) / camera_paths, group.mean(axis=1))
     line, column = np.indices(weight.shape)
-    tile = tiles(column.ravel(), line.ravel())
-    number = np.bincount(tile, minlength=count)[met]
     weight = np.maximum(weight, 1e-6)
-    brightness += np.bincount(tile, (light / weight).ravel(), count)[met] / number
-    sensed = np.bincount(tile, (squares / weight).ravel(), count)[met] / number / camera_paths
-    relative = relative_weights(brightness)
-    return Noise(_usual(relative * sensed), _usual(relative * camera))
-
-
-def _usual(noise):
-    """Mean of the tiles' noise without the largest `RARE_TILES`."""
-    return float(np.mean(np.sort(noise)[:-max(round(RARE_TILES * len(noise)), 1)] if len(noise) > 1 else noise))
+    light, sensed = tile_means(column.ravel(), line.ravel(), (light / weight).ravel(), (squares / weight / camera_paths).ravel())
+    met = np.isfinite(seen)
+    sensed, camera = sensed[met], camera[met]
+    relative = relative_weights((seen + light)[met])
+    return Noise(*(usual_mean(relative * noise, RARE_TILES, 1) for noise in (sensed, camera)))

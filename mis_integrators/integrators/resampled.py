@@ -70,6 +70,11 @@ def ends_room(lengths, M):
 class ResampledSession(IterativeSession):
     """Iterations of both plugins: light sub-paths, pmfs of the cache points, camera sub-paths, connections, emission met, light that meets the sensor."""
 
+    PASSES = {"_light_pass": ("_trace_light", ("light",)), "_camera_pass": ("_trace_camera", ("camera", "hits")),
+              "_pilot_pass": ("_pilot_targets", ("light", "ends")), "_target_pass": ("_own_targets", ("light", "ends")),
+              "_connection_pass": ("_connect", ("light", "camera", "ends")), "_hit_pass": ("_meet", ("camera", "hits")),
+              "_sensor_pass": ("_join_sensor", ("light",))}
+
     def __init__(self, integrator, scene, sensor, seed, iterations):
         super().__init__(integrator, scene, sensor, seed, iterations)
         self.traits = SceneTraits(scene)
@@ -111,11 +116,6 @@ class ResampledSession(IterativeSession):
         self.light_chunk = max(round(wanted / self.light_rounds), self.integrator.light_paths, KNOWN_PATHS)
         self.capacity["light"] = rounded_up(int(vertices * self.light_chunk))
         self.ratio = dr.opaque(mi.Float, self.light_chunk * self.light_rounds * self.chunks / self.pixel_paths)
-
-    PASSES = {"_light_pass": ("_trace_light", ("light",)), "_camera_pass": ("_trace_camera", ("camera", "hits")),
-              "_pilot_pass": ("_pilot_targets", ("light", "ends")), "_target_pass": ("_own_targets", ("light", "ends")),
-              "_connection_pass": ("_connect", ("light", "camera", "ends")), "_hit_pass": ("_meet", ("camera", "hits")),
-              "_sensor_pass": ("_join_sensor", ("light",))}
 
     def _freeze(self, grown=None):
         self._fill_tables()

@@ -73,9 +73,8 @@ def start_camera_paths(sensor, seed, first, stride: int, n_paths: int, camera_pa
     return path, active, rng, mi.Ray3f(ray), weight, splat, aperture
 
 
-def all_over_the_film(first, skip, n_paths: int, camera_paths: int):
-    """What `start_camera_paths` takes as `first` to leave out `skip` numbers after each pixel's `camera_paths`: a part of the paths that sees all
-    of the film."""
+def with_gaps(first, skip, n_paths: int, camera_paths: int):
+    """What `start_camera_paths`, with a `stride` of one, takes as `first` to leave out `skip` numbers after each pixel's `camera_paths`."""
     return first + dr.arange(mi.UInt32, n_paths) // camera_paths * skip
 
 

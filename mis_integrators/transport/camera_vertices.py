@@ -8,7 +8,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from .camera_pass import all_over_the_film, behind_emitters, start_camera_paths, within_crop
+from .camera_pass import behind_emitters, start_camera_paths, with_gaps, within_crop
 from .junctions import Junction, scattered_mean
 from .lenses import Lens
 from .packing import Store
@@ -78,7 +78,7 @@ def trace_camera_vertices(scene, sensor, integrator, lights, traits, soften, see
     `soften.row(p, n)` numbers places, with the normal on the side of the light; `soften.softened(geometry, squared)` may change the geometric
     term of a step that starts there, with its squared distance (infinite for environments).
     """
-    first = all_over_the_film(first, skip, n_paths, camera_paths)
+    first = with_gaps(first, skip, n_paths, camera_paths)
     path, active, rng, ray, sensor_weight, splat, aperture = start_camera_paths(sensor, seed, first, 1, n_paths, camera_paths, wavelength_sample)
     lens = Lens(sensor)
     inside = within_crop(sensor.film(), splat)

@@ -190,9 +190,9 @@ def expected_squared_bias(radii, difference, error, iterations, wanted, least=LE
     return np.einsum("qh,qhr->r", weight, bias)
 
 
-def usual_mean(values):
-    """Mean over pixels without the largest `RARE_PIXELS` of them: one pixel at the edge of a lamp can outweigh all others."""
-    kept = np.sort(values)[:max(int(round(len(values) * (1 - RARE_PIXELS))), 1)]
+def usual_mean(values, rare=RARE_PIXELS, fewest=0):
+    """Mean over pixels without the largest `rare` (a share) of them, `fewest` at least: one pixel at the edge of a lamp can outweigh all others."""
+    kept = np.sort(values)[:max(len(values) - max(round(len(values) * rare), fewest), 1)]
     return float(np.mean(kept))
 
 

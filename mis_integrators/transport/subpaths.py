@@ -25,7 +25,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from .camera_pass import all_over_the_film, behind_emitters, start_camera_paths, within_crop
+from .camera_pass import behind_emitters, start_camera_paths, with_gaps, within_crop
 from .junctions import Junction, scattered_mean
 from .lenses import Lens
 from .light_pass import lane_count, scatter_light
@@ -190,7 +190,7 @@ def trace_camera_subpaths(scene, sensor, integrator, lights, traits, weights, se
     with what joins the two, may be joined with; `count` as in `trace_light_subpaths`. `ledger`, if given, learns every contribution:
     `met(path, depth, value, share, mask)` and `direct(...)`, with the length of the joint path in segments, and the weight apart.
     """
-    first = all_over_the_film(first, skip, n_paths, camera_paths)
+    first = with_gaps(first, skip, n_paths, camera_paths)
     path, active, rng, ray, sensor_weight, splat, aperture = start_camera_paths(sensor, seed, first, 1, n_paths, camera_paths, wavelength_sample)
     lens = Lens(sensor)
     inside = within_crop(sensor.film(), splat)
