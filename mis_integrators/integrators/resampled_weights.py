@@ -36,6 +36,8 @@ UNEXPECTED = 0.1
 """A cache point's light is unexpected if the points around it have less than this share of its own pmf for it."""
 LEAST_DOUBT = 0.05
 """Some of the light may always be unexpected."""
+LINES = 64
+"""Cache points that are compared with all others at once: their distances fit in a processor's cache."""
 LEAST_GAIN, MOST_GAIN = 1.0, 2.0
 """A draw counts as so many connections to a light sub-path of its own. A cache that promises more is not to be believed (fireflies). Where it promises
 less, a heuristic that goes by second moments would hand paths to techniques that are noisier: what is drawn seldom is mostly small. That is so the
@@ -129,9 +131,14 @@ def around(p, n, neighbors, normal_cost):
     """Places of the other cache points that each of C is nearest to (C x `neighbors`, or as many as there are): those that `CacheGrid` would mix
     with it. NumPy arrays `p`, `n` (C x 3); `normal_cost` as of `CacheGrid` [length^2]."""
     p, n = (p - p.mean(axis=0)).astype(np.float32), n.astype(np.float32)
-    cost = np.sum(p ** 2, axis=1) - 2 * p @ p.T - np.float32(normal_cost) * n @ n.T          # but for what is the same in a row
-    np.fill_diagonal(cost, np.inf)
-    return least_columns(cost, min(neighbors, len(p) - 1))
+    squared, count = np.sum(p ** 2, axis=1), min(neighbors, len(p) - 1)
+    near = np.empty((len(p), count), dtype=np.intp)
+    for first in range(0, len(p), LINES):
+        some = np.arange(first, min(first + LINES, len(p)))
+        cost = squared - 2 * p[some] @ p.T - np.float32(normal_cost) * n[some] @ n.T         # but for what is the same in a row
+        cost[some - first, some] = np.inf
+        near[some] = least_columns(cost, count)
+    return near
 
 
 def doubt(near, r, seen):
