@@ -524,3 +524,42 @@ def test_windows_are_known_from_all_directions():
     (even, mean, error), (uneven, other, other_error) = found
     assert even > 1.3 * uneven, (even, uneven)
     assert abs(mean - other) < 5.3 * np.hypot(error, other_error)
+
+
+def direct_light_of_floor(scene, lights, count=1 << 18):
+    """Direct light at places of the room's floor: irradiances by one sample each, their directions' densities as stated, and as `pdf_direct` has them."""
+    rng = np.random.default_rng(1)
+    x, y = (mi.Float(v) for v in rng.uniform([[0.2], [0.2]], [[5.8], [3.8]], (2, count)).astype(np.float32))
+    ray = mi.Ray3f(mi.Point3f(x, y, 1), mi.Vector3f(0, 0, -1))
+    si = scene.ray_intersect(ray)
+    ds, weight, pdf = lights.sample_direct(si, streams(dr.arange(mi.UInt32, count), mi.UInt32(2)), mi.Bool(True))
+    lit = dr.max(weight) > 0
+    found = mi.DirectionSample3f(scene, scene.ray_intersect(si.spawn_ray(ds.d), lit), si)
+    value = np.array(dr.select(lit, dr.mean(weight) * dr.maximum(ds.d.z, 0), 0) + dr.zeros(mi.Float, count))
+    lit = np.array(lit)
+    return value, np.array(pdf)[lit], np.array(lights.pdf_direct(si, found, mi.Bool(True)))[lit]
+
+
+@pytest.mark.parametrize("sky", ["constant", "sunsky"])
+def test_direct_light_is_looked_for_at_windows(sky):
+    """Next-event estimation in a room aims at the window: its mean is that of the sky's own sampler (5.3 standard errors: 1e-7; 10 % are seen) and its
+    variance a fraction of it; the density of each direction is what `pdf_direct` says. (All random numbers are fixed.)"""
+    scene = room_with_window({"type": "constant"} if sky == "constant" else {"type": "sunsky", "sun_direction": [-0.8, 0.1, 0.5], "turbidity": 3.0})
+    guide = EnvironmentGuide(scene, scene.sensors()[0])
+    assert guide.aims
+    aimed, stated, again = direct_light_of_floor(scene, Lights(scene, guide=guide))
+    assert np.quantile(np.abs(again / stated - 1), 0.999) < 0.01
+    guide.aims = False
+    own, *_ = direct_light_of_floor(scene, Lights(scene, guide=guide), 1 << 22)
+    (a, error_a), (b, error_b) = mean_and_error(aimed), mean_and_error(own)
+    error = np.hypot(error_a, error_b)
+    assert abs(a - b) < 5.3 * error, f"{a} against {b}"
+    assert (5.3 + 1.65) * error < 0.1 * b, "test too weak"
+    assert aimed.var() < 0.3 * own.var(), aimed.var() / own.var()
+
+
+@pytest.mark.parametrize("emitter", ["constant", "sunsky"])
+def test_open_skies_are_not_aimed_at(emitter):
+    """Where the sky is everywhere there is nothing to aim at, and what that costs is not done."""
+    scene = tray("lambertian", emitter)
+    assert not EnvironmentGuide(scene, scene.sensors()[0]).aims

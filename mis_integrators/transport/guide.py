@@ -4,6 +4,7 @@ A sun, a sky or an environment map sends its sub-paths through the disk of the w
 almost none would enter. A pilot of camera paths asks from which directions, and through which part of the plane across each
 direction, the places that matter are lit. Sub-paths then start mostly there: a histogram over (direction cell, position cell), and one over
 the faces of the box around the lit places (`entrances`), mixed with the plain densities, which keeps every estimate unbiased however poor the pilot.
+The latter also tells next-event estimation where the windows are, if that makes less noise.
 """
 
 from __future__ import annotations
@@ -41,6 +42,10 @@ LEVEL_SHARES = (0.55, 0.25, 0.1, 0.1)
 FEWEST_RECORDS = 64
 SPREAD_WAVELENGTHS = 450, 520, 590, 640
 """Wavelengths [nm] at which lights are looked at where no path brings its own."""
+AIMED_SHARE = 0.5
+"""Share of the directions of direct light that are aimed at the entrances, if any are."""
+WORTH_AIMING = 0.9
+"""None are if that leaves more than this of the noise."""
 FOCUS_TAIL = 0.01
 """Share of the records' weight that may lie outside the focus, at each end of each axis."""
 
@@ -98,6 +103,20 @@ def _sees_sky(scene, ray, active):
     return reached
 
 
+def _worth_aiming(entrances, p, d, light, density, own):
+    """Whether direct light is less noisy with the `AIMED_SHARE` of its directions aimed at the entrances.
+
+    Records (NumPy arrays): places `p` and directions `d` (3, n) to environments that a shadow ray reaches, `light` from there, densities per solid angle with which
+    they were drawn, and with which the emitter's own sampler draws them. At a place, light has the second moment of its ratio to the density of its
+    direction; here that is taken relative to the light, so that dark places count as much as bright ones.
+    """
+    if len(light) < FEWEST_RECORDS:
+        return False
+    place = mi.Point3f(p)
+    aimed = np.where(np.array(entrances.near(place)), np.array(entrances.direction_density(place, mi.Vector3f(d))), own)
+    return np.sum(light * density / ((1 - AIMED_SHARE) * own + AIMED_SHARE * aimed)) < WORTH_AIMING * np.sum(light * density / own)
+
+
 class Place(NamedTuple):
     """Surfaces that camera paths have met: their BSDFs, the paths' throughput, and where they scatter smoothly."""
 
@@ -112,7 +131,8 @@ class EnvironmentGuide:
 
     Attributes: `center`, `radius` of the scene's bounding sphere; `focus_center`, `focus_radius` of the lit places that the
     pilot met; `entrances` of the light of environments (`None` where the pilot saw next to none); `direction_share`, the share of environment sub-paths
-    whose direction comes from the emitter's own sampler.
+    whose direction comes from the emitter's own sampler; `aims`, whether next-event estimation in the box around the lit places aims at the
+    entrances.
     """
 
     def __init__(self, scene, sensor):
@@ -129,6 +149,7 @@ class EnvironmentGuide:
         self._first_row = mi.UInt32(first_rows)
         self.direction_share = 1.0
         self.entrances = None
+        self.aims = False
         self._learn(sensor)
 
     def _set_sphere(self, center, radius):
@@ -153,9 +174,9 @@ class EnvironmentGuide:
         self._learn_directions(places)
         records = [self._numpy(self._look(index, emitter, place, rng)) for index, emitter in self.infinite for place, rng in places
                    for _ in range(TESTS if emitter.is_environment() else 1)]
-        p, d, row, weight = (np.concatenate(x, axis=-1) for x in zip(*records))
+        p, d, row, weight, density, own = (np.concatenate(x, axis=-1) for x in zip(*records))
         useful = (weight > 0) & np.isfinite(weight)
-        p, d, row, weight = p[:, useful], d[:, useful], row[useful], weight[useful]
+        p, d, row, weight, density, own = (x[..., useful] for x in (p, d, row, weight, density, own))
         of_sky = self._environment_rows()
         cells = POSITION_CELLS ** 2
         pmf = np.zeros((self.row_count, cells))
@@ -163,14 +184,20 @@ class EnvironmentGuide:
             weight = np.minimum(weight, 20 * np.mean(weight))
             low, high = _weighted_box(p, weight, FOCUS_TAIL)
             # An even flux is what merging wants, and heavy records (a glossy peak, a texel of the sun) guide no better than others.
-            weight = np.sqrt(weight)
+            light, weight = weight, np.sqrt(weight)
             center, radius = (low + high) / 2, max(np.linalg.norm(high - low) / 2, 1e-4 * self.radius)
             self.focus_center, self.focus_radius = mi.Point3f([float(x) for x in center]), float(radius) * 1.05
             cell, inside = (np.array(x) for x in self._position_cell(mi.Vector3f(d), mi.Point3f(p)))
             pmf += np.bincount((row * cells + cell)[inside], weight[inside], pmf.size).reshape(pmf.shape)
             entering = of_sky[row]
             if np.count_nonzero(entering) >= FEWEST_RECORDS:
-                self.entrances = Entrances(low, high, p[:, entering], d[:, entering], weight[entering])
+                def entrances(records):
+                    return Entrances(low, high, p[:, records], d[:, records], weight[records])
+
+                self.entrances = entrances(entering)
+                # What half of the records have taught is tried on the others: a histogram knows those too well that it was made from.
+                odd = np.cumsum(entering) % 2 == 1
+                self.aims = _worth_aiming(entrances(entering & odd), *(x[..., entering & ~odd & (own > 0)] for x in (p, d, light, density, own)))
         pmf = smoothed(pmf.reshape(-1, POSITION_CELLS, POSITION_CELLS), LEVEL_SHARES).reshape(self.row_count, cells)
         total = pmf.sum(axis=1)
         pmf /= np.maximum(total, 1e-300)[:, None]
@@ -276,8 +303,10 @@ class EnvironmentGuide:
         return place.smooth & (self._response(place, towards, place.smooth) > 0)
 
     def _look(self, index, emitter, place, rng):
-        """Records (p, direction to the light, table row, weight) of a place each, where sub-paths of the emitter would come from; the weight estimates what
-        light from there adds to the image."""
+        """Records (p, direction to the light, table row, weight, density, own density) of a place each, where sub-paths of the emitter would come from; the
+        weight estimates what light from there adds to the image. The densities of the direction, and of the emitter's own sampler there, are zero but for
+        environments; the latter also where next-event estimation has something in its way."""
+        pdf = own = dr.zeros(mi.Float, PILOT_PATHS)
         if emitter.is_environment():
             towards, pdf, row, _ = self.sample_direction(emitter, mi.UInt32(index), place.si, next_2d(rng), rng.next_float32(), place.smooth)
             light = self._radiance(emitter, towards, place.smooth) * dr.select(pdf > 0, dr.rcp(pdf), 0)
@@ -285,9 +314,15 @@ class EnvironmentGuide:
             ds, irradiance = emitter.sample_direction(place.si, next_2d(rng), place.smooth)
             towards, light, row = ds.d, channel_mean(irradiance), self.row_of_emitter(mi.UInt32(index))
         response = self._response(place, towards, place.smooth)
-        reached = _sees_sky(self.scene, place.si.spawn_ray(towards), place.smooth & (response > 0) & (light > 0))
+        ray = place.si.spawn_ray(towards)
+        reached = _sees_sky(self.scene, ray, place.smooth & (response > 0) & (light > 0))
+        if emitter.is_environment():
+            ds = dr.zeros(mi.DirectionSample3f, PILOT_PATHS)
+            ds.d = towards
+            direct = reached & ~self.scene.ray_test(ray, reached)
+            own = dr.select(direct, emitter.pdf_direction(place.si, ds, direct), 0)
         weight = dr.select(reached, light * channel_mean(place.throughput) * dr.minimum(response, 1), 0)
-        return place.si.p, towards + dr.zeros(mi.Vector3f, PILOT_PATHS), row + dr.zeros(mi.UInt32, PILOT_PATHS), weight
+        return (place.si.p, *(x + dr.zeros(type(x), PILOT_PATHS) for x in (towards, row, weight, pdf, own)))
 
     # ------------------------------------------------------------------ densities
 
@@ -360,6 +395,16 @@ class EnvironmentGuide:
             return own_pdf
         table_pdf = dr.gather(mi.Float, self._direction_pmf, direction_cell(towards), active) * (DIRECTION_CELLS / (4 * dr.pi))
         return self.direction_share * own_pdf + (1 - self.direction_share) * table_pdf
+
+    # ------------------------------------------------------------------ direct light
+
+    def direct_density(self, own_pdf, p, towards, active=True):
+        """Density per solid angle of next-event estimation of an environment from `p`, where its own sampler has density `own_pdf`."""
+        if not self.aims:
+            return own_pdf
+        near = active & self.entrances.near(p)
+        mixed = (1 - AIMED_SHARE) * own_pdf + AIMED_SHARE * self.entrances.direction_density(p, towards, near)
+        return dr.select(near, mixed, own_pdf)
 
     # ------------------------------------------------------------------ power
 

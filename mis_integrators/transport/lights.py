@@ -12,7 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .guide import EnvironmentGuide, direction_cell, infinite_emitters
+from .guide import AIMED_SHARE, EnvironmentGuide, direction_cell, infinite_emitters
 from .packing import from_numpy
 from .random import next_2d, streams
 from .spectra import channel_mean
@@ -227,7 +227,14 @@ class Lights:
         emitter = self.pointer(index)
         sample = next_2d(rng, active)
         textured = active & self._textured_mask(emitter) if self.has_textured else mi.Bool(False)
+        if self._aims:
+            aims = active & self._of_kind(index, "environment", active=active) & self.guide.entrances.near(ref.p)
+            aimed = aims & (sample.x < AIMED_SHARE)
+            left = dr.select(aimed, sample.x / AIMED_SHARE, (sample.x - AIMED_SHARE) / (1 - AIMED_SHARE))
+            sample.x = dr.select(aims, left, sample.x)
         ds, weight = emitter.sample_direction(ref, sample, active & ~textured)
+        if self._aims:
+            ds, weight = self._aim(ref, ds, weight, sample, aims, aimed)
         if self.has_textured:
             ds_t, weight_t = self._sample_by_area(ref, emitter, index, sample, textured)
             ds = dr.select(textured, ds_t, ds)
@@ -235,6 +242,25 @@ class Lights:
         valid = active & (ds.pdf > 0) & dr.any(weight != 0)
         valid &= dr.isfinite(ds.pdf)
         return ds, dr.select(valid, weight * dr.rcp(probability), 0), ds.pdf * probability
+
+    @property
+    def _aims(self):
+        """Whether direct light of an environment is looked for where it enters."""
+        return self.guide is not None and self.guide.aims
+
+    def _aim(self, ref, ds, weight, sample, aims, aimed):
+        """`(ds, weight)` of `propose_direct` with the lanes `aimed` turned towards the entrances, and the lanes `aims`, among which they are, counted by
+        the density of both ways together."""
+        towards, good = self.guide.entrances.sample_direction(ref.p, sample, aimed)
+        ds.d = dr.select(aimed, towards, ds.d)
+        ds.n = dr.select(aimed, mi.Normal3f(-towards), ds.n)
+        ds.p = dr.select(aimed, ref.p + towards * (2 * self.guide.radius), ds.p)
+        ds.dist = dr.select(aimed, 2 * self.guide.radius, ds.dist)
+        si = dr.zeros(mi.SurfaceInteraction3f, dr.width(ref.p))
+        si.wi, si.time, si.wavelengths = -ds.d, ref.time, ref.wavelengths
+        ds.pdf = dr.select(aims, self.guide.direct_density(ds.emitter.pdf_direction(ref, ds, aims), ref.p, ds.d, aims), ds.pdf)
+        light = ds.emitter.eval(si, aims) * dr.select((good | ~aimed) & (ds.pdf > 0), dr.rcp(ds.pdf), 0)
+        return ds, dr.select(aims, light, weight)
 
     @staticmethod
     def shadow_ray(ref, ds, infinite):
@@ -276,6 +302,9 @@ class Lights:
             textured = active & self._textured_mask(emitter)
             by_area = dr.square(ds.dist) / (dr.abs_dot(ds.d, ds.n) * self._area(lookup(self.numbers, emitter, mi.UInt32, textured), textured))
             pdf = dr.select(textured, dr.select(dr.dot(ds.d, ds.n) < 0, by_area, 0), pdf)
+        if self._aims:
+            sky = active & self._of_kind(lookup(self.numbers, emitter, mi.UInt32, active), "environment", active=active)
+            pdf = dr.select(sky, self.guide.direct_density(pdf, ref.p, ds.d, sky), pdf)
         return pdf
 
     @staticmethod
@@ -443,7 +472,8 @@ class Lights:
         own_pdf = ds.emitter.pdf_direction(ref, ds, active)
         row = self.guide.row_of_emitter(self._scene_index(index)) + direction_cell(ds.d)
         density = self.guide.direction_density(own_pdf, ds.d, active) * self.guide.position_density(ds.d, row, ref.p, active)
-        return dr.select(own_pdf > 0, density * dr.rcp(own_pdf), 0)
+        direct = self.guide.direct_density(own_pdf, ref.p, ds.d, active)
+        return dr.select(direct > 0, density * dr.rcp(direct), 0)
 
     def _ratio_area(self, ref, ds, index, active):
         pdf = self._pdf_of_emitter(ref, ds, active) * (dr.pi * self._area(index, active))
