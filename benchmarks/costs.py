@@ -74,7 +74,7 @@ def measured(opened, plugins) -> list[dict]:
             session.iterate()
             counted = costs.events(session, segments, session.last_vertex, pilot.forecast.gathered * factor ** 2)
             sessions.append((plugin, f"{name_of(plugin, parameters)} x {factor:g}", session, counted))
-    for plugin in filter(plugins.__contains__, CONNECTED):
+    for plugin in [plugin for plugin in CONNECTED if plugin in plugins]:
         for ratio in LIGHT_TRACING:
             session = mi.load_dict({"type": plugin, "light_tracing": ratio, **opened.inherited}).session(scene, sensor)
             session.iterate()

@@ -61,7 +61,7 @@ class Entrances:
         leaves = dr.min(far)
         meets = dr.max(near) < leaves
         axis = dr.select(far.x <= leaves, mi.UInt32(0), dr.select(far.y <= leaves, mi.UInt32(1), mi.UInt32(2)))
-        upper = dr.select(axis == 0, towards.x, dr.select(axis == 1, towards.y, towards.z)) > 0
+        upper = _component(towards, axis) > 0
         place = (p + leaves * towards - self._low) / self._extent
         u, v = dr.select(axis == 0, place.y, place.x), dr.select(axis == 2, place.y, place.z)
         return 2 * axis + dr.select(upper, mi.UInt32(1), 0), square_cell(u, v, FACE_CELLS), meets, leaves
@@ -78,9 +78,8 @@ class Entrances:
     def density(self, towards, p, active=True):
         """Density of the line along `towards` through `p`, per unit area across it."""
         face, cell, meets, _ = self._exit(towards, p)
-        light = dr.gather(mi.Float, self._light, face * FACE_CELLS ** 2 + cell, active & meets)
         total = sum(self._faces(towards)[1])
-        return dr.select(meets & (total > 0), light * dr.rcp(dr.gather(mi.Float, self._cell_area, face // 2, active) * total), 0)
+        return dr.select(meets & (total > 0), self._per_area(face, cell, active & meets) * dr.rcp(total), 0)
 
     def sample(self, towards, sample, jitter, active=True):
         """A point where a line along `towards` comes out of the box, from two uniform numbers; `jitter`: two more that place it within its cell, or `None`
@@ -105,10 +104,8 @@ class Entrances:
         """Density per solid angle of `sample_direction`."""
         face, cell, meets, distance = self._exit(towards, p)
         meets &= active & (distance > 0)
-        light = dr.gather(mi.Float, self._light, face * FACE_CELLS ** 2 + cell, meets)
-        axis = face // 2
-        cosine = dr.abs(dr.select(axis == 0, towards.x, dr.select(axis == 1, towards.y, towards.z)))
-        return dr.select(meets, light * dr.square(distance) * dr.rcp(dr.maximum(cosine, 1e-9) * dr.gather(mi.Float, self._cell_area, axis, meets)), 0)
+        cosine = dr.maximum(dr.abs(_component(towards, face // 2)), 1e-9)
+        return dr.select(meets, self._per_area(face, cell, meets) * dr.square(distance) * dr.rcp(cosine), 0)
 
     def sample_direction(self, p, sample, active=True):
         """Directions from `p` towards a point of the histogram, from two uniform numbers, and whether it is one at which they come out of the box: seen
@@ -122,6 +119,11 @@ class Entrances:
 
     # ------------------------------------------------------------------
 
+    def _per_area(self, face, cell, active):
+        """The histogram as a density per unit area of the faces."""
+        light = dr.gather(mi.Float, self._light, face * FACE_CELLS ** 2 + cell, active)
+        return light * dr.rcp(dr.gather(mi.Float, self._cell_area, face // 2, active))
+
     def _cell_of_face(self, face, u, active):
         """A cell of faces, from uniform numbers, and what these leave over."""
         cells = FACE_CELLS ** 2
@@ -133,3 +135,8 @@ class Entrances:
         a, b = in_square_cell(cell, offset, FACE_CELLS)
         place = mi.Vector3f(dr.select(axis == 0, across, a), dr.select(axis == 1, across, dr.select(axis == 0, a, b)), dr.select(axis == 2, across, b))
         return mi.Point3f(self._low + place * self._extent)
+
+
+def _component(v, axis):
+    """The component of a vector along each lane's own axis (0, 1 or 2)."""
+    return dr.select(axis == 0, v.x, dr.select(axis == 1, v.y, v.z))

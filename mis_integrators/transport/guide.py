@@ -103,6 +103,13 @@ def _sees_sky(scene, ray, active):
     return reached
 
 
+def _aimed_density(entrances, own_pdf, p, towards, active=True):
+    """Density per solid angle of directions from `p` of which, near the entrances, the `AIMED_SHARE` is aimed at these; all others have density `own_pdf`."""
+    near = active & entrances.near(p)
+    mixed = (1 - AIMED_SHARE) * own_pdf + AIMED_SHARE * entrances.direction_density(p, towards, near)
+    return dr.select(near, mixed, own_pdf)
+
+
 def _worth_aiming(entrances, p, d, light, density, own):
     """Whether direct light is less noisy with the `AIMED_SHARE` of its directions aimed at the entrances.
 
@@ -112,9 +119,8 @@ def _worth_aiming(entrances, p, d, light, density, own):
     """
     if len(light) < FEWEST_RECORDS:
         return False
-    place = mi.Point3f(p)
-    aimed = np.where(np.array(entrances.near(place)), np.array(entrances.direction_density(place, mi.Vector3f(d))), own)
-    return np.sum(light * density / ((1 - AIMED_SHARE) * own + AIMED_SHARE * aimed)) < WORTH_AIMING * np.sum(light * density / own)
+    aimed = np.array(_aimed_density(entrances, mi.Float(own), mi.Point3f(p), mi.Vector3f(d)))
+    return np.sum(light * density / aimed) < WORTH_AIMING * np.sum(light * density / own)
 
 
 class Place(NamedTuple):
@@ -400,11 +406,7 @@ class EnvironmentGuide:
 
     def direct_density(self, own_pdf, p, towards, active=True):
         """Density per solid angle of next-event estimation of an environment from `p`, where its own sampler has density `own_pdf`."""
-        if not self.aims:
-            return own_pdf
-        near = active & self.entrances.near(p)
-        mixed = (1 - AIMED_SHARE) * own_pdf + AIMED_SHARE * self.entrances.direction_density(p, towards, near)
-        return dr.select(near, mixed, own_pdf)
+        return _aimed_density(self.entrances, own_pdf, p, towards, active) if self.aims else own_pdf
 
     # ------------------------------------------------------------------ power
 
