@@ -28,6 +28,8 @@ PLUGINS = {
     "bdpm_balance": MANY,
     "volpath_multiview": {},
 }
+RIVAL = {"volpath_multiview": "volpath"}
+"""What a plugin is compared with, if not with `path`: passing through a mask is a segment of `max_depth` there, but not in `volpath`."""
 SLACK, BLUR = 0.002, 0.03
 """Relative to the brightness of a region and of the image together: single precision; what merging at such a radius may take from shapes' edges."""
 DEPTH, MOST = 4, 480
@@ -37,7 +39,7 @@ DEPTH, MOST = 4, 480
 
 
 def compare(scene, plugin, whole):
-    """Against `path`, over the image and its quarters, until an error of `whole` in the image would be seen, or `MOST` iterations are done.
+    """Against `path` (or `RIVAL`), over the image and its quarters, until an error of `whole` in the image would be seen, or `MOST` iterations are done.
 
     Small shapes that direct light does not reach lose more than `BLUR` at their edges. What is lost so is halved with the radius, an error is not:
     where there is a difference, half the radius decides.
@@ -62,7 +64,7 @@ def found_by(scene, plugin, parameters, whole):
     common = {"max_depth": DEPTH, "rr_depth": 100}
     loaded = mi.load_dict(scene)
     ours = SessionBatches(mi.load_dict({"type": plugin, **parameters, **common}), loaded, blocks=2)
-    path = PathBatches(mi.load_dict({"type": "path", **common}), loaded, blocks=2, spp=128)
+    path = PathBatches(mi.load_dict({"type": RIVAL.get(plugin, "path"), **common}), loaded, blocks=2, spp=128)
     estimates = collect_until(ours, path, whole, 3 * whole, start=24, most=MOST)
     brightness = estimates[1].mean[0].mean()
     lifted = [Estimate(e.mean + brightness, e.error2, e.freedom) for e in estimates]
