@@ -295,6 +295,46 @@ def test_dark_and_short(rgb, parameters):
     np.testing.assert_allclose(*[x.mean(axis=(0, 1)) for x in images], rtol=0.03)
 
 
+# --- Which camera vertices draw -----------------------------------------------------------------------------
+
+
+def test_slight_vertices_are_thinned_out(rgb):
+    """Each camera vertex stays with the probability whose inverse it is given, worked out apart: rough ones and the brightest of a path always, others by
+    what the nearest cache points promise. A chi-square of 200 rounds, false alarms 1e-6."""
+    from mis_integrators.transport.connections import LEAST_CHANCE, SLIGHT, list_draws
+    session, rounds = plugin("pcbpt", max_depth=6).session(glossy_box(size=32), 0, 1, 0), 200
+    session.start()
+    spectral = session._spectral(1)
+    light, (_, _, _, camera, count, *_) = session._light(1, 0, spectral), session._camera(1, 0, spectral)
+    *ends, pmfs = session._proposals(1, spectral, light)
+    proposals = session._pmfs_of(session._ends(ends[1], ends[0], *ends[2:]), pmfs)
+    number = int(count[0])
+    z = read_vertices(camera, dr.arange(mi.UInt32, number), True, states=STEP)
+    row = np.array(session.grid.row(z["p"], dr.mulsign(z["n"], dr.dot(z["n"], z["towards"]))))
+    expected = np.array(pmfs[2])[np.array(session.grid.table).reshape(-1, 3)[row]].mean(axis=1)
+    promised = np.array(z["throughput"] * z["value"]).mean(axis=0) * expected
+    path, rough = np.array(z["path"]), np.array(z["density"]) < 0
+    promised[rough] = 0
+    brightest = np.zeros(session.chunk)
+    np.maximum.at(brightest, path, promised)
+    level = SLIGHT * brightest[path]
+    chance = np.where(rough | (promised >= level), 1, np.maximum(promised / np.where(level > 0, level, 1), LEAST_CHANCE))
+    slight = chance < 1
+    assert 0.05 < slight.mean() < 0.95 and rough.any() and (chance[slight] > LEAST_CHANCE).mean() > 0.2
+    stays = np.zeros(number)
+    for seed in range(rounds):
+        places, factor, found = list_draws(proposals, camera, count, session.capacity["camera"], session.chunk, STEP, session.capacity["camera"],
+                                           mi.UInt32(seed))
+        places, factor = (np.array(x)[:int(found[0])] for x in (places, factor))
+        assert len(set(places)) == len(places)
+        np.testing.assert_allclose(factor, 1 / chance[places], rtol=1e-4)
+        stays[places] += 1
+    assert np.all(stays[~slight] == rounds)
+    squares = (stays - rounds * chance)[slight] ** 2 / (rounds * chance * (1 - chance))[slight].clip(1e-3)
+    mean, error = squares.mean(), squares.std() / np.sqrt(slight.sum())
+    assert abs(mean - 1) < 5 * error and error < 0.1
+
+
 # --- Repeatability, memory, parameters ----------------------------------------------------------------------
 
 
@@ -371,6 +411,21 @@ def test_parts_share_their_proposals(rgb, monkeypatch):
     agree(plugin("bdpt_ris"), path(rr_depth=50), scene, blocks=2, whole=0.02, block=0.05, most=600)
 
 
+def test_parts_hold_every_path_once(rgb, monkeypatch):
+    """Parts of a film, each of which sees all of it."""
+    from mis_integrators.integrators import resampled
+    from mis_integrators.transport.camera_pass import with_gaps
+    monkeypatch.setattr(resampled, "CHUNK", 470)
+    session = plugin("pcbpt").session(box_scene(23), 0, 1, 0)
+    numbers = []
+    for chunk in range(session.chunks):
+        gaps = session.all_over_the_film(chunk)
+        some = dr.arange(mi.UInt32, session.chunk) + with_gaps(*gaps, session.chunk, 4)
+        numbers.append(np.array(some)[np.array(session.in_chunk(*gaps))])
+        assert np.ptp(numbers[-1]) > 0.9 * session.path_count
+    assert np.array_equal(np.sort(np.concatenate(numbers)), np.arange(session.path_count)) and session.chunks == 5
+
+
 def test_pilot_sees_all_of_the_film(rgb, monkeypatch):
     """Cache points of a film in parts come from all over it, as those of a film in one: heights of first vertices, two samples of the same
     distribution (Kolmogorov and Smirnov; false alarms 1e-6)."""
@@ -427,18 +482,34 @@ def test_noise_is_seen_in_one_iteration(camera_paths):
 
 def test_light_tracing_follows_the_scene(rgb):
     """Where the noise is caustics, as many light sub-paths are traced as camera paths; where almost nothing that they meet is seen but through glass, fewer.
-    What was chosen is told, and makes the same image in another session that recalls it."""
+    What was chosen is told, and makes the same image in another session that recalls it (and has to begin the first iteration anew)."""
     chosen = []
     for name in ("caustics", "sds"):
         scene = mi.load_file(str(SCENES / f"{name}.xml"), resx=32, resy=24)
         session = plugin("bdpt_ris", max_depth=10).session(scene, 0, 1, 0)
         session.iterate()
+        assert session.light_chunk == session.chunk
+        session.iterate()
         chosen.append(session.settings["light_tracing"])
     other = plugin("bdpt_ris", max_depth=10).session(scene, 0, 1, 0)
     other.recall(session.learned)
-    other.iterate()
+    for _ in range(2):
+        other.iterate()
     assert chosen[0] == 1 and chosen[1] < 0.95 and other.light_chunk == session.light_chunk
     np.testing.assert_allclose(other.image(), session.image(), rtol=1e-4, atol=1e-6)
+
+
+def test_light_tracing_does_not_follow_the_parts(rgb, monkeypatch):
+    """As much for a film in parts as for one in one, but for the noise of the pilot, which sees a part."""
+    from mis_integrators.integrators import resampled
+    chosen = []
+    for chunk in (1 << 18, 3000):
+        monkeypatch.setattr(resampled, "CHUNK", chunk)
+        sessions = [plugin("pcbpt").session(mi.load_file(str(SCENES / "door.xml"), resx=48, resy=36), 0, seed, 0) for seed in range(4)]
+        for session in sessions:
+            session.start()
+        chosen.append(np.log([session.light_tracing for session in sessions]))
+    assert session.chunks == 3 and abs(np.mean(chosen[0]) - np.mean(chosen[1])) < 0.3         # log(sqrt(3)) = 0.55
 
 
 @pytest.mark.parametrize("ratio", [0.125, 8])

@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..transport.camera_pass import film_sample_count
+from ..transport.camera_pass import film_sample_count, with_gaps
 from ..transport.film import Accumulator, shared_wavelengths, variance_channels
 from ..transport.packing import rounded_up
 from ..transport.random import mix
@@ -218,10 +218,11 @@ class IterativeSession:
                 setattr(self, name, self.recorded(getattr(self, function)))
 
     def split_paths(self, largest):
-        """Splits the `path_count` camera paths of an iteration into `chunks` parts of `chunk` paths, at most `largest` each: that bounds memory."""
+        """Splits the `path_count` camera paths of an iteration into `chunks` parts of `chunk` paths, all those of a pixel in the same part and about `largest` at
+        most: that bounds memory."""
         self.path_count = film_sample_count(self.sensor) * self.samples_per_iteration
         self.chunks = -(-self.path_count // largest)
-        self.chunk = -(-self.path_count // self.chunks)
+        self.chunk = -(-self.path_count // (self.chunks * self.samples_per_iteration)) * self.samples_per_iteration
 
     def sum_of_chunks(self, render):
         """What `render(chunk, first)` returns, a tuple of tensors or `None`s, summed over all parts; `first`: the number of the part's first path."""
@@ -231,13 +232,14 @@ class IterativeSession:
             total = blocks if total is None else tuple(None if a is None else a + b for a, b in zip(total, blocks))
         return total
 
-    def all_over_the_film(self):
-        """Numbers `first` and `skip` of a part's camera paths that see all of the film, for pilots: as of `trace_camera_vertices`."""
-        return dr.opaque(mi.UInt32, 0), dr.opaque(mi.UInt32, self.samples_per_iteration * (self.chunks - 1))
+    def all_over_the_film(self, chunk=0):
+        """Numbers `first` and `skip` of a part's camera paths that see all of the film, as of `trace_camera_vertices`: for pilots, or for all parts."""
+        paths = self.samples_per_iteration
+        return dr.opaque(mi.UInt32, chunk * paths), dr.opaque(mi.UInt32, paths * (self.chunks - 1))
 
-    def in_chunk(self, first):
-        """Which of `chunk` paths from number `first` on there are: the last part may have fewer."""
-        return dr.arange(mi.UInt32, self.chunk) + first < self.path_count
+    def in_chunk(self, first, skip=0):
+        """Which of `chunk` paths from number `first` on there are, with gaps of `skip` after each pixel's: the last part may have fewer."""
+        return dr.arange(mi.UInt32, self.chunk) + with_gaps(first, skip, self.chunk, self.samples_per_iteration) < self.path_count
 
     def _run(self, iteration):
         """Adds an iteration to the sums."""

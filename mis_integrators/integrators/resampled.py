@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from ..transport.cache_points import CacheGrid
 from ..transport.camera_vertices import STEP, hit_layout, sum_before, trace_camera_vertices
-from ..transport.connections import join_sensor
+from ..transport.connections import join_sensor, list_draws
 from ..transport.film import as_camera_weights, colour_channels, expected_weight, splat_channels, splat_samples, with_colour
 from ..transport.junctions import scattered_mean
 from ..transport.lenses import Lens
@@ -35,7 +33,7 @@ CACHE_SHARE, FEWEST_CACHE_POINTS = 1 / 300, 256
 MOST_PAIRS = 1 << 24
 """Pairs of a cache point and a light vertex at most, four bytes each (and some more while they are made); beyond that there are fewer cache points."""
 FEW = 8
-"""Renders of fewer iterations do not spend one on finding out how many light sub-paths pay."""
+"""Renders of fewer iterations do not find out how many light sub-paths pay: the passes would have to be recorded anew for the rest."""
 KNOWN_PATHS, MOST_KNOWN_SETS = 200, 8
 """Light sub-paths of the first iteration from which Q and Q_s are estimated, in sets of M; at most so many sets."""
 
@@ -72,8 +70,8 @@ class ResampledSession(IterativeSession):
 
     PASSES = {"_light_pass": ("_trace_light", ("light",)), "_camera_pass": ("_trace_camera", ("camera", "hits")),
               "_pilot_pass": ("_pilot_targets", ("light", "ends")), "_target_pass": ("_own_targets", ("light", "ends")),
-              "_connection_pass": ("_connect", ("light", "camera", "ends")), "_hit_pass": ("_meet", ("camera", "hits")),
-              "_sensor_pass": ("_join_sensor", ("light",))}
+              "_draw_pass": ("_list_draws", ("camera", "ends", "draws")), "_connection_pass": ("_connect", ("light", "camera", "ends", "draws")),
+              "_hit_pass": ("_meet", ("camera", "hits")), "_sensor_pass": ("_join_sensor", ("light",))}
 
     def __init__(self, integrator, scene, sensor, seed, iterations):
         super().__init__(integrator, scene, sensor, seed, iterations)
@@ -82,19 +80,20 @@ class ResampledSession(IterativeSession):
         self.split_paths(CHUNK)
         width, height = sensor.film().crop_size()
         self.pixel_paths = width * height * integrator.camera_paths
-        self.capacity = {"camera": rounded_up(4 * self.chunk), "hits": rounded_up(self.chunk), "ends": rounded_up(6 * integrator.light_paths)}
+        self.capacity = {"camera": rounded_up(4 * self.chunk), "draws": rounded_up(3 * self.chunk), "hits": rounded_up(self.chunk),
+                         "ends": rounded_up(6 * integrator.light_paths)}
         self.light_tracing = integrator.light_tracing or None
-        self._share_light(1.0)
+        self.lens = Lens(sensor).connects
+        self._share_light(*self._wanted_light(0))
         depth = integrator.max_depth
         self.lit = not self.lights.dark and (depth < 0 or depth >= 2)
-        self.lens = Lens(sensor).connects
         bounds = self.traits.bounds
         self.reach = 4 * float(np.linalg.norm(np.array(bounds.max).ravel() - np.array(bounds.min).ravel()))
         self.expected_weight = expected_weight(sensor.film(), integrator.camera_paths)
         self.recorded = recorder()
         self.grid = CacheGrid(mi.Point3f(0), mi.Normal3f(0, 0, 1), integrator.cache_neighbors)
         self.records, self.shares = ignorant(self.grid)
-        self.cache = self.known = self.first_light = self.vertices = None
+        self.cache = self.known = self.first_light = self.begun = self.vertices = None
         self._freeze()
 
     @property
@@ -108,9 +107,16 @@ class ResampledSession(IterativeSession):
     def recall(self, learned):
         self.light_tracing = learned.get("light_tracing", self.light_tracing)
 
-    def _share_light(self, ratio, vertices=4.0):
+    def _wanted_light(self, iteration):
+        """Light sub-paths for each camera path of an iteration, and vertices of each that there shall be room for. Of the first one nothing is known."""
+        if iteration == 0:
+            return float(self.lens) * (self.integrator.light_tracing or 1.0), 4.0
+        return float(self.lens) * (self.light_tracing or 1.0), 1.25 * self.vertices[0]
+
+    def _share_light(self, ratio, vertices):
         """Has about `ratio` light sub-paths traced for each camera path, enough in any case for what is drawn from and for Q; they have so many `vertices`
         on average."""
+        self.shared = ratio, vertices
         wanted = ratio * self.chunk
         self.light_rounds = max(round(wanted / CHUNK), 1)
         self.light_chunk = max(round(wanted / self.light_rounds), self.integrator.light_paths, KNOWN_PATHS)
@@ -194,15 +200,24 @@ class ResampledSession(IterativeSession):
         dr.eval(pmfs)                                              # a recording cannot make it
         return pmfs
 
-    def _connect(self, scene, sensor, tables, radiance, camera, count, light, starts, places, found, pmfs, seed, spectral):
-        """Radiance of camera paths with that of connections to drawn light sub-paths added."""
+    def _pmfs_of(self, ends, pmfs):
+        return Proposals(self.grid, *pmfs, ends.count, self.integrator.light_paths + self.capacity["ends"])
+
+    def _list_draws(self, tables, camera, count, light, starts, places, found, pmfs, seed):
+        """As `list_draws`."""
+        proposals = self._pmfs_of(self._ends(starts, light, places, found), pmfs)
+        return list_draws(proposals, camera, count, self.capacity["camera"], self.chunk, STEP, self.capacity["draws"], seed)
+
+    def _connect(self, scene, sensor, tables, radiance, camera, draws, light, starts, places, found, pmfs, seed, spectral):
+        """Radiance of camera paths with that of connections to drawn light sub-paths added. `draws`: as of `list_draws`."""
         integrator, weights = self.integrator, self.weights()
         ends = self._ends(starts, light, places, found)
-        proposals = Proposals(self.grid, *pmfs, ends.count, integrator.light_paths + self.capacity["ends"])
-        index = lanes(self.capacity["camera"] * integrator.resamples)
-        vertex = index // integrator.resamples
-        active = vertex < dr.gather(mi.UInt32, count, 0)
-        z = read_vertices(camera, vertex, active, states=STEP)
+        proposals = self._pmfs_of(ends, pmfs)
+        index = lanes(self.capacity["draws"] * integrator.resamples)
+        chosen, factor, count = draws
+        slot = index // integrator.resamples
+        active = slot < dr.gather(mi.UInt32, count, 0)
+        z = read_vertices(camera, dr.gather(mi.UInt32, chosen, slot, active), active, states=STEP)
         rng = vertex_streams(z["path"] * integrator.resamples + index % integrator.resamples, z["number"], seed)
         row = self.grid.row(z["p"], dr.mulsign(z["n"], dr.dot(z["n"], z["towards"])))
         drawn = proposals.draw(row, rng, active)
@@ -217,7 +232,7 @@ class ResampledSession(IterativeSession):
         carried = z["throughput"] * value * sent.light
         active &= (dr.max(carried) > 0) & dr.all(dr.isfinite(carried))
         active = ends.unblocked(scene, z["p"], z["n"], sent, active)
-        share = self._share(weights, camera, z, sent, value, forward, back, segments, active)
+        share = self._share(weights, camera, z, sent, value, forward, back, segments, active) * dr.gather(mi.Float, factor, slot, active)
         estimate = carried * (share * dr.rcp(integrator.light_paths * integrator.resamples * dr.maximum(probability, 1e-20)))
         total = radiance + dr.zeros(mi.Spectrum, self.chunk)        # radiance may be a single zero
         dr.scatter_reduce(dr.ReduceOp.Add, total, estimate, z["path"], active)
@@ -257,11 +272,10 @@ class ResampledSession(IterativeSession):
     # ------------------------------------------------------------------ before the first iteration
 
     def _prepare(self):
-        """Draws the cache points, and finds out how many light sub-paths pay where nobody has said so. All sessions of a render see the same here, whatever
-        they have been told."""
-        spectral = self._spectral(PILOT)
-        light = self._light(PILOT, 0, spectral)
-        traced = self._camera(PILOT, *self.all_over_the_film(), spectral)
+        """Begins the first iteration: draws the cache points from its first part, and finds out how many light sub-paths pay where nobody has said so. All
+        sessions of a render see the same here, whatever they have been told."""
+        spectral = self._spectral(0)
+        light, traced = self._light(0, 0, spectral), self._camera(0, 0, spectral)
         vertices, M = min(int(traced[4][0]), self.capacity["camera"]), self.integrator.light_paths
         self.vertices = int(light[1][0]) / self.light_chunk, vertices / self.chunk
         wanted = min(max(FEWEST_CACHE_POINTS, int(vertices * CACHE_SHARE)), max(vertices, 1))
@@ -271,28 +285,20 @@ class ResampledSession(IterativeSession):
         self.grid = CacheGrid(self.cache["p"], normals, self.integrator.cache_neighbors)
         self.records, self.shares = ignorant(self.grid)
         self._freeze()
+        self.first_light = light
         if self.light_tracing is None and self.lens and (self.iterations_planned or FEW) >= FEW:
-            self.light_tracing = self._best_light_tracing(light, traced, spectral)
-        ratio = self.light_tracing if self.lens else 0.0
-        if ratio is not None:
-            self._share_light(ratio, 1.25 * self.vertices[0])
-            self._freeze()
+            proposals = self._proposals(0, spectral, light)
+            part = self._part(0, 0, spectral, light, proposals, traced)
+            self.light_tracing = self._best_light_tracing(*part)
+            self.begun = proposals, part
 
-    def _best_light_tracing(self, light, traced, spectral):
-        """How many light sub-paths pay for each camera path, by an iteration that nobody sees, with one."""
-        paths = self.integrator.camera_paths
-        radiance = self._radiance(traced, self._proposals(PILOT, spectral, light), self._seed(PILOT, DRAW), spectral)
-        sensed = np.array(self._meet_sensor(light, self._seed(PILOT, APERTURE), spectral))
+    def _best_light_tracing(self, radiance, alpha, position, met):
+        """How many light sub-paths pay for each camera path, by a part (`_part`) of an iteration with one."""
+        paths, met = self.integrator.camera_paths, self.chunks * np.array(met)
         border, weight = self.sensor.film().rfilter().border_size(), np.array(self.expected_weight)[:, :, 0]
-        corner = to_numpy(traced[2]) - np.array(self.sensor.film().crop_offset())[:, None] + border
-        noise = observed_noise(np.floor(corner).astype(int), np.array(channel_mean(radiance)), paths, sensed[:, :, :3].mean(axis=2), sensed[:, :, 3], weight)
+        corner = to_numpy(position) - np.array(self.sensor.film().crop_offset())[:, None] + border
+        noise = observed_noise(np.floor(corner).astype(int), np.array(channel_mean(radiance)), paths, met[:, :, :3].mean(axis=2), met[:, :, 3], weight)
         return best_ratio(noise, *path_costs(self.integrator.plugin, self.vertices, paths))
-
-    def _first_light(self):
-        """The first iteration's light sub-paths; kept until Q and Q_s are known."""
-        if self.first_light is None:
-            self.first_light = self._light(0, 0, self._spectral(0))
-        return self.first_light
 
     def _take_weights(self, iteration):
         """Sets the weights of an iteration. They must not depend on its own light sub-paths: the first one's goes by densities alone, those of all
@@ -300,10 +306,16 @@ class ResampledSession(IterativeSession):
         if not self.integrator.aware:
             return
         if iteration > 0 and self.known is None:
-            self.known = tabulate(self.grid, *self._integrals(self._first_light(), self._spectral(0)))
+            self.known = tabulate(self.grid, *self._integrals(self.first_light, self._spectral(0)))
             self.first_light = None
         self.records, self.shares = self.known if iteration > 0 else ignorant(self.grid)
         self._fill_tables()
+
+    def _take_light(self, iteration):
+        """Sets how many light sub-paths an iteration has."""
+        if self.shared != self._wanted_light(iteration):
+            self._share_light(*self._wanted_light(iteration))
+            self._freeze("light")
 
     def _cache_points(self, camera, vertices, count):
         """`count` of the camera's vertices, at random (a single one in nothingness if there is none)."""
@@ -348,10 +360,10 @@ class ResampledSession(IterativeSession):
             if not self._grown("light", light[1]):
                 return light
 
-    def _camera(self, iteration, first, skip, spectral):
+    def _camera(self, iteration, chunk, spectral):
         """What `trace_camera_vertices` returns."""
         while True:
-            traced = self._camera_pass(self.scene, self.sensor, self._tables, self._seed(iteration, CAMERA), first, skip, spectral)
+            traced = self._camera_pass(self.scene, self.sensor, self._tables, self._seed(iteration, CAMERA), *self.all_over_the_film(chunk), spectral)
             if not self.lit or not (self._grown("camera", traced[4]) or self._grown("hits", traced[6])):
                 return traced
 
@@ -369,10 +381,19 @@ class ResampledSession(IterativeSession):
             self.scene, self.sensor, self._tables, self._seed(iteration, START), *light, self.cache, spectral))
         return light[0], *ends, self._pmfs(r, seen, ends[-1])
 
-    def _radiance(self, traced, proposals, seed, spectral):
+    def _draws(self, camera, count, proposals, seed):
+        """What `list_draws` returns."""
+        while True:
+            draws = self._draw_pass(self._tables, camera, count, *proposals, seed)
+            if not self._grown("draws", draws[-1]):
+                return draws
+
+    def _radiance(self, iteration, chunk, traced, proposals, spectral):
         """Radiance of camera paths (`trace_camera_vertices`) with everything that they meet and are connected to."""
         radiance, _, _, camera, count, hits, hit_count = traced
-        radiance = self._connection_pass(self.scene, self.sensor, self._tables, radiance, camera, count, *proposals, seed, spectral)
+        draws = self._draws(camera, count, proposals, self._seed(iteration, THIN, chunk))
+        radiance = self._connection_pass(self.scene, self.sensor, self._tables, radiance, camera, draws, *proposals, self._seed(iteration, DRAW, chunk),
+                                         spectral)
         radiance = self._hit_pass(self._tables, radiance, camera, hits, hit_count)
         dr.eval(radiance)                                  # else its sums may still wait when the film's are made
         return radiance
@@ -382,19 +403,24 @@ class ResampledSession(IterativeSession):
         vertices, found, _ = light
         return self._sensor_pass(self.scene, self.sensor, self._tables, vertices, found, seed, spectral)
 
-    def _chunk(self, iteration, spectral, light, proposals, chunk, first):
-        """Blocks of one part of the paths: of camera paths, and of light that met the sensor (or None). `light`: the first part's light sub-paths."""
-        traced = self._camera(iteration, first, dr.opaque(mi.UInt32, 0), spectral)
+    def _part(self, iteration, chunk, spectral, light, proposals, traced=None):
+        """One part of an iteration: radiance, alpha and film position of its camera paths (`traced`, if they are already), and the block of the light that met
+        the sensor (or None). `light`: the first part's light sub-paths."""
+        traced = traced or self._camera(iteration, chunk, spectral)
         radiance, alpha, position, *_ = traced
         block = None
         if self.lit:
-            radiance = self._radiance(traced, proposals, self._seed(iteration, DRAW, chunk), spectral)
+            radiance = self._radiance(iteration, chunk, traced, proposals, spectral)
             for part in range(chunk * self.light_rounds, (chunk + 1) * self.light_rounds) if self.lens else ():
                 met = self._meet_sensor(self._light(iteration, part, spectral) if part else light, self._seed(iteration, APERTURE, part), spectral)
                 block = met if block is None else block + met
+        return radiance, alpha, position, block
+
+    def _chunk(self, spectral, chunk, radiance, alpha, position, block):
+        """Blocks of one part (`_part`): of camera paths, and of light that met the sensor."""
         if self.integrator.hide_emitters:
             radiance = dr.select(alpha > 0, radiance, 0)       # as `path` does: what is behind nothing but null surfaces is hidden
-        return splat_samples(self.sensor.film(), position, radiance, alpha, spectral["matrix"], self.in_chunk(first)), block
+        return splat_samples(self.sensor.film(), position, radiance, alpha, spectral["matrix"], self.in_chunk(*self.all_over_the_film(chunk))), block
 
     def start(self):
         if self.cache is None and self.lit:
@@ -403,18 +429,24 @@ class ResampledSession(IterativeSession):
     def _iteration(self, iteration):
         self.start()
         spectral = self._spectral(iteration)
-        light = proposals = None
+        (proposals, begun), light, self.begun = self.begun if iteration == 0 and self.begun else (None, None), None, None
         if self.lit:
             self._take_weights(iteration)
-            light = self._light(iteration, 0, spectral) if iteration else self._first_light()
+            self._take_light(iteration)
+            light = self.first_light if iteration == 0 and self.first_light else self._light(iteration, 0, spectral)
             if not self.integrator.aware or self.known is not None:
                 self.first_light = None                    # nobody will ask for it again
-            proposals = self._proposals(iteration, spectral, light)
-        block, light = self.sum_of_chunks(partial(self._chunk, iteration, spectral, light, proposals))
+            proposals = proposals or self._proposals(iteration, spectral, light)
+
+        def render(chunk, _):
+            part = begun if begun and chunk == 0 else self._part(iteration, chunk, spectral, light, proposals)
+            return self._chunk(spectral, chunk, *part)
+
+        block, light = self.sum_of_chunks(render)
         return block if light is None else with_colour(block, as_camera_weights(light[:, :, :3], block, self.expected_weight))
 
 
-LIGHT, CAMERA, APERTURE, START, DRAW = 0, 1, 3, 4, 5
+LIGHT, CAMERA, APERTURE, START, DRAW, THIN = 0, 1, 3, 4, 5, 6
 """Purposes of an iteration's random seeds, besides `IterativeSession.WAVELENGTH`."""
 PILOT = 1 << 31
-"""The number of the iteration that never is: what is made before the first one draws from its seeds."""
+"""The number of the iteration that never is: what only the weights and the cache are made of draws from its seeds."""

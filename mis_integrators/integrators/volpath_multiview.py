@@ -66,7 +66,7 @@ class VolpathMultiview(IterativeIntegrator):
      * - max_depth
        - |int|
        - Longest path in segments (-1: unlimited). A value of 1 shows only directly visible emitters, 2 adds single scattering, and so
-         on. (Default: -1)
+         on; passing straight through a surface or medium counts for nothing, as in ``volpath``. (Default: -1)
      * - rr_depth
        - |int|
        - Depth from which Russian roulette may end a path. (Default: 5)

@@ -14,6 +14,7 @@ from .junctions import SMALLEST_COSINE
 from .lenses import unblocked, unblocked_by_visible
 from .packing import Store
 from .random import vertex_streams
+from .recording import lanes
 from .spectra import channel_mean
 from .subpaths import STATES, junction_of, read_vertices
 
@@ -111,6 +112,38 @@ def list_pairs(traits, weights, camera, camera_count, camera_capacity: int, ligh
         place += 1
         left -= 1
     return store.camera, store.light, store.factor, store.count
+
+
+SLIGHT, LEAST_CHANCE = 0.2, 0.2
+"""Camera vertices that are promised less than this share of what the brightest one of their path is are thinned out, at most to that share of them: the
+promise is one of cache points some way off."""
+
+
+def list_draws(proposals, camera, camera_count, camera_capacity: int, paths: int, states, capacity: int, seed):
+    """The camera vertices (of `paths` sub-paths, with `states`) that are to be joined to light vertices drawn for them from `proposals`.
+
+    Lambertian ones are thinned out (Russian roulette) by the light that they are promised, next to their path's others: the throughput decides, mostly, and
+    shadows. Returns `(places, one over the probability of staying, count)`.
+    """
+    index = lanes(camera_capacity)
+    active = index < dr.gather(mi.UInt32, camera_count, 0)
+    z = read_vertices(camera, index, active, ("p", "path", "throughput", "density", "towards", "number", "value", "n"), states)
+    row = proposals.grid.row(z["p"], dr.mulsign(z["n"], dr.dot(z["n"], z["towards"])))
+    simple = active & (z["density"] >= 0)
+    promised = dr.select(simple, channel_mean(z["throughput"] * z["value"]) * proposals.promise(row, simple), 0)
+    brightest = dr.zeros(mi.UInt32, paths)                          # as bits: positive numbers have the same order
+    dr.scatter_reduce(dr.ReduceOp.Max, brightest, dr.reinterpret_array(mi.UInt32, promised), z["path"], simple)
+    dr.eval(brightest, promised)
+    level = SLIGHT * dr.reinterpret_array(mi.Float, dr.gather(mi.UInt32, brightest, z["path"], simple))
+    chance = dr.select(simple & (promised < level), dr.maximum(promised * dr.rcp(dr.maximum(level, 1e-30)), LEAST_CHANCE), 1)
+    keep = active & (vertex_streams(z["path"], z["number"], seed).next_float32() < chance)
+    count = dr.zeros(mi.UInt32, 1)
+    slot = dr.scatter_inc(count, mi.UInt32(0), keep)
+    keep &= slot < dr.opaque(mi.UInt32, capacity)
+    places, factor = dr.empty(mi.UInt32, capacity), dr.empty(mi.Float, capacity)
+    dr.scatter(places, index, slot, keep)
+    dr.scatter(factor, dr.rcp(chance), slot, keep)
+    return places, factor, count
 
 
 def visible(scene, connection, camera, active):

@@ -18,7 +18,8 @@ def uniform_share(visible):
 
 
 def cumulative_sums(r, seen, count, width):
-    """Cumulative sums, up to one in each row, of the pmfs of C cache points over up to `width` light vertices; and `uniform_share` of each row.
+    """Cumulative sums, up to one in each row, of the pmfs of C cache points over up to `width` light vertices; `uniform_share` of each row; and what the row
+    expects of all light vertices together, what is not seen for `BLIND_SHARE`.
 
     `r` (float, C x width, one row a cache point): q*/p of each light vertex if nothing stood between, zero in unused places; `seen` (bool, alike):
     whether nothing does; `count` (uint32 of width one): light vertices in use, the first ones. The pmf is that of what is seen, with
@@ -34,18 +35,19 @@ def cumulative_sums(r, seen, count, width):
     sums = dr.fma(share, blind, (1 - share) * dr.minimum(seen_sums / dr.select(some > 0, some, 1), 1))
     end = dr.arange(mi.UInt32, dr.width(r) // width) * width + (width - 1)
     every, some = (dr.gather(mi.Float, x, end) for x in (all_sums, seen_sums))
-    return sums, uniform_share(dr.minimum(dr.select(every > 0, some / dr.select(every > 0, every, 1), 0), 1))
+    expected = dr.fma(BLIND_SHARE, every, (1 - BLIND_SHARE) * some)
+    return sums, uniform_share(dr.minimum(dr.select(every > 0, some / dr.select(every > 0, every, 1), 0), 1)), expected
 
 
 class Proposals:
-    """For every row of a `CacheGrid` a mixture of the pmfs of its cache points: `cumulative` and `uniform` as of `cumulative_sums`, `count`
-    and `width` as there.
+    """For every row of a `CacheGrid` a mixture of the pmfs of its cache points: `cumulative`, `uniform` and `expected` as of `cumulative_sums`,
+    `count` and `width` as there.
 
     The probability of a light vertex is what the cumulative sums give it: they are what is drawn from, rounding included.
     """
 
-    def __init__(self, grid, cumulative, uniform, count, width):
-        self.grid, self.cumulative, self.uniform, self.count = grid, cumulative, uniform, count
+    def __init__(self, grid, cumulative, uniform, expected, count, width):
+        self.grid, self.cumulative, self.uniform, self.expected, self.count = grid, cumulative, uniform, expected, count
         self.width, self.steps = dr.opaque(mi.UInt32, width), width.bit_length()
 
     def draw(self, row, rng, active=True):
@@ -72,3 +74,8 @@ class Proposals:
             mean += (1 - share) * dr.maximum(upper - lower, 0)
             uniform += share
         return (mean + uniform / mi.Float(dr.maximum(self.count, 1))) / self.grid.neighbors
+
+    def promise(self, row, active=True):
+        """What the row's cache points expect on average: q*/p, summed over the light vertices."""
+        points = [self.grid.neighbor(row, number, active) for number in range(self.grid.neighbors)]
+        return sum(dr.gather(mi.Float, self.expected, point, active) for point in points) / self.grid.neighbors
