@@ -233,7 +233,7 @@ def test_agrees_full(rgb, emitter, family, name):
     if has_delta(family) and emitter in POINT_LIKE:
         pytest.skip("path is blind there")
     oracle = ptracer if emitter == "directionalarea" else path
-    agree(plugin(name), oracle(rr_depth=50), tray(family, emitter), block=0.05, most=4096)
+    agree(plugin(name), oracle(rr_depth=50), tray(family, emitter), block=0.05, most=8192)
 
 
 @pytest.mark.parametrize("emitter", ["directionalarea"])

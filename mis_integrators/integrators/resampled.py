@@ -34,6 +34,8 @@ MOST_PAIRS = 1 << 24
 """Pairs of a cache point and a light vertex at most, four bytes each (and some more while they are made); beyond that there are fewer cache points."""
 FEW = 8
 """Renders of fewer iterations do not find out how many light sub-paths pay: the passes would have to be recorded anew for the rest."""
+KEPT_DRAWS = 0.9
+"""Share of the camera vertices that there is room for among those that draw, at first: enough in most scenes."""
 KNOWN_PATHS, MOST_KNOWN_SETS = 200, 8
 """Light sub-paths of the first iteration from which Q and Q_s are estimated, in sets of M; at most so many sets."""
 
@@ -80,7 +82,7 @@ class ResampledSession(IterativeSession):
         self.split_paths(CHUNK)
         width, height = sensor.film().crop_size()
         self.pixel_paths = width * height * integrator.camera_paths
-        self.capacity = {"camera": rounded_up(4 * self.chunk), "draws": rounded_up(3 * self.chunk), "hits": rounded_up(self.chunk),
+        self.capacity = {"camera": rounded_up(4 * self.chunk), "draws": rounded_up(self.chunk), "hits": rounded_up(self.chunk),
                          "ends": rounded_up(6 * integrator.light_paths)}
         self.light_tracing = integrator.light_tracing or None
         self.lens = Lens(sensor).connects
@@ -279,7 +281,7 @@ class ResampledSession(IterativeSession):
         vertices, M = min(int(traced[4][0]), self.capacity["camera"]), self.integrator.light_paths
         self.vertices = int(light[1][0]) / self.light_chunk, vertices / self.chunk
         wanted = min(max(FEWEST_CACHE_POINTS, int(vertices * CACHE_SHARE)), max(vertices, 1))
-        self.capacity["ends"] = ends_room(np.array(light[2]), M)
+        self.capacity |= {"ends": ends_room(np.array(light[2]), M), "draws": rounded_up(max(int(KEPT_DRAWS * vertices), 1))}
         self.cache = self._cache_points(traced[3], vertices, max(min(wanted, MOST_PAIRS // (M + self.capacity["ends"])), 1))
         normals = dr.mulsign(self.cache["n"], dr.dot(self.cache["n"], self.cache["towards"]))
         self.grid = CacheGrid(self.cache["p"], normals, self.integrator.cache_neighbors)
@@ -429,7 +431,8 @@ class ResampledSession(IterativeSession):
     def _iteration(self, iteration):
         self.start()
         spectral = self._spectral(iteration)
-        (proposals, begun), light, self.begun = self.begun if iteration == 0 and self.begun else (None, None), None, None
+        proposals, begun = self.begun if iteration == 0 and self.begun else (None, None)
+        self.begun = light = None
         if self.lit:
             self._take_weights(iteration)
             self._take_light(iteration)
