@@ -223,6 +223,7 @@ def test_crop_is_the_cropped_window(rgb, rfilter, bdd):
     assert all(off(dx, dy) > 3 * off(0, 0) for dx in (-1, 0, 1) for dy in (-1, 0, 1) if (dx, dy) != (0, 0))
 
 
+@pytest.mark.thinned(5, 2)
 @pytest.mark.parametrize("rfilter", ["gaussian", "tent", "mitchell", "lanczos", "catmullrom"])
 @pytest.mark.parametrize("border", [False, True])
 def test_reconstruction_filters(rgb, rfilter, border):
@@ -309,6 +310,7 @@ def test_direct_light_of_directionalarea(rgb, bdd):
         assert image.mean() == pytest.approx(oracle, rel=0.02)    # 5 sigma of 200,000 photons
 
 
+@pytest.mark.thinned(2, 2)
 @pytest.mark.parametrize("bdd", [0, 2])
 @pytest.mark.parametrize("rr_depth", [1, 2, 50])
 def test_roulette_leaves_the_mean(rgb, bdd, rr_depth):
