@@ -306,8 +306,7 @@ def test_slight_vertices_are_thinned_out(rgb):
     session.start()
     spectral = session._spectral(1)
     light, (_, _, _, camera, count, *_) = session._light(1, 0, spectral), session._camera(1, 0, spectral)
-    *ends, pmfs = session._proposals(1, spectral, light)
-    proposals = session._pmfs_of(session._ends(ends[1], ends[0], *ends[2:]), pmfs)
+    *_, pmfs = session._proposals(1, spectral, light)
     number = int(count[0])
     z = read_vertices(camera, dr.arange(mi.UInt32, number), True, states=STEP)
     row = np.array(session.grid.row(z["p"], dr.mulsign(z["n"], dr.dot(z["n"], z["towards"]))))
@@ -323,8 +322,8 @@ def test_slight_vertices_are_thinned_out(rgb):
     assert 0.05 < slight.mean() < 0.95 and rough.any() and (chance[slight] > LEAST_CHANCE).mean() > 0.2
     stays = np.zeros(number)
     for seed in range(rounds):
-        places, factor, found = list_draws(proposals, camera, count, session.capacity["camera"], session.chunk, STEP, session.capacity["camera"],
-                                           mi.UInt32(seed))
+        places, factor, found = list_draws(session.grid, pmfs[2], camera, count, session.capacity["camera"], session.chunk, STEP,
+                                           session.capacity["camera"], mi.UInt32(seed))
         places, factor = (np.array(x)[:int(found[0])] for x in (places, factor))
         assert len(set(places)) == len(places)
         np.testing.assert_allclose(factor, 1 / chance[places], rtol=1e-4)

@@ -49,7 +49,8 @@ def test_neighbours_are_the_nearest(rgb, count, neighbors, stretch):
 
 def new_proposals(grid, r, seen, count, width):
     count = dr.opaque(mi.UInt32, count)
-    return Proposals(grid, *cumulative_sums(r, seen, count, width), count, width)
+    cumulative, uniform, _ = cumulative_sums(r, seen, count, width)
+    return Proposals(grid, cumulative, uniform, count, width)
 
 
 @pytest.mark.parametrize("width", [24, 37])

@@ -20,7 +20,7 @@ from ..transport.proposals import Proposals, cumulative_sums
 from ..transport.random import mix, next_2d, vertex_streams
 from ..transport.recording import lanes, recorder
 from ..transport.spectra import channel_mean
-from ..transport.subpaths import junction_of, read_vertices, trace_light_subpaths
+from ..transport.subpaths import junction_of, read_vertices, seen_normal, trace_light_subpaths
 from ..transport.traits import SceneTraits
 from .common import IterativeIntegrator, IterativeSession
 from .light_tracing import LEAST, MOST, best_ratio, observed_noise, path_costs
@@ -72,7 +72,7 @@ class ResampledSession(IterativeSession):
 
     PASSES = {"_light_pass": ("_trace_light", ("light",)), "_camera_pass": ("_trace_camera", ("camera", "hits")),
               "_pilot_pass": ("_pilot_targets", ("light", "ends")), "_target_pass": ("_own_targets", ("light", "ends")),
-              "_draw_pass": ("_list_draws", ("camera", "ends", "draws")), "_connection_pass": ("_connect", ("light", "camera", "ends", "draws")),
+              "_draw_pass": ("_list_draws", ("camera", "draws")), "_connection_pass": ("_connect", ("light", "camera", "ends", "draws")),
               "_hit_pass": ("_meet", ("camera", "hits")), "_sensor_pass": ("_join_sensor", ("light",))}
 
     def __init__(self, integrator, scene, sensor, seed, iterations):
@@ -176,8 +176,7 @@ class ResampledSession(IterativeSession):
         if self.integrator.max_depth > 0:
             active &= z["depth"] + sent.vertices <= self.integrator.max_depth
         if target == "f_y_rho_g_v":
-            n = dr.mulsign(z["n"], dr.dot(z["n"], z["towards"]))
-            cosine = dr.dot(n, sent.d)
+            cosine = dr.dot(seen_normal(z), sent.d)
             cosine = dr.select(z["through"], dr.abs(cosine), dr.maximum(cosine, 0))
             r = channel_mean(sent.light) * cosine
         else:
@@ -202,26 +201,22 @@ class ResampledSession(IterativeSession):
         dr.eval(pmfs)                                              # a recording cannot make it
         return pmfs
 
-    def _pmfs_of(self, ends, pmfs):
-        return Proposals(self.grid, *pmfs, ends.count, self.integrator.light_paths + self.capacity["ends"])
-
-    def _list_draws(self, tables, camera, count, light, starts, places, found, pmfs, seed):
+    def _list_draws(self, tables, camera, count, expected, seed):
         """As `list_draws`."""
-        proposals = self._pmfs_of(self._ends(starts, light, places, found), pmfs)
-        return list_draws(proposals, camera, count, self.capacity["camera"], self.chunk, STEP, self.capacity["draws"], seed)
+        return list_draws(self.grid, expected, camera, count, self.capacity["camera"], self.chunk, STEP, self.capacity["draws"], seed)
 
     def _connect(self, scene, sensor, tables, radiance, camera, draws, light, starts, places, found, pmfs, seed, spectral):
         """Radiance of camera paths with that of connections to drawn light sub-paths added. `draws`: as of `list_draws`."""
         integrator, weights = self.integrator, self.weights()
         ends = self._ends(starts, light, places, found)
-        proposals = self._pmfs_of(ends, pmfs)
+        proposals = Proposals(self.grid, *pmfs[:2], ends.count, integrator.light_paths + self.capacity["ends"])
         index = lanes(self.capacity["draws"] * integrator.resamples)
         chosen, factor, count = draws
         slot = index // integrator.resamples
         active = slot < dr.gather(mi.UInt32, count, 0)
         z = read_vertices(camera, dr.gather(mi.UInt32, chosen, slot, active), active, states=STEP)
         rng = vertex_streams(z["path"] * integrator.resamples + index % integrator.resamples, z["number"], seed)
-        row = self.grid.row(z["p"], dr.mulsign(z["n"], dr.dot(z["n"], z["towards"])))
+        row = self.grid.row(z["p"], seen_normal(z))
         drawn = proposals.draw(row, rng, active)
         active &= drawn < dr.gather(mi.UInt32, ends.count, 0)
         probability = proposals.probability(row, drawn, active)
@@ -283,8 +278,7 @@ class ResampledSession(IterativeSession):
         wanted = min(max(FEWEST_CACHE_POINTS, int(vertices * CACHE_SHARE)), max(vertices, 1))
         self.capacity |= {"ends": ends_room(np.array(light[2]), M), "draws": rounded_up(max(int(KEPT_DRAWS * vertices), 1))}
         self.cache = self._cache_points(traced[3], vertices, max(min(wanted, MOST_PAIRS // (M + self.capacity["ends"])), 1))
-        normals = dr.mulsign(self.cache["n"], dr.dot(self.cache["n"], self.cache["towards"]))
-        self.grid = CacheGrid(self.cache["p"], normals, self.integrator.cache_neighbors)
+        self.grid = CacheGrid(self.cache["p"], seen_normal(self.cache), self.integrator.cache_neighbors)
         self.records, self.shares = ignorant(self.grid)
         self._freeze()
         self.first_light = light
@@ -338,7 +332,7 @@ class ResampledSession(IterativeSession):
         """`Q_s`, `Q_blind`, `doubts` and `ends_s` as `tabulate` takes them."""
         M, points, cache = self.integrator.light_paths, dr.width(self.cache["depth"]), self.cache
         sets = max(min(-(-KNOWN_PATHS // M), MOST_KNOWN_SETS, self.light_chunk // M), 1)
-        normals = to_numpy(dr.mulsign(cache["n"], dr.dot(cache["n"], cache["towards"]))).T
+        normals = to_numpy(seen_normal(cache)).T
         near = around(to_numpy(cache["p"]).T, normals, self.integrator.cache_neighbors, self.grid.normal_cost)
         Q_s, Q_blind, doubts, ends_s = np.zeros((points, LENGTHS)), np.zeros(points), np.zeros(points), np.zeros(LENGTHS)
         for k in range(sets):
@@ -383,17 +377,18 @@ class ResampledSession(IterativeSession):
             self.scene, self.sensor, self._tables, self._seed(iteration, START), *light, self.cache, spectral))
         return light[0], *ends, self._pmfs(r, seen, ends[-1])
 
-    def _draws(self, camera, count, proposals, seed):
+    def _draws(self, camera, count, expected, seed):
         """What `list_draws` returns."""
         while True:
-            draws = self._draw_pass(self._tables, camera, count, *proposals, seed)
+            draws = self._draw_pass(self._tables, camera, count, expected, seed)
             if not self._grown("draws", draws[-1]):
                 return draws
 
     def _radiance(self, iteration, chunk, traced, proposals, spectral):
         """Radiance of camera paths (`trace_camera_vertices`) with everything that they meet and are connected to."""
         radiance, _, _, camera, count, hits, hit_count = traced
-        draws = self._draws(camera, count, proposals, self._seed(iteration, THIN, chunk))
+        *_, (*_, expected) = proposals
+        draws = self._draws(camera, count, expected, self._seed(iteration, THIN, chunk))
         radiance = self._connection_pass(self.scene, self.sensor, self._tables, radiance, camera, draws, *proposals, self._seed(iteration, DRAW, chunk),
                                          spectral)
         radiance = self._hit_pass(self._tables, radiance, camera, hits, hit_count)

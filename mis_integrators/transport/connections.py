@@ -16,7 +16,7 @@ from .packing import Store
 from .random import vertex_streams
 from .recording import lanes
 from .spectra import channel_mean
-from .subpaths import STATES, junction_of, read_vertices
+from .subpaths import STATES, junction_of, read_vertices, seen_normal
 
 
 @dataclass
@@ -119,18 +119,18 @@ SLIGHT, LEAST_CHANCE = 0.2, 0.2
 promise is one of cache points some way off."""
 
 
-def list_draws(proposals, camera, camera_count, camera_capacity: int, paths: int, states, capacity: int, seed):
-    """The camera vertices (of `paths` sub-paths, with `states`) that are to be joined to light vertices drawn for them from `proposals`.
+def list_draws(grid, expected, camera, camera_count, camera_capacity: int, paths: int, states, capacity: int, seed):
+    """The camera vertices (of `paths` sub-paths, with `states`) that are to be joined to light vertices drawn for them.
 
     Lambertian ones are thinned out (Russian roulette) by the light that they are promised, next to their path's others: the throughput decides, mostly, and
-    shadows. Returns `(places, one over the probability of staying, count)`.
+    shadows. `expected` (as of `cumulative_sums`): what each cache point of the `CacheGrid` promises. Returns `(places, one over the probability of staying, count)`.
     """
     index = lanes(camera_capacity)
     active = index < dr.gather(mi.UInt32, camera_count, 0)
     z = read_vertices(camera, index, active, ("p", "path", "throughput", "density", "towards", "number", "value", "n"), states)
-    row = proposals.grid.row(z["p"], dr.mulsign(z["n"], dr.dot(z["n"], z["towards"])))
+    row = grid.row(z["p"], seen_normal(z))
     simple = active & (z["density"] >= 0)
-    promised = dr.select(simple, channel_mean(z["throughput"] * z["value"]) * proposals.promise(row, simple), 0)
+    promised = dr.select(simple, channel_mean(z["throughput"] * z["value"]) * grid.mean(expected, row, simple), 0)
     brightest = dr.zeros(mi.UInt32, paths)                          # as bits: positive numbers have the same order
     dr.scatter_reduce(dr.ReduceOp.Max, brightest, dr.reinterpret_array(mi.UInt32, promised), z["path"], simple)
     dr.eval(brightest, promised)

@@ -40,14 +40,14 @@ def cumulative_sums(r, seen, count, width):
 
 
 class Proposals:
-    """For every row of a `CacheGrid` a mixture of the pmfs of its cache points: `cumulative`, `uniform` and `expected` as of `cumulative_sums`,
-    `count` and `width` as there.
+    """For every row of a `CacheGrid` a mixture of the pmfs of its cache points: `cumulative` and `uniform` as of `cumulative_sums`, `count`
+    and `width` as there.
 
     The probability of a light vertex is what the cumulative sums give it: they are what is drawn from, rounding included.
     """
 
-    def __init__(self, grid, cumulative, uniform, expected, count, width):
-        self.grid, self.cumulative, self.uniform, self.expected, self.count = grid, cumulative, uniform, expected, count
+    def __init__(self, grid, cumulative, uniform, count, width):
+        self.grid, self.cumulative, self.uniform, self.count = grid, cumulative, uniform, count
         self.width, self.steps = dr.opaque(mi.UInt32, width), width.bit_length()
 
     def draw(self, row, rng, active=True):
@@ -74,8 +74,3 @@ class Proposals:
             mean += (1 - share) * dr.maximum(upper - lower, 0)
             uniform += share
         return (mean + uniform / mi.Float(dr.maximum(self.count, 1))) / self.grid.neighbors
-
-    def promise(self, row, active=True):
-        """What the row's cache points expect on average: q*/p, summed over the light vertices."""
-        points = [self.grid.neighbor(row, number, active) for number in range(self.grid.neighbors)]
-        return sum(dr.gather(mi.Float, self.expected, point, active) for point in points) / self.grid.neighbors

@@ -79,6 +79,11 @@ def read_vertices(vertices, index, active, only=None, states=STATES):
     return record
 
 
+def seen_normal(vertex):
+    """Geometric normal of vertices, as read by `read_vertices`, on the side that their sub-path came from."""
+    return dr.mulsign(vertex["n"], dr.dot(vertex["n"], vertex["towards"]))
+
+
 def _either(mask, yes, no):
     """Element by element, of two states."""
     return [dr.select(mask, a, b) for a, b in zip(yes, no)]
