@@ -10,6 +10,11 @@ import mitsuba as mi
 
 from . import __version__, loading
 
+LARGEST_SEED = 2**32 - 1
+MOST_SAMPLES = 2**31 - 1
+"""Samples per pixel at most."""
+MOST_SENSORS = 2**16
+
 _EXIT_CODES = """exit codes:
   0    rendered and written
   1    error in the scene or in a parameter, or while rendering
@@ -130,6 +135,6 @@ def _positive_number(text: str) -> float:
 
 def _seed(text: str) -> int:
     value = _integer(text)
-    if not 0 <= value < 1 << 32:
-        raise argparse.ArgumentTypeError("0 to 4294967295")
+    if not 0 <= value <= LARGEST_SEED:
+        raise argparse.ArgumentTypeError(f"0 to {LARGEST_SEED}")
     return value
