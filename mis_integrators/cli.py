@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import math
+import os
 import sys
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from . import again, checkpoint, cluster, loading, output
+from . import checkpoint, cluster, loading, output, reproduce
 from .checkpoint import Checkpoint, CheckpointError
 from .opening import Request
 from .options import parse, versions
@@ -20,6 +21,8 @@ from .progress import Progress
 from .rendering import Chore, Clock, Interrupt, fewest_iterations, iterate
 from .session import Session
 from .stopping import TargetError
+from .transport import traits
+from .untrusted import Malformed
 
 EXIT_OK, EXIT_SCENE, EXIT_USAGE, EXIT_OUTPUT, EXIT_CHECKPOINT, EXIT_CLUSTER, EXIT_INTERRUPTED = 0, 1, 2, 3, 4, 5, 130
 
@@ -51,52 +54,103 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _run(options: argparse.Namespace, interrupt: Interrupt) -> int:
-    _check_output(options.output)
+    _check_outputs(options)
     try:
-        learned, different = again.follow(options.like, options) if options.like else ({}, None)
-        if different and not options.quiet:
-            print(f"mis-render: {different}; this image may differ", file=sys.stderr)
-        needs_views = "--all-views" if options.all_views else "--frames" if options.frames else None
-        opened = _request(options).open(needs_views)
-        session: Any = opened.session
-        if learned:
-            session.recall(learned)
-        loaded = opened.loaded
-        identity = opened.identity() if options.checkpoint else {}
-        keep_variance = bool(options.checkpoint or options.target_error)
-        if keep_variance:
-            session.keep_variance()
-        clock = _resume(options, identity, session) if options.checkpoint else Clock()
-        target = TargetError(options.target_error) if options.target_error else None
-        with contextlib.ExitStack() as stack:
+        with output.alone(options.output):
+            return _render_alone(options, interrupt)
+    except BlockingIOError as error:
+        raise Failure(EXIT_OUTPUT, f"cannot write {options.output}: {error.strerror}") from error
+    except MemoryError as error:
+        raise Failure(EXIT_SCENE, f"{OUT_OF_MEMORY}; render a smaller film, or fewer light paths an iteration") from error
+
+
+def _render_alone(options: argparse.Namespace, interrupt: Interrupt) -> int:
+    with contextlib.ExitStack() as stack:
+        try:
+            learned = _follow(options) if options.like else {}
+            needs_views = "--all-views" if options.all_views else "--frames" if options.frames else None
+            opened = _request(options).open(needs_views)
+            for description in getattr(traits, "unfinite_data", lambda _: [])(opened.loaded.scene):
+                _warn(f"{description}: values that are not finite (NaN or infinite); what they light or colour is left out of the image")
+            session: Any = opened.session
+            if learned:
+                _recall_image(session, learned, options)
+            identity = opened.identity() if options.checkpoint else {}
+            keep_variance = bool(options.checkpoint or options.target_error)
+            if keep_variance:
+                session.keep_variance()
+            clock = _resume(options, identity, session) if options.checkpoint else Clock()
+            target = TargetError(options.target_error) if options.target_error else None
             if options.workers or options.scheduler:
                 client = stack.enter_context(cluster.connected(options.workers, options.scheduler))
                 threads = max(1, dr.thread_count() // options.workers) if options.workers else None
                 session = cluster.DistributedSession(client, opened, keep_variance, threads)
-            kept = _render(session, opened.sensor, options, identity, clock, target, interrupt)
-    except loading.SCENE_ERRORS as error:
-        raise Failure(EXIT_SCENE, loading.one_line(error)) from error
-    except cluster.ClusterError as error:
-        raise Failure(EXIT_CLUSTER, str(error)) from error
+            kept, broken = _render(session, opened.sensor, options, identity, clock, target, interrupt)
+        except (*loading.SCENE_ERRORS, cluster.ClusterError) as error:
+            raise _failure(error) from error
 
-    metadata = _metadata(options, loaded, session, clock)
-    metadata[again.ATTRIBUTE] = again.note(options, session, opened.session.learned)
-    if target:
-        target.update(session)
-        metadata["relativeError"] = target.error
-    written = _write(options, session, metadata, options.output, kept)
-    for suffix in (".preview.exr", ".preview.png"):
-        options.output.with_suffix(suffix).unlink(missing_ok=True)
+        metadata = _metadata(options, opened.loaded, session, clock)
+        metadata[reproduce.ATTRIBUTE] = reproduce.attribute(options, session, opened.session.learned)
+        if pixels := session.unfinite_pixels():
+            metadata["unfinitePixels"] = pixels
+            _warn(f"{pixels} pixels had values that are not finite (NaN or infinite) in some iterations; those values are left out")
+        if target:
+            target.update(session)
+            metadata["relativeError"] = target.error
+            if target.black:
+                _warn("the image is black, so that its relative error says nothing: is there light, and does the camera look at it?")
+        # Before the workers are left, which may take long.
+        written = _write(options, session, metadata, options.output, kept)
+        for suffix in (".preview.exr", ".preview.png"):
+            options.output.with_suffix(suffix).unlink(missing_ok=True)
     report = (
         f"{metadata['spp']} samples per pixel in {clock.rendering:.1f} s (and {clock.compiling:.1f} s of "
         f"compiling){_about_error(target)}: {written}"
     )
+    if broken:
+        failure = _failure(broken)
+        raise Failure(failure.code, f"{failure}; what was rendered before is written, {report}") from broken
     if interrupt.requested:
         print(f"mis-render: interrupted after {report}", file=sys.stderr)
         return EXIT_INTERRUPTED
     if not options.quiet:
         print(report, file=sys.stderr)
     return EXIT_OK
+
+
+OUT_OF_MEMORY = "there is not enough memory"
+
+
+def _failure(error: BaseException) -> Failure:
+    """What to report of an error of the scene, of its rendering, or of the workers."""
+    if isinstance(error, cluster.ClusterError):
+        return Failure(EXIT_CLUSTER, str(error))
+    if isinstance(error, MemoryError):
+        return Failure(EXIT_SCENE, OUT_OF_MEMORY)
+    known = isinstance(error, loading.SCENE_ERRORS)
+    return Failure(EXIT_SCENE, loading.one_line(error) if known else f"{type(error).__name__}: {loading.one_line(error)}")
+
+
+def _warn(text: str) -> None:
+    """Say what the user must know, however quiet all else is to be."""
+    print(f"mis-render: {text}", file=sys.stderr)
+
+
+def _follow(options: argparse.Namespace) -> dict[str, Any]:
+    """Set the options to those of the image of ``--like``; returns what its session had learned."""
+    recipe = reproduce.read(options.like)
+    for name, value in recipe.options.items():
+        setattr(options, name, value)
+    if recipe.remark and not options.quiet:
+        print(f"mis-render: {options.like} {recipe.remark}", file=sys.stderr)
+    return recipe.learned
+
+
+def _recall_image(session: Session, learned: dict[str, Any], options: argparse.Namespace) -> None:
+    try:
+        session.recall(learned)
+    except Malformed as error:
+        raise Malformed(f"--like {options.like}: its header: {error}") from None
 
 
 def _request(options: argparse.Namespace) -> Request:
@@ -148,8 +202,9 @@ def _render(
     clock: Clock,
     target: TargetError | None,
     interrupt: Interrupt,
-) -> Path | None:
-    """Iterate as long as the options say; returns the checkpoint that holds all of it, if there is one."""
+) -> tuple[Path | None, Exception | None]:
+    """Iterate as long as the options say; returns the checkpoint that holds all of it, if there is one, and the error that ended it after there was
+    enough for an image, if one did."""
     width, height = sensor.film().crop_size()
     pixels = getattr(session, "pixels", width * height)
     if options.time and hasattr(session, "plan_time"):
@@ -169,11 +224,17 @@ def _render(
         keep = Chore(str(path), options.checkpoint or math.inf, lambda: _keep(path, identity, session, clock), progress.warn)
         preview = options.output.with_suffix(".preview.exr")
         show = Chore(str(preview), options.preview or math.inf, lambda: _preview(session, options, preview), progress.warn)
-        iterate(session, planned, options.time, target, clock, [keep, show], progress, interrupt)
+        broken = None
+        try:
+            iterate(session, planned, options.time, target, clock, [keep, show], progress, interrupt)
+        except Exception as error:
+            if session.iterations < fewest_iterations(session):
+                raise
+            broken = error
         if not options.checkpoint:
-            return None
+            return None, broken
         keep.now()
-        return None if keep.failure else path
+        return None if keep.failure else path, broken
 
 
 def _keep(path: Path, identity: dict[str, Any], session: Session, clock: Clock) -> None:
@@ -186,7 +247,7 @@ def _keep(path: Path, identity: dict[str, Any], session: Session, clock: Clock) 
 def _resume(options: argparse.Namespace, identity: dict[str, Any], session: Session) -> Clock:
     """Let the session go on from the checkpoint, if it shall and there is one."""
     path = checkpoint.beside(options.output)
-    if not path.exists():
+    if not os.path.lexists(path):
         return Clock()
     if not options.resume:
         raise Failure(EXIT_CHECKPOINT, f"{path} holds an earlier render: --resume goes on from it; remove it to start anew")
@@ -195,9 +256,14 @@ def _resume(options: argparse.Namespace, identity: dict[str, Any], session: Sess
         if what := checkpoint.difference(found.identity, identity):
             raise CheckpointError(f"{path} is of another render: {what}")
         session.recall(dict(found.learned))
+        shapes = {name: array.shape for name, array in found.arrays.items()}
+        if len(found.done) and shapes != session.sum_shapes():
+            raise CheckpointError(f"{path} is no checkpoint of this render: its sums have other names or shapes")
         session.sums.merge(found.arrays, found.done)
-    except (CheckpointError, OSError) as error:
-        raise Failure(EXIT_CHECKPOINT, f"cannot resume: {error}") from error
+    except Malformed as error:
+        raise Failure(EXIT_CHECKPOINT, f"cannot resume: {path} is no checkpoint of this render: {error}") from error
+    except (CheckpointError, OSError, MemoryError) as error:
+        raise Failure(EXIT_CHECKPOINT, f"cannot resume: {error or OUT_OF_MEMORY}") from error
     for written in (path, options.output, options.output.with_suffix(".png")):
         output.remove_leftovers(written)
     return Clock(found.seconds, found.compiling)
@@ -235,14 +301,17 @@ def _write(
         raise Failure(EXIT_OUTPUT, f"cannot write {writing}: {error.strerror or error}{rest}") from error
 
 
-def _check_output(path: Path) -> None:
-    for file in (path, path.with_suffix(".png")):
-        if file.is_dir():
-            raise Failure(EXIT_OUTPUT, f"cannot write {file}: it is a directory")
-    try:
-        output.make_writable(path.parent)
-    except OSError as error:
-        raise Failure(EXIT_OUTPUT, f"cannot write {path}: {error.strerror or error}") from error
+def _check_outputs(options: argparse.Namespace) -> None:
+    """Refuse, before anything is rendered, what cannot be written in the end."""
+    image = options.output
+    files = [image, image.with_suffix(".png")]
+    if options.preview:
+        files += [image.with_suffix(".preview.exr"), image.with_suffix(".preview.png")]
+    for file in files:
+        try:
+            output.make_writable(file)
+        except OSError as error:
+            raise Failure(EXIT_OUTPUT, f"cannot write {file}: {error.strerror or error}") from error
 
 
 if __name__ == "__main__":

@@ -1,7 +1,8 @@
-"""What a scene file consists of, by content: the file itself, those it includes, and every file that any of them names."""
+"""What an image is made of, by content: the scene's file, those it includes, every file that any of them names, and this package's own sources."""
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import html
 import os
@@ -32,6 +33,16 @@ def scene_digests(path: Path, variables: Mapping[str, str]) -> dict[str, str]:
                 named[name] = Path(file)
     named.update({_name(file, path): file for file in sources})
     return {name: _digest(file) for name, file in sorted(named.items())}
+
+
+@functools.cache
+def of_package() -> str:
+    """The first 12 digits of the SHA-256 of all source files of this package: two states of it may make two images."""
+    root = Path(__file__).parent
+    digest = hashlib.sha256()
+    for file in sorted(file for pattern in ("*.py", "*.json") for file in root.rglob(pattern)):
+        digest.update(f"{file.relative_to(root).as_posix()}\n{_digest(file)}\n".encode())
+    return digest.hexdigest()[:12]
 
 
 def changes(then: Mapping[str, str], now: Mapping[str, str]) -> list[str]:

@@ -8,7 +8,7 @@ from pathlib import Path
 import drjit as dr
 import mitsuba as mi
 
-from . import __version__, loading
+from . import __version__, fingerprint, loading
 
 LARGEST_SEED = 2**32 - 1
 MOST_SAMPLES = 2**31 - 1
@@ -98,8 +98,8 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
 
 
 def versions() -> str:
-    """The versions that an image depends on."""
-    return f"mis_integrators {__version__}, mitsuba {mi.__version__}, drjit {dr.__version__}"
+    """The versions that an image depends on; of this package a hash of its sources, too."""
+    return f"mis_integrators {__version__} ({fingerprint.of_package()}), mitsuba {mi.__version__}, drjit {dr.__version__}"
 
 
 def _assignment(text: str) -> tuple[str, str]:

@@ -11,9 +11,12 @@ import numpy as np
 
 from .sums import Sums
 from .turns import by_turns
+from .untrusted import Fields
 
 # Camera paths that one pass of a Mitsuba integrator traces: bounds its memory, and the wait after a Ctrl-C.
 PATHS_PER_PASS = 1 << 20
+# Samples that a sampler makes of those that it is asked for, at most: some only know squares or powers of two.
+ROUNDING = 4
 # Passes of a render that estimates its error or is spread over workers, at least.
 FEWEST_PASSES = 32
 
@@ -60,6 +63,12 @@ class Session(Protocol):
     def image(self) -> np.ndarray:
         """Mean over the iterations done: float32 of shape (H, W, C), radiance in the scene's units."""
 
+    def unfinite_pixels(self) -> int:
+        """How many pixels had values that are not finite in some iteration. Those values are left out of the sums."""
+
+    def sum_shapes(self) -> dict[str, tuple[int, ...]]:
+        """The shapes that the sums will have after an iteration, by name."""
+
     def keep_variance(self) -> None:
         """From the first iteration on, keep what ``estimate`` needs."""
 
@@ -73,7 +82,8 @@ class Session(Protocol):
         """Find out what must be known before the first iteration, unless it is known: pilots, caches."""
 
     def recall(self, learned: dict[str, Any]) -> None:
-        """Take over what another session of the same render has ``learned``; before the first iteration."""
+        """Take over what another session of the same render has ``learned``; before the first iteration. It may come from a file that anyone wrote:
+        raises ``untrusted.Malformed`` if it is not what such a session can have learned."""
 
 
 def make_session(
@@ -100,7 +110,7 @@ class MitsubaSession:
     ):
         self._integrator, self._scene, self._sensor, self._seed, self._spp = integrator, scene, sensor, seed, spp
         width, height = sensor.film().crop_size()
-        largest = max(1, PATHS_PER_PASS // (width * height))
+        largest = self._largest = max(1, PATHS_PER_PASS // (width * height))
         if fine:
             largest = min(largest, max(1, spp // FEWEST_PASSES) if spp else 16)
         passes = math.ceil(spp / largest)
@@ -129,7 +139,9 @@ class MitsubaSession:
         return {"samples_per_iteration": self.samples_per_iteration}
 
     def recall(self, learned: dict[str, Any]) -> None:
-        self._set_samples(learned["samples_per_iteration"])
+        fields = Fields(learned, "learned")
+        self._set_samples(fields.integer("samples_per_iteration", 1, ROUNDING * self._largest))
+        fields.finish()
 
     def start(self) -> None:
         pass
@@ -146,21 +158,37 @@ class MitsubaSession:
         image = np.array(self._sensor.film().bitmap(), np.float64).reshape(self._shape)
         # Else the sampler's unused final state waits, and the next recorded pass would trace these paths again to evaluate it.
         self._sensor.sampler().seed(0, 1)
-        self.sums.add("total", image)
-        if self._keeps_variance:
-            self.sums.add("square", np.square(image[..., self._colours]))
-        self.sums.done.add(iteration)
+        finite = np.isfinite(image).all(axis=2, keepdims=True)
+        image = np.where(finite, image, 0.0)
+        with self.sums.all_or_nothing():
+            self.sums.add("total", image)
+            self.sums.add("left_out", ~finite)
+            if self._keeps_variance:
+                self.sums.add("square", np.square(image[..., self._colours]))
+            self.sums.done.add(iteration)
+
+    def _counts(self) -> np.ndarray:
+        """How many iterations each pixel is the mean of, shape (H, W, 1)."""
+        return self.iterations - self.sums["left_out"]
+
+    def unfinite_pixels(self) -> int:
+        return int(np.count_nonzero(self.sums["left_out"]))
+
+    def sum_shapes(self) -> dict[str, tuple[int, ...]]:
+        height, width, _ = self._shape
+        square = {"square": (height, width, len(self._colours))} if self._keeps_variance else {}
+        return {"total": self._shape, "left_out": (height, width, 1), **square}
 
     def image(self) -> np.ndarray:
-        return (self.sums["total"] / self.iterations).astype(np.float32)
+        return (self.sums["total"] / np.maximum(self._counts(), 1)).astype(np.float32)
 
     def keep_variance(self) -> None:
         self._keeps_variance = True
 
     def estimate(self) -> tuple[np.ndarray, np.ndarray]:
-        n = self.iterations
-        mean = self.sums["total"][..., self._colours] / n
-        return mean, np.maximum(self.sums["square"] / n - np.square(mean), 0) / (n - 1)
+        n = self._counts()
+        mean = self.sums["total"][..., self._colours] / np.maximum(n, 1)
+        return mean, np.maximum(self.sums["square"] / np.maximum(n, 1) - np.square(mean), 0) / np.maximum(n - 1, 1)
 
 
 def _colour_channels(channels: list[str]) -> list[int]:

@@ -1,10 +1,10 @@
 """When a render is good enough: its relative error, estimated from the differences between its own iterations.
 
-With m_p the mean of pixel p over the iterations, v_p the estimated variance of that mean, and m the mean over all pixels and channels,
+With m_p the mean of pixel p over the iterations, v_p the estimated variance of that mean, and m the mean brightness of the picture,
 
     E^2 = mean over pixels and channels of  v_p / (m_p^2 + (0.1 m)^2)
 
-without the worst 0.1 % of the pixels. So E is about the noise of a pixel over its brightness; pixels much darker than the picture count less.
+without the worst 0.1 % of the pixels; m is the mean without the brightest 0.1 %. So E is about the noise of a pixel over its brightness; pixels much darker than the picture count less.
 The scale of the scene's light cancels. What E does not see is what all iterations have in common: the blur of a merge radius, and light so rare that
 no iteration has found it yet. The pixels left out are for single bright dots, whose variance a few iterations do not tell.
 """
@@ -29,11 +29,17 @@ LARGEST_STEP = 1.25
 
 def relative_error(mean: np.ndarray, variance: np.ndarray) -> float:
     """The relative error E above of a picture with the given `mean` and variance of the mean, both of shape (H, W, C). Zero where all is black."""
-    level = DARK * float(np.abs(mean).mean())
+    brightness = np.abs(mean)
+    level = DARK * (_mean_without_largest(brightness) or float(brightness.mean()))
     if not level:
         return 0.0
-    errors = np.sort((variance / (np.square(mean) + level**2)).mean(axis=-1), axis=None)
-    return math.sqrt(errors[: max(1, round(errors.size * (1 - LEFT_OUT)))].mean())
+    return math.sqrt(_mean_without_largest(variance / (np.square(mean) + level**2)))
+
+
+def _mean_without_largest(values: np.ndarray) -> float:
+    """Mean over the channels, then over the pixels without the share ``LEFT_OUT`` of the largest."""
+    pixels = np.sort(values.mean(axis=-1), axis=None)
+    return float(pixels[: max(1, round(pixels.size * (1 - LEFT_OUT)))].mean())
 
 
 class TargetError:
@@ -43,6 +49,8 @@ class TargetError:
         self.target = target
         self.error = math.inf
         """The last estimate."""
+        self.black = False
+        """Whether nothing but black was there to estimate."""
         self._next = FEWEST_ITERATIONS
 
     def reached(self, session: Session) -> bool:
@@ -62,4 +70,5 @@ class TargetError:
     def update(self, session: Session) -> None:
         """Estimate the error of what is there, if there are two iterations."""
         if session.iterations > 1:
-            self.error = relative_error(*session.estimate())
+            mean, variance = session.estimate()
+            self.error, self.black = relative_error(mean, variance), not mean.any()

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any, Callable, Mapping
+import contextlib
+from typing import Any, Callable, Iterator, Mapping
 
 import numpy as np
 
@@ -43,6 +44,10 @@ class Iterations:
             self.beyond.remove(self.below)
             self.below += 1
 
+    def copy(self) -> "Iterations":
+        """The same set, which changes by itself."""
+        return Iterations(self.below, tuple(self.beyond))
+
     def update(self, other: "Iterations") -> None:
         """Add all numbers of a disjoint set."""
         if not len(self):
@@ -74,6 +79,16 @@ class Sums:
         """Add to the sum of that name."""
         value = self._tensor(value)
         self.tensors[name] = self.tensors[name] + value if name in self.tensors else value
+
+    @contextlib.contextmanager
+    def all_or_nothing(self) -> Iterator[None]:
+        """Where the block ends with an error, the sums are what they were before it."""
+        tensors, done = dict(self.tensors), self.done.copy()
+        try:
+            yield
+        except BaseException:
+            self.tensors, self.done = tensors, done
+            raise
 
     def arrays(self) -> dict[str, np.ndarray]:
         """The sums as float64 arrays."""

@@ -73,6 +73,9 @@ class FakeSession:
     def image(self):
         return np.full((8, 12, 4), (self.iterations + 1) / 2, np.float32)
 
+    def unfinite_pixels(self):
+        return 0
+
 
 @pytest.fixture
 def use(monkeypatch):

@@ -17,6 +17,7 @@ from ..transport.packing import rounded_up
 from ..transport.photon_map import PhotonMap, build_photon_map, smallest_cell
 from ..transport.recording import recorder
 from ..transport.traits import SceneTraits, lookup
+from ..untrusted import Fields
 from .common import MOST_LIGHT_PATHS, IterativeIntegrator, IterativeSession
 from .pilot import choose_radii
 from .schedule import read_radius, shrunk
@@ -122,7 +123,7 @@ class BDPMSession(IterativeSession):
         super().__init__(integrator, scene, sensor, seed, iterations)
         self.traits, self.lights = integrator.survey or (SceneTraits(scene), Lights.seen_by(scene, sensor, integrator.plugin))
         self.split_paths(CAMERA_CHUNK)
-        self.light_paths = integrator.photon_count or film_sample_count(sensor)
+        self.light_paths = integrator.photon_count or min(film_sample_count(sensor), MOST_LIGHT_PATHS)
         depth = integrator.max_depth
         unreachable = self.lights.needs_photons_for_direct_light()
         self.has_caustics = not self.lights.dark and ((unreachable and (depth < 0 or depth >= 2)) or
@@ -282,9 +283,15 @@ class BDPMSession(IterativeSession):
                 "camera_paths": self.samples_per_iteration}
 
     def recall(self, learned):
-        if learned:
-            self.radii, self.corrected = dict(learned["radii"]), dict(learned["corrected"])
-            self.send(learned["camera_paths"])
+        if not learned:
+            return
+        fields = Fields(learned, "learned")
+        radii, corrected = fields.object("radii"), fields.object("corrected")
+        self.radii = {kind: radii.number(kind) for kind in self.kinds()}
+        self.corrected = {kind: corrected.boolean(kind) for kind in self.kinds()}
+        self.send(fields.integer("camera_paths", 1, self.most_camera_paths()))
+        for each in (radii, corrected, fields):
+            each.finish()
 
     def _iteration(self, iteration):
         self.start()

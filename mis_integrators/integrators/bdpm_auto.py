@@ -5,9 +5,10 @@ from __future__ import annotations
 import mitsuba as mi
 
 from ..transport.traits import check_scene, has_media
+from ..untrusted import Fields
 from ..volume.traits import check_volume_scene
 from .bdpm import BDPM
-from .choice import Decision, choose, handed_on, new_session
+from .choice import CANDIDATES, Decision, choose, handed_on, new_session
 from .common import IterativeIntegrator, IterativeSession
 
 
@@ -99,12 +100,19 @@ class AutoSession(IterativeSession):
                 "session": decision.session.learned}
 
     def recall(self, learned):
-        if learned:
-            session = new_session(learned["plugin"], learned["parameters"], self.integrator, self.scene, self.sensor, self.seed,
-                                  self.iterations_planned)
-            session.recall(learned["session"])
-            self.iterations_planned = session.iterations_planned
-            self._take(Decision(learned["plugin"], learned["parameters"], session, learned["reasons"], learned["errors"]))
+        if not learned:
+            return
+        fields = Fields(learned, "learned")
+        plugin = fields.choice("plugin", [name for name, _ in CANDIDATES])
+        parameters = fields.choice("parameters", [given for name, given in CANDIDATES if name == plugin])
+        expected = fields.object("errors")
+        errors = {name: expected.number(name, positive=False) for name in expected.names()}
+        reasons, inner = fields.texts("reasons"), fields.any("session")
+        fields.finish()
+        session = new_session(plugin, parameters, self.integrator, self.scene, self.sensor, self.seed, self.iterations_planned)
+        session.recall(inner)
+        self.iterations_planned = session.iterations_planned
+        self._take(Decision(plugin, parameters, session, reasons, errors))
 
     def _iteration(self, iteration):
         self.start()

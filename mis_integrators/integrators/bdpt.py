@@ -18,7 +18,7 @@ from ..transport.recording import lanes, recorder
 from ..transport.spectra import channel_mean
 from ..transport.subpaths import read_vertices, trace_camera_subpaths, trace_light_subpaths
 from ..transport.traits import SceneTraits
-from .common import IterativeIntegrator, IterativeSession
+from .common import MOST_LIGHT_PATHS, IterativeIntegrator, IterativeSession
 from .connection_weights import ConnectionWeights
 from .pyramid import Ledger, camera_images, sensor_images, technique_channels, with_rest
 
@@ -128,6 +128,8 @@ class BDPTSession(IterativeSession):
         self.pixel_paths = width * height * integrator.camera_paths
         self.capacity = {"light": rounded_up(3 * self.light_chunk), "camera": rounded_up(3 * self.chunk), "pairs": rounded_up(4 * self.chunk)}
         self.lens = Lens(sensor).connects
+        if integrator.techniques:
+            self.accumulator.technique_channels = len(technique_channels(integrator.techniques, integrator.technique_weights))
         depth = integrator.max_depth
         self.bidirectional = not self.lights.dark and (depth < 0 or depth >= 2)
         self.expected_weight = expected_weight(sensor.film(), integrator.camera_paths)
@@ -140,7 +142,7 @@ class BDPTSession(IterativeSession):
 
     def light_count(self):
         """Light sub-paths with each part of the camera paths."""
-        return self.chunk
+        return min(self.chunk, MOST_LIGHT_PATHS)
 
     def weights(self, spectral):
         """The weights of an iteration."""
@@ -249,7 +251,7 @@ class BDPTSession(IterativeSession):
         """Radiance of camera paths with that of merges added (none here)."""
         return radiance
 
-    def _iteration(self, iteration):
+    def _run(self, iteration):
         spectral = self._spectral(iteration)
         block, techniques, light = self.sum_of_chunks(partial(self._chunk, iteration, spectral))
         if light is not None:
@@ -258,12 +260,7 @@ class BDPTSession(IterativeSession):
             techniques = None if techniques is None else techniques + light[:, :, 3:]
         if techniques is not None:
             techniques = with_rest(techniques, block) if self.integrator.technique_weights else techniques
-            self.sums.add("techniques", techniques)
-            dr.eval(self.sums.tensors)
-        return block
-
-    def fill_film(self):
-        self.accumulator.put(self._emptied(self.sensor.film()), self.integrator.variance, self.sums.tensors.get("techniques"))
+        self.accumulator.add(block, iteration, techniques)
 
 
 LIGHT, CAMERA, APERTURE, THIN = 0, 1, 3, 4

@@ -23,6 +23,7 @@ from .unidirectional import PathSession
 
 PHOTON_MAPPERS = FIRST, OPT2, LATER, OPT3 = ("bdpm", {"bdd": 0}), ("bdpm_opt2", {}), ("bdpm", {"bdd": 1}), ("bdpm_opt3", {})
 """The first is tried in any case."""
+CANDIDATES = ("path", {}), *PHOTON_MAPPERS
 PILOT_SHARE = 0.05
 """Share of the planned time that the pilot may have; `path` and the first photon mapper are tried however long that takes."""
 KEEPS_UP = 4

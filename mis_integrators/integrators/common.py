@@ -13,8 +13,9 @@ from ..transport.film import Accumulator, shared_wavelengths, variance_channels
 from ..transport.packing import rounded_up
 from ..transport.random import mix
 from ..transport.recording import settle
-from ..transport.traits import UnsupportedScene, check_scene, check_variant
+from ..transport.traits import UnsupportedScene, check_film, check_scene, check_variant
 from ..turns import TURN, by_turns
+from ..untrusted import Fields
 from .parameters import Parameters
 
 
@@ -76,16 +77,17 @@ class IterativeIntegrator(mi.AdjointIntegrator):
     def session(self, scene, sensor=0, seed=0, spp=0):
         """Prepares a rendering of `scene` with `spp` camera paths a pixel, or without a planned end if `spp` is 0."""
         sensor = self._sensor(scene, sensor)
+        check_film(sensor, self.plugin)
         self.check(scene, sensor)
         self.check_path_number([sensor])
         return self.new_session(scene, sensor, scalar_seed(seed), self.planned_iterations(spp, self.fewest_camera_paths))
 
     def check_path_number(self, sensors):
         """Raises `ValueError` where an iteration would have more camera paths than can be numbered."""
-        pixels = sum(math.prod(sensor.film().size()) for sensor in sensors)
-        if self.camera_paths * pixels > MOST_PATHS:
+        pixels = sum(film_sample_count(sensor) for sensor in sensors)
+        if self.fewest_camera_paths * pixels > MOST_PATHS:
             raise ValueError(f'{self.plugin}: parameter "camera_paths" = {self.camera_paths} makes more than {MOST_PATHS} paths an iteration on '
-                             f"films of {pixels} pixels; ask for more samples per pixel (spp), and so more iterations, instead")
+                             f"{pixels} pixels; ask for more samples per pixel (spp), and so more iterations, instead, or crop the film")
 
     def planned_iterations(self, spp, camera_paths):
         """Iterations of `camera_paths` that make `spp` camera paths a pixel; None (no planned end) if `spp` is 0."""
@@ -103,6 +105,11 @@ class IterativeIntegrator(mi.AdjointIntegrator):
         if iterations * camera_paths != spp:
             mi.Log(mi.LogLevel.Warn, f"{self.plugin}: {spp} samples per pixel rounded up to {iterations} iterations of "
                                      f"camera_paths = {camera_paths}")
+
+    def say_unfinite(self, session):
+        """Warns where values of a session that are not finite were left out."""
+        if pixels := session.unfinite_pixels():
+            mi.Log(mi.LogLevel.Warn, f"{self.plugin}: {pixels} pixels had values that are not finite, which are left out")
 
     def _sensor(self, scene, sensor):
         check_variant(scene, self.plugin)
@@ -122,6 +129,7 @@ class IterativeIntegrator(mi.AdjointIntegrator):
             for _ in range(session.iterations_planned):
                 session.iterate()
             with TURN:
+                self.say_unfinite(session)
                 session.fill_film()
                 if not develop:
                     return mi.TensorXf()
@@ -148,7 +156,7 @@ class IterativeSession:
         self.integrator, self.scene, self.sensor, self.seed = integrator, scene, sensor, seed
         self.iterations_planned = iterations
         self.samples_per_iteration = integrator.fewest_camera_paths
-        self.accumulator = Accumulator(integrator.variance)
+        self.accumulator = Accumulator(sensor.film(), integrator.variance)
         self.variant = mi.variant()
         settle(scene)
 
@@ -173,7 +181,15 @@ class IterativeSession:
 
     def estimate(self):
         """Mean colour so far and its estimated variance: float64, (height, width, 3) each. Needs two iterations at least, and `keep_variance`."""
-        return self.accumulator.estimate(self.sensor.film())
+        return self.accumulator.estimate()
+
+    def unfinite_pixels(self):
+        """How many pixels had values that are not finite in some iteration; those values are left out."""
+        return self.accumulator.unfinite_pixels()
+
+    def sum_shapes(self):
+        """The shapes that the sums will have after an iteration, by name."""
+        return self.accumulator.shapes()
 
     def start(self):
         """Finds out what must be known before the first iteration, unless it is known: pilots, caches."""
@@ -184,7 +200,12 @@ class IterativeSession:
         return {}
 
     def recall(self, learned):
-        """Takes over what another session of the same render has `learned`; before the first iteration."""
+        """Takes over what another session of the same render has `learned`; before the first iteration. Raises `Malformed` if it cannot be that."""
+        Fields(learned, "learned").finish()
+
+    def most_camera_paths(self):
+        """Camera paths a pixel that an iteration can have."""
+        return max(1, MOST_PATHS // film_sample_count(self.sensor))
 
     def resize(self, camera_paths):
         """Makes iterations of another number of camera paths a pixel; about as many samples as before are planned."""
@@ -203,7 +224,7 @@ class IterativeSession:
         if mi.variant() != self.variant:
             raise RuntimeError(f"{self.integrator.plugin}: this render was begun under the variant {self.variant}, but the active one is now "
                                f"{mi.variant()}")
-        with dr.suspend_grad():
+        with dr.suspend_grad(), self.sums.all_or_nothing():
             self._run(self.sums.done.first_missing if iteration is None else iteration)
             dr.eval(self.sums.tensors)
             dr.sync_thread()

@@ -22,6 +22,7 @@ from ..transport.recording import lanes, recorder
 from ..transport.spectra import channel_mean
 from ..transport.subpaths import junction_of, read_vertices, seen_normal, trace_light_subpaths
 from ..transport.traits import SceneTraits
+from ..untrusted import Fields
 from .common import IterativeIntegrator, IterativeSession
 from .light_tracing import LEAST, MOST, best_ratio, observed_noise, path_costs
 from .resampled_weights import LENGTHS, ResampledWeights, around, doubt, guessed_weight, ignorant, tabulate
@@ -107,7 +108,10 @@ class ResampledSession(IterativeSession):
         return {} if self.light_tracing is None else {"light_tracing": self.light_tracing}
 
     def recall(self, learned):
-        self.light_tracing = learned.get("light_tracing", self.light_tracing)
+        if learned:
+            fields = Fields(learned, "learned")
+            self.light_tracing = fields.number("light_tracing", MOST)
+            fields.finish()
 
     def _wanted_light(self, iteration):
         """Light sub-paths for each camera path of an iteration, and vertices of each that there shall be room for. Of the first one nothing is known."""

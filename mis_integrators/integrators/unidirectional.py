@@ -7,6 +7,7 @@ import mitsuba as mi
 
 from ..transport.camera_pass import film_sample_count, start_camera_paths
 from ..transport.film import splat_samples
+from ..untrusted import Fields
 from .common import IterativeSession
 
 BUSY = 1 << 19
@@ -41,7 +42,9 @@ class PathSession(IterativeSession):
         return {"camera_paths": self.samples_per_iteration}
 
     def recall(self, learned):
-        self.resize(learned["camera_paths"])
+        fields = Fields(learned, "learned")
+        self.resize(fields.integer("camera_paths", 1, self.most_camera_paths()))
+        fields.finish()
         self.split_paths(CHUNK)
 
     def trace(self, iteration, chunk, first, stride, paths, spectral, variation=0):

@@ -11,6 +11,7 @@ from ..transport.packing import to_numpy
 from ..transport.photon_map import smallest_cell
 from ..transport.recording import lanes
 from ..transport.subpaths import read_vertices
+from ..untrusted import Fields
 from .bdpt import BDPT, BDPTSession
 from .common import MOST_LIGHT_PATHS
 from .connection_weights import ConnectionWeights
@@ -98,7 +99,7 @@ class VCMSession(BDPTSession):
         return {**super().settings, "photon_count": self.light_paths, **radius}
 
     def light_count(self):
-        return -(-self.integrator.photon_count // self.chunks) or self.chunk
+        return -(-self.integrator.photon_count // self.chunks) or super().light_count()
 
     def radius_at(self, iteration):
         """The merge radius."""
@@ -119,7 +120,10 @@ class VCMSession(BDPTSession):
         return {} if self.radius is None else {"radius": self.radius}
 
     def recall(self, learned):
-        self.radius = learned.get("radius", self.radius)
+        if learned:
+            fields = Fields(learned, "learned")
+            self.radius = fields.number("radius")
+            fields.finish()
 
     def _choose_radius(self, spectral):
         """A share of the spread of the vertices that camera paths meet first: the diagonal, over the root of three, of the box that leaves out 2 % of

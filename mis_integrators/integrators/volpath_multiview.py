@@ -12,7 +12,7 @@ from ..transport.film import colour_channels, colour_matrix
 from ..transport.lights import Lights
 from ..transport.random import mix, streams
 from ..transport.recording import recorder
-from ..transport.traits import UnsupportedScene, check_variant
+from ..transport.traits import UnsupportedScene, check_film, check_variant
 from ..turns import by_turns
 from ..volume.films import OWN, SHARED, ViewAccumulator, own_values, splat, write_film
 from ..volume.lines import common_nulls, connect, follow_nulls, sight
@@ -121,6 +121,7 @@ class VolpathMultiview(IterativeIntegrator):
     def _session(self, scene, sensors, seed, spp):
         check_volume_scene(scene, self.plugin)
         for sensor in sensors:
+            check_film(sensor, self.plugin)
             Views.check_sensor(sensor, self.plugin)
         self.check_path_number(sensors)
         camera_paths = self.camera_paths or self._automatic(sensors, spp)
@@ -345,4 +346,5 @@ def render_views(scene, integrator=None, spp=0, seed=0):
         integrator.say_rounded(session, spp)
         for _ in range(session.iterations_planned):
             session.iterate()
+        integrator.say_unfinite(session)
         return session.view_tensors()

@@ -102,14 +102,23 @@ def spread(sums, mean):
     return sums["square"] - 2 * mean * sums["cross"] + mean * mean * sums["weight_square"]
 
 
+def finite_pixels(block):
+    """Which pixels of a block tensor have values that are all finite: a mask of shape (height, width, 1)."""
+    finite = dr.isfinite(block[:, :, :1])
+    for channel in range(1, block.shape[2]):
+        finite &= dr.isfinite(block[:, :, channel:channel + 1])
+    return finite
+
+
 class Accumulator:
     """Sums of the iterations' blocks and, for the variance, of their squares. Its size does not grow with iterations.
 
-    The sums are `total`; with the variance `square` (colour squared), `cross` (colour times weight), `weight_square`.
+    The sums are `total`; `left_out`, how many iterations had a value at the pixel that is not finite and are left out there, weight and all; with the variance
+    `square` (colour squared), `cross` (colour times weight), `weight_square`; `techniques` if there are such images.
     """
 
-    def __init__(self, with_variance):
-        self.with_variance = with_variance
+    def __init__(self, film, with_variance, technique_channels=0):
+        self.film, self.with_variance, self.technique_channels = film, with_variance, technique_channels
         self.sums = Sums(mi.TensorXd)
 
     @property
@@ -117,9 +126,27 @@ class Accumulator:
         """Iterations summed."""
         return len(self.sums.done)
 
-    def add(self, block, iteration):
-        """Adds the block tensor of an iteration."""
+    def shapes(self):
+        """The shapes that the sums will have after an iteration, by name."""
+        border = 2 * self.film.rfilter().border_size()
+        width, height = self.film.crop_size()
+        size = height + border, width + border
+        channels = {"total": 5 if mi.has_flag(self.film.flags(), mi.FilmFlags.Alpha) else 4, "left_out": 1}
+        if self.with_variance:
+            channels |= {"square": 3, "cross": 3, "weight_square": 1}
+        if self.technique_channels:
+            channels["techniques"] = self.technique_channels
+        return {name: (*size, count) for name, count in channels.items()}
+
+    def add(self, block, iteration, techniques=None):
+        """Adds the block tensor of an iteration, and that of its techniques' images."""
+        finite = finite_pixels(block)
+        if techniques is not None:
+            finite &= finite_pixels(techniques)
+            self.sums.add("techniques", dr.select(finite, techniques, 0))
+        block = dr.select(finite, block, 0)
         self.sums.add("total", block)
+        self.sums.add("left_out", dr.select(finite, mi.Float(0), mi.Float(1)))
         if self.with_variance:
             add_squares(self.sums, block[:, :, :3], block[:, :, -1:])
         self.sums.done.add(iteration)
@@ -139,21 +166,28 @@ class Accumulator:
         mean, weight = self.mean()
         return dr.maximum(spread(self.sums, mean), 0) * (n / ((n - 1) * weight * weight))
 
-    def estimate(self, film):
+    def estimate(self):
         """Mean colour and its estimated variance, float64 (height, width, 3) each, without the block's border."""
-        border = film.rfilter().border_size()
-        inside = slice(border, -border) if border else slice(None)
-        return tuple(np.array(tensor)[inside, inside] for tensor in (self.mean()[0], self.variance_of_mean()))
+        return tuple(self._inside(tensor) for tensor in (self.mean()[0], self.variance_of_mean()))
 
-    def put(self, film, variance, extra=None):
-        """Writes the accumulated image into a film prepared with matching AOVs: with channels of the `variance` or not. `extra`: a tensor of more
-        channels, summed with the same weights."""
+    def unfinite_pixels(self):
+        """How many pixels of the film had values that are not finite in some iteration."""
+        return int(np.count_nonzero(self._inside(self.sums["left_out"])))
+
+    def _inside(self, tensor):
+        """A tensor as an array, without the block's border."""
+        border = self.film.rfilter().border_size()
+        inside = slice(border, -border) if border else slice(None)
+        return np.array(tensor)[inside, inside]
+
+    def put(self, film, variance):
+        """Writes the accumulated image into a film prepared with matching AOVs: with channels of the `variance` or not, then those of the techniques."""
         tensor = self.sums["total"]
         if variance:
             channels = self.variance_of_mean() * tensor[:, :, -1:]
             tensor = dr.concat([tensor, channels[:, :, :1] if mi.is_monochromatic else channels], axis=2)
-        if extra is not None:
-            tensor = dr.concat([tensor, extra], axis=2)
+        if self.technique_channels:
+            tensor = dr.concat([tensor, self.sums["techniques"]], axis=2)
         film.put_block(mi.ImageBlock(mi.TensorXf(tensor), film.crop_offset(), film.rfilter(), border=True))
 
 

@@ -13,7 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..sums import Sums
-from ..transport.film import add_squares, colour_channels, spread
+from ..transport.film import add_squares, colour_channels, finite_pixels, spread
 
 SHARED = 4
 """Channels of what all paths bring: colour, weight."""
@@ -60,7 +60,8 @@ def _line_weights(rfilter, size, border, steps=512):
 
 
 class ViewAccumulator:
-    """Sums of the iterations' common images and, for the variance, of their squares. Its size does not grow with iterations.
+    """Sums of the iterations' common images and, for the variance, of their squares. Its size does not grow with iterations. A pixel lacks
+    the iterations in which a value of it is not finite; `left_out0` and `left_out1` count the even and the odd ones of those.
 
     `ratio`: pictures are Y/D (MWIS).
     """
@@ -82,15 +83,36 @@ class ViewAccumulator:
 
     def add(self, shared, own, iteration):
         """Adds the layers of an iteration, tensors (height, width, `SHARED`) and (height, width, `OWN`)."""
-        self.sums.add("own", own)
-        same, other = (f"shared{(iteration + step) % 2}" for step in range(2))
-        self.sums.add(same, shared)
-        if other not in self.sums.tensors:
-            self.sums.add(other, dr.zeros(mi.TensorXd, shared.shape))
+        finite = finite_pixels(shared) & finite_pixels(own)
+        shared = dr.select(finite, shared, 0)
+        self.sums.add("own", dr.select(finite, own, 0))
+        same, other = ((iteration + step) % 2 for step in range(2))
+        for name, value in (("shared", shared), ("left_out", dr.select(finite, mi.Float(0), mi.Float(1)))):
+            self.sums.add(f"{name}{same}", value)
+            if f"{name}{other}" not in self.sums.tensors:
+                self.sums.add(f"{name}{other}", dr.zeros(mi.TensorXd, value.shape))
         if self.with_variance:
             add_squares(self.sums, shared[:, :, :3], shared[:, :, 3:])
         self.sums.done.add(iteration)
         dr.schedule(self.sums.tensors)
+
+    def shapes(self):
+        """The shapes that the sums will have after an iteration, by name."""
+        width, height = self.views.atlas_size
+        channels = {"own": OWN, **{f"{name}{parity}": count for name, count in (("shared", SHARED), ("left_out", 1)) for parity in range(2)}}
+        if self.with_variance:
+            channels |= {"square": 3, "cross": 3, "weight_square": 1}
+        return {name: (height, width, count) for name, count in channels.items()}
+
+    def unfinite_pixels(self):
+        """How many pixels of all views had values that are not finite in some iteration."""
+        left_out = np.array(self.sums["left_out0"] + self.sums["left_out1"])
+        return sum(int(np.count_nonzero(window)) for window in self._windows(left_out))
+
+    def _counts(self):
+        """How many iterations each pixel has, even ones and odd ones."""
+        evens = self.sums.done.even()
+        return evens - self.sums["left_out0"], self.iterations - evens - self.sums["left_out1"]
 
     def _mean(self, shared):
         """Y/D, zero where nothing arrived."""
@@ -99,14 +121,13 @@ class ViewAccumulator:
 
     def _colour(self):
         even, odd = self.shared
-        n = self.iterations
         if self.ratio:
             return self._mean(even + odd)
         total = even[:, :, :3] + odd[:, :, :3]
-        evens = self.sums.done.even()
-        for mine, other, count in ((even, odd, evens), (odd, even, n - evens)):
+        evens, odds = self._counts()
+        for mine, other, count in ((even, odd, evens), (odd, even, odds)):
             total += self._mean(other) * (self.expected * count - mine[:, :, 3:])
-        return total / (self.expected * n)
+        return total / (self.expected * dr.maximum(evens + odds, 1))
 
     def picture(self):
         """The common image so far (height, width, 5): colour, alpha, 1."""
@@ -118,7 +139,7 @@ class ViewAccumulator:
     def variance(self):
         """Estimated variance of each pixel's mean (height, width, 3) from the iterations: that of Y - m D over W, or over the mean of D (delta
         method). The noise of emitters seen directly, if any, is not in it."""
-        n, total = self.iterations, self.sums["shared0"] + self.sums["shared1"]
+        n, total = dr.maximum(sum(self._counts()), 2), self.sums["shared0"] + self.sums["shared1"]
         mean = self._mean(total)
         rest = total[:, :, :3] - mean * total[:, :, 3:]
         divisor = total[:, :, 3:] / n if self.ratio else self.expected
