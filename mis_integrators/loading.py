@@ -1,13 +1,20 @@
-"""Load a Mitsuba scene, its integrator replaced (the old one is never built) or its parameters set."""
+"""Load a Mitsuba scene, its integrator replaced (the old one is never built) or its parameters set.
+
+The scene may be a stranger's: no library is loaded but those of Mitsuba itself.
+"""
 
 from __future__ import annotations
 
+import os
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Mapping
+from typing import Any, Iterable, Mapping
 
 import mitsuba as mi
+
+from ._plugins import PLUGINS
+from .transport.traits import check_film
 
 Value = int | float | bool | str
 
@@ -16,6 +23,12 @@ INHERITED = ("max_depth", "rr_depth", "hide_emitters")
 
 # What Mitsuba and the integrators raise for a scene or a parameter that is wrong.
 SCENE_ERRORS = (RuntimeError, ValueError, ImportError)
+
+MITSUBA = Path(mi.__file__).parent
+"""The folder in which Mitsuba finds its own plugins."""
+
+LARGEST_INTEGER = 2**63 - 1
+"""Integers beyond this are none to Mitsuba."""
 
 
 @dataclass
@@ -41,6 +54,8 @@ def load(
     state = mi.parser.parse_file(config, str(path), **variables)
     if state.root.type != mi.ObjectType.Scene:
         raise RuntimeError(f'"{path}" is not a scene')
+    mi.file_resolver().prepend(str(path.parent))
+    _keep_out_foreign_libraries([node.props.plugin_name() for node in state.nodes] + ([plugin] if plugin else []))
     mi.parser.transform_all(config, state)
     node = _integrator_node(state) or _add_integrator(state)
     if plugin:
@@ -55,20 +70,23 @@ def load(
         node.props[name] = value
     name, given = node.props.plugin_name(), _plain(node.props)
 
-    mi.file_resolver().prepend(str(path.parent))
     scene = mi.parser.instantiate(config, state)
+    for sensor in scene.sensors():
+        check_film(sensor, name)
     return LoadedScene(scene, scene.integrator(), name, given)
 
 
 def parse_value(text: str) -> Value:
-    """The value that a text means: an integer, a float, a boolean (``true``, ``false``), else the text."""
+    """The value that a text means: an integer (up to ``LARGEST_INTEGER``), a float, a boolean (``true``, ``false``), else the text."""
     if text.lower() in ("true", "false"):
         return text.lower() == "true"
     for kind in (int, float):
         try:
-            return kind(text)
+            value = kind(text)
         except ValueError:
-            pass
+            continue
+        if kind is float or abs(value) <= LARGEST_INTEGER:
+            return value
     return text
 
 
@@ -85,6 +103,46 @@ def one_line(error: BaseException) -> str:
         )
         text = place + re.sub(r"^[\w.]+: ", "", rest[frames_end:])
     return " ".join(text.split()) or type(error).__name__
+
+
+def _keep_out_foreign_libraries(names: list[str]) -> None:
+    """See to it that plugins come from Mitsuba's own folder, whatever lies beside the scene or in the current folder.
+
+    Mitsuba loads a plugin from the first folder of its file resolver that has ``plugins`` with a library of that name. Where it would not find its own
+    one, that is loaded now, and stays. Raises ``RuntimeError`` where one of the ``names`` is more than a name, or where there is a library for a
+    plugin that is none of Mitsuba's.
+    """
+    for name in names:
+        if not re.fullmatch(r"[A-Za-z0-9_]+", name):
+            raise RuntimeError(f'{name!r} is not the name of a plugin: only letters, digits and "_" are allowed')
+    own = {library.stem: library for library in (MITSUBA / "plugins").iterdir()}
+    suffix = next(iter(own.values())).suffix
+    for name in sorted({*names, *PLUGINS} - set(own)):
+        if library := _foreign_library(f"{name}{suffix}"):
+            raise RuntimeError(f'{library} is not loaded for the plugin "{name}": only plugins in Mitsuba\'s own folder are; remove this file')
+    _load_own([name for name, library in own.items() if _foreign_library(library.name)])
+
+
+def _foreign_library(file_name: str) -> str | None:
+    """The library of that name that Mitsuba would load from another folder than its own, if there is one."""
+    found = str(mi.file_resolver().resolve(f"plugins/{file_name}"))
+    own = MITSUBA / "plugins" / file_name
+    return found if os.path.exists(found) and not (own.exists() and os.path.samefile(found, own)) else None
+
+
+def _load_own(names: Iterable[str]) -> None:
+    """Have Mitsuba load plugins from its own folder."""
+    resolver = mi.file_resolver()
+    folders = [str(folder) for folder in resolver]
+    resolver.clear()
+    resolver.append(str(MITSUBA))
+    try:
+        for name in names:
+            mi.PluginManager.instance().plugin_type(name)
+    finally:
+        resolver.clear()
+        for folder in folders:
+            resolver.append(folder)
 
 
 def _integrator_node(state: Any) -> Any:

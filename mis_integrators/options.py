@@ -9,11 +9,14 @@ import drjit as dr
 import mitsuba as mi
 
 from . import __version__, fingerprint, loading
+from .untrusted import shown
 
 LARGEST_SEED = 2**32 - 1
 MOST_SAMPLES = 2**31 - 1
 """Samples per pixel at most."""
 MOST_SENSORS = 2**16
+MOST_WORKERS = 2**10
+"""Processes on this machine at most."""
 
 _EXIT_CODES = """exit codes:
   0    rendered and written
@@ -42,7 +45,7 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
         add(flag, dest="variables" if flag == "-D" else "parameters", action="append", default=[], type=_assignment,
             metavar=f"{name}=value", help=f"set {what}")
     length = parser.add_mutually_exclusive_group()
-    length.add_argument("--spp", type=_positive_int, metavar="N", help="samples per pixel (default: the scene's sample_count)")
+    length.add_argument("--spp", type=_samples, metavar="N", help="samples per pixel (default: the scene's sample_count)")
     length.add_argument("--time", type=_positive_number, metavar="SECONDS",
                         help="render for so long, at least one iteration; compiling kernels does not count")
     add("--target-error", type=_positive_number, metavar="E",
@@ -52,7 +55,7 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
         help="render again what this image of mis-render shows: with its integrator, parameters, seed and samples, and what was found out for it, such "
         "as merge radii; the scene must be the same")
     add("--seed", type=_seed, metavar="S", help="seed of the random numbers (default: 0)")
-    add("--sensor", type=_integer, default=None, metavar="N", help="index of the sensor (default: 0)")
+    add("--sensor", type=_sensor, default=None, metavar="N", help="index of the sensor (default: 0)")
     add("--all-views", action="store_true",
         help="render all views of the scene together (all sensors, and the children of a batch) into a contact sheet")
     add("--frames", action="store_true", help="also write each view, FILE.000.png and so on: frames of an animation")
@@ -65,7 +68,7 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     add("--preview", type=_positive_number, metavar="SECONDS",
         help="write the image so far to FILE.preview.exr and .png every so many seconds, until the image is there")
     where = parser.add_mutually_exclusive_group()
-    where.add_argument("--workers", type=_positive_int, metavar="N",
+    where.add_argument("--workers", type=_workers, metavar="N",
                        help="spread the iterations over so many processes of this machine; --time then includes their compiling")
     where.add_argument("--scheduler", metavar="ADDRESS",
                        help="spread the iterations over the workers of a Dask cluster, such as tcp://host:8786, which must find the scene under "
@@ -109,32 +112,37 @@ def _assignment(text: str) -> tuple[str, str]:
     return name, value
 
 
-def _integer(text: str) -> int:
+def _integer_between(text: str, low: int, high: int) -> int:
     try:
-        return int(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text} is not an integer") from None
-
-
-def _positive_int(text: str) -> int:
-    value = _integer(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError("at least 1")
+        value = int(text)
+    except ValueError:           # of thousands of digits, too
+        value = low - 1
+    if not low <= value <= high:
+        raise argparse.ArgumentTypeError(f"{shown(text)} is not an integer from {low} to {high}")
     return value
+
+
+def _samples(text: str) -> int:
+    return _integer_between(text, 1, MOST_SAMPLES)
+
+
+def _seed(text: str) -> int:
+    return _integer_between(text, 0, LARGEST_SEED)
+
+
+def _sensor(text: str) -> int:
+    return _integer_between(text, 0, MOST_SENSORS - 1)
+
+
+def _workers(text: str) -> int:
+    return _integer_between(text, 1, MOST_WORKERS)
 
 
 def _positive_number(text: str) -> float:
     try:
         value = float(text)
     except ValueError:
-        raise argparse.ArgumentTypeError(f"{text} is not a number") from None
+        raise argparse.ArgumentTypeError(f"{shown(text)} is not a number") from None
     if not 0 < value < float("inf"):
-        raise argparse.ArgumentTypeError("more than 0")
-    return value
-
-
-def _seed(text: str) -> int:
-    value = _integer(text)
-    if not 0 <= value <= LARGEST_SEED:
-        raise argparse.ArgumentTypeError(f"0 to {LARGEST_SEED}")
+        raise argparse.ArgumentTypeError(f"{shown(text)} is not a finite number, more than 0")
     return value

@@ -127,6 +127,16 @@ def has_media(scene):
     return any(isinstance(o, mi.Medium) for o in scene_objects(scene)) or any(s.is_medium_transition() for s in scene.shapes())
 
 
+def check_film(sensor, plugin):
+    """Raises `UnsupportedScene` for a film, or a crop window, without pixels."""
+    film = sensor.film()
+    width, height = film.crop_size()
+    if not (width and height):
+        full_width, full_height = film.size()
+        raise UnsupportedScene(f"{plugin}: nothing can be rendered on a film of {width} x {height} pixels (the crop window of "
+                               f"{full_width} x {full_height}); width and height must be at least 1")
+
+
 def check_scene(scene, sensor, plugin):
     """Raises `UnsupportedScene` for what the surface integrators cannot render, before any sampling."""
     if mi.is_polarized:
