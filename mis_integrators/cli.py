@@ -12,6 +12,7 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from . import checkpoint, cluster, loading, output, reproduce
 from .checkpoint import Checkpoint, CheckpointError
@@ -40,7 +41,7 @@ def main(arguments: list[str] | None = None) -> int:
     options = parse(arguments)
     interrupt = Interrupt()
     try:
-        with interrupt:
+        with interrupt, np.errstate(all="ignore"):       # values that are not finite are left out, and said once
             return _run(options, interrupt)
     except BaseException as error:
         # Libraries turn an interrupt that reaches them into errors of any kind.
@@ -55,13 +56,15 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _run(options: argparse.Namespace, interrupt: Interrupt) -> int:
     _check_outputs(options)
-    try:
-        with output.alone(options.output):
+    with contextlib.ExitStack() as stack:
+        try:
+            stack.enter_context(output.alone(options.output))
+        except OSError as error:
+            raise Failure(EXIT_OUTPUT, f"cannot write {options.output}: {error.strerror or error}") from error
+        try:
             return _render_alone(options, interrupt)
-    except BlockingIOError as error:
-        raise Failure(EXIT_OUTPUT, f"cannot write {options.output}: {error.strerror}") from error
-    except MemoryError as error:
-        raise Failure(EXIT_SCENE, f"{OUT_OF_MEMORY}; render a smaller film, or fewer light paths an iteration") from error
+        except MemoryError as error:
+            raise Failure(EXIT_SCENE, f"{OUT_OF_MEMORY}; render a smaller film, or fewer light paths an iteration") from error
 
 
 def _render_alone(options: argparse.Namespace, interrupt: Interrupt) -> int:
