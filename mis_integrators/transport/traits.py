@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import re
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+
+from ..untrusted import shown
 
 
 class UnsupportedScene(ValueError):
@@ -84,6 +88,25 @@ def scene_bounds(scene):
         box.expand(mi.ScalarPoint3f(-1, -1, -1))
         box.expand(mi.ScalarPoint3f(1, 1, 1))
     return box
+
+
+def unfinite_data(scene):
+    """Descriptions, a line each, of data of the scene that hold values which are not finite: of emitters, textures, BSDFs, media, volumes and shapes. Each says
+    where the data are (as `mi.traverse` names them, from the id on, or from the class where there is none), whose they are, and how many such values there are."""
+    kinds = mi.Emitter, mi.Texture, mi.BSDF, mi.Medium, mi.Volume, mi.PhaseFunction, mi.Shape
+    parameters = mi.traverse(scene)
+    data = {name: (owner, parameters[name]) for name, (_, _, owner, _) in parameters.properties.items() if isinstance(owner, kinds)}
+    dr.eval([value for _, value in data.values()])                  # at once: each by itself would be a kernel
+    found = []
+    for name, (owner, value) in data.items():
+        values = np.array(value)
+        if values.dtype.kind == "f" and (count := values.size - np.count_nonzero(np.isfinite(values))):
+            outermost = owner
+            while parameters.hierarchy[outermost][1] > 1:
+                outermost = parameters.hierarchy[outermost][0]
+            place = re.sub(r"^object_\d+", outermost.class_name(), name)    # an address, where there is no id
+            found.append(f"{shown(place)} of {owner.class_name()} has {count} of {values.size} values that are not finite")
+    return found
 
 
 class SceneTraits:
