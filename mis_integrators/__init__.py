@@ -1,7 +1,7 @@
 """Integrators for Mitsuba 3 built on multiple importance sampling.
 
 Importing this package makes a usable LLVM known to Dr.Jit and registers every plugin for the active Mitsuba
-variant and for each variant set later; it does nothing else. `render_views` renders several views of a scene together.
+variant and for each variant set later; it warns if Mitsuba or Dr.Jit is newer than those tested, and does nothing else. `render_views` renders several views of a scene together.
 """
 
 from typing import Any
@@ -10,10 +10,14 @@ from . import llvm
 
 llvm.make_known()  # before anything imports Dr.Jit, which loads its LLVM once and for all
 
-from . import _plugins  # noqa: E402
+import drjit as _drjit  # noqa: E402
+import mitsuba as _mitsuba  # noqa: E402
+
+from . import _plugins, _tested  # noqa: E402
 
 __version__ = "0.1.0"
 
+_tested.warn_of_newer({"mitsuba": _mitsuba.__version__, "drjit": _drjit.__version__})
 _plugins.follow_variants()
 
 

@@ -13,9 +13,9 @@ def main(arguments: list[str]) -> int:
 
         return doctor.main()
     if name == "render":
-        from . import cli
+        import mis_render
 
-        return cli.main(rest)
+        return mis_render.main(rest)
     print(f"usage: {COMMANDS}", file=sys.stderr)
     return 2
 

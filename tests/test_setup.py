@@ -2,6 +2,7 @@
 
 import importlib
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -12,7 +13,7 @@ from pathlib import Path
 import mitsuba as mi
 import pytest
 
-from mis_integrators import _plugins, llvm
+from mis_integrators import _plugins, _tested, llvm
 from mis_integrators.llvm import library_directories
 
 ROOT = Path(__file__).parent.parent
@@ -205,6 +206,40 @@ def test_scalar_variant_says_what_the_plugins_need():
     assert "llvm_ad_*" in result.stderr.splitlines()[-1]
 
 
+# --- Newer versions -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name, version", [("mitsuba", "3.10.0"), ("mitsuba", "4.0.0.dev1"), ("drjit", "1.6.0")])
+def test_newer_version_is_one_line(name, version):
+    result = run_python(f"import drjit, mitsuba; {name}.__version__ = '{version}'\nimport mis_integrators, mis_integrators.loading")
+    assert result.returncode == 0 and result.stderr.count("\n") == 1
+    assert f"{name} {version} may not work: the newest tested are mitsuba 3.9 and drjit 1.5" in result.stderr
+
+
+def test_warning_of_a_newer_version_can_be_filtered():
+    code = "import warnings; warnings.filterwarnings('ignore', module='mis_integrators')\nimport mitsuba; mitsuba.__version__ = '3.10.0'\nimport mis_integrators"
+    result = run_python(code)
+    assert (result.returncode, result.stdout, result.stderr) == (0, "", "")
+
+
+@pytest.mark.parametrize("versions", [{"mitsuba": "3.9.1", "drjit": "1.5.0"}, {"mitsuba": "3.9.12", "drjit": "1.5.3.dev2"}, {"mitsuba": "3.8.0", "drjit": "1.4"}])
+def test_tested_and_older_versions_are_not_warned_of(recwarn, versions):
+    _tested.warn_of_newer(versions)
+    assert not recwarn.list
+
+
+def test_nothing_is_said_under_the_installed_versions():
+    result = run_python("import mis_integrators")
+    assert (result.returncode, result.stdout, result.stderr) == (0, "", "")
+
+
+def test_newest_tested_versions_are_those_of_the_package():
+    """What pip may install is what was tested."""
+    text = (ROOT / "pyproject.toml").read_text()
+    for name, (major, minor) in _tested.NEWEST.items():
+        assert re.search(rf'"{name}>={major}\.{minor}\.\d+,<{major}\.{minor + 1}"', text), name
+
+
 # --- The package ----------------------------------------------------------------------------------
 
 
@@ -249,7 +284,7 @@ def test_wheel_holds_every_file(tmp_path):
         pytest.skip("setuptools is older than pyproject.toml asks for")
     source = tmp_path / "source"
     shutil.copytree(ROOT / "mis_integrators", source / "mis_integrators")
-    for name in ("pyproject.toml", "README.md", "LICENSE"):
+    for name in ("pyproject.toml", "README.md", "LICENSE", "mis_render.py"):
         shutil.copy(ROOT / name, source)
     subprocess.run(
         [
@@ -269,5 +304,7 @@ def test_wheel_holds_every_file(tmp_path):
     )
     (wheel,) = tmp_path.glob("*.whl")
     names = set(zipfile.ZipFile(wheel).namelist())
-    assert {file.relative_to(ROOT).as_posix() for file in package_files()} <= names
+    assert {file.relative_to(ROOT).as_posix() for file in package_files()} | {"mis_render.py"} <= names
+    (entry_points,) = [name for name in names if name.endswith("entry_points.txt")]
+    assert "mis-render = mis_render:main" in zipfile.ZipFile(wheel).read(entry_points).decode()
     assert any(name.endswith("licenses/LICENSE") for name in names)
