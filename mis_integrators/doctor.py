@@ -92,7 +92,10 @@ def compiler() -> list[Finding]:
     import drjit as dr
 
     named = os.environ.get(llvm.VARIABLE)
-    why = f"the newest on this system that is at least {llvm.OLDEST_WORKING}" if llvm.chosen else f"named by {llvm.VARIABLE}"
+    tested = f"{llvm.OLDEST_WORKING} to {llvm.NEWEST_TESTED}"
+    why = f"named by {llvm.VARIABLE}"
+    if llvm.chosen:
+        why = f"the newest on this system of those tested ({tested})" if llvm.is_tested(llvm.chosen) else f"as there is none of those tested ({tested})"
     version = ".".join(map(str, dr.detail.llvm_version()))
     text = f"{version} from {named}, {why}" if named else f"{version}, which Dr.Jit found by itself"
     problem = llvm.problem()

@@ -1,10 +1,12 @@
 """Find a libLLVM that works with Dr.Jit.
 
 LLVM 14, 15 and 16 abort the process while they generate code for Dr.Jit ("Cannot select: fminimum"), which no
-program can catch, so such a version is refused before it is used.
+program can catch, so such a version is refused before it is used. A version newer than those that were tested is used
+where there is no other.
 
 This file uses the standard library alone and runs by itself: ``python llvm.py`` prints the library it would
-choose, or says on standard error what to install and exits with status 1.
+choose, or says on standard error what to install and exits with status 1. ``python llvm.py versions`` prints the oldest
+and the newest version that are tested.
 """
 
 import os
@@ -15,7 +17,7 @@ import sysconfig
 from pathlib import Path
 from typing import Iterable, Mapping
 
-OLDEST_WORKING = 17
+OLDEST_WORKING, NEWEST_TESTED = 17, 22
 VARIABLE = "DRJIT_LIBLLVM_PATH"
 
 # Versions are read from file names only. Loading a library to call LLVMGetVersion would leave it in the
@@ -28,8 +30,8 @@ chosen: Path | None = None
 """The library that ``make_known`` has chosen in this process; ``None`` if it was not asked to, or found none."""
 
 _INSTALL = (
-    f"install LLVM {OLDEST_WORKING} or newer: `apt-get install libllvm19` (Debian, Ubuntu), "
-    "`conda install -c conda-forge libllvm19`, or `brew install llvm`"
+    f"install LLVM {OLDEST_WORKING} to {NEWEST_TESTED}: `apt-get install libllvm19` (Debian, Ubuntu), `dnf install llvm-libs` (Fedora), "
+    "`pacman -S llvm-libs` (Arch), `conda install -c conda-forge libllvm19`, or `brew install llvm@19` (macOS)"
 )
 
 
@@ -44,15 +46,18 @@ def version_of(library: Path) -> tuple[int, ...] | None:
     return tuple(int(part) for part in found[1].split(".")) if found else None
 
 
-def newest_working(libraries: Iterable[Path]) -> Path | None:
-    """The library of the highest version that is at least ``OLDEST_WORKING``; the first one among equals."""
-    best: Path | None = None
-    best_version: tuple[int, ...] = (OLDEST_WORKING - 1, sys.maxsize)
-    for library in libraries:
-        version = version_of(library)
-        if version and version > best_version:
-            best, best_version = library, version
-    return best
+def is_tested(library: Path) -> bool:
+    """Whether a libLLVM is of one of the versions that are tested, as far as its path tells."""
+    version = version_of(library)
+    return version is not None and OLDEST_WORKING <= version[0] <= NEWEST_TESTED
+
+
+def best_working(libraries: Iterable[Path]) -> Path | None:
+    """The library of the highest version that is tested; where there is none, of the lowest that is newer. The first one among equals."""
+    versions = {library: version_of(library) or (0,) for library in libraries}
+    if tested := [library for library in versions if is_tested(library)]:
+        return max(tested, key=versions.__getitem__)
+    return min((library for library in versions if versions[library][0] > NEWEST_TESTED), key=versions.__getitem__, default=None)
 
 
 def library_directories(environment: Mapping[str, str], root: Path = Path("/")) -> list[Path]:
@@ -94,11 +99,11 @@ def libraries_in_linker_cache(listing: str) -> list[Path]:
 
 
 def choose(environment: Mapping[str, str], root: Path = Path("/")) -> Path | None:
-    """The newest working libLLVM of this system, or ``None``. ``DRJIT_LIBLLVM_PATH`` is not looked at."""
+    """The best libLLVM of this system (see ``best_working``), or ``None``. ``DRJIT_LIBLLVM_PATH`` is not looked at."""
     found = libraries_in(library_directories(environment, root))
     if root == Path("/"):
         found += libraries_in_linker_cache(_linker_cache())
-    return newest_working(found)
+    return best_working(found)
 
 
 def problem_with_variable(environment: Mapping[str, str]) -> str | None:
@@ -165,7 +170,10 @@ def _linker_cache() -> str:
     return ""
 
 
-def _main() -> int:
+def _main(arguments: list[str]) -> int:
+    if arguments == ["versions"]:
+        print(OLDEST_WORKING, NEWEST_TESTED)
+        return 0
     if os.environ.get(VARIABLE):
         library: Path | None = Path(os.environ[VARIABLE])
         message = problem_with_variable(os.environ)
@@ -177,4 +185,4 @@ def _main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(_main())
+    sys.exit(_main(sys.argv[1:]))

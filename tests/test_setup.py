@@ -81,9 +81,19 @@ def test_newest_working_library_is_chosen(tmp_path):
 
 def test_versions_are_compared_as_numbers(tmp_path):
     library(tmp_path, "usr/lib/libLLVM-9.so.1")
-    hundred = library(tmp_path, "usr/lib/libLLVM.so.100.0")
-    library(tmp_path, "usr/lib/libLLVM.so.22.1")
-    assert llvm.choose({}, tmp_path) == hundred
+    library(tmp_path, "usr/lib/libLLVM.so.18.9")
+    eighteen = library(tmp_path, "usr/lib/libLLVM.so.18.10")
+    assert llvm.choose({}, tmp_path) == eighteen
+
+
+def test_newer_than_tested_is_the_last_resort(tmp_path):
+    """The one nearest to what was tested."""
+    library(tmp_path, "usr/lib/libLLVM.so.100.0")
+    next_one = library(tmp_path, f"usr/lib/libLLVM.so.{llvm.NEWEST_TESTED + 1}.1")
+    library(tmp_path, "usr/lib/libLLVM-16.so.1")
+    assert llvm.choose({}, tmp_path) == next_one and not llvm.is_tested(next_one)
+    tested = library(tmp_path, f"usr/lib/libLLVM.so.{llvm.NEWEST_TESTED}.1")
+    assert llvm.choose({}, tmp_path) == tested and llvm.is_tested(tested)
 
 
 def test_only_libraries_that_abort_means_none(tmp_path):
@@ -168,6 +178,96 @@ def test_set_up_stops_with_one_message(tmp_path, python, environment, message):
                             env={**os.environ, **environment})
     assert result.returncode == 1 and message in result.stderr and result.stderr.count("\n") == 1, result.stderr
     assert result.stderr.startswith("setup: ") and not (tmp_path / "venv").exists()
+
+
+def command(folder: Path, name: str, code: str) -> Path:
+    """A shell script of that name in a folder; an older one is replaced."""
+    file = folder / name
+    file.unlink(missing_ok=True)
+    file.write_text(f"#!/bin/sh\n{code}\n")
+    file.chmod(0o755)
+    return file
+
+
+@pytest.fixture
+def set_up(tmp_path):
+    """Runs `tools/setup.sh` where there is no LLVM until one is installed, as root, with commands that only take notes of what they are told."""
+    tools, done, installed = tmp_path / "tools", tmp_path / "done", tmp_path / "installed"
+    tools.mkdir()
+    for name in ("awk", "bash", "cat", "dirname", "env", "sed", "sh", "sleep", "sort", "touch"):
+        (tools / name).symlink_to(shutil.which(name))
+    command(tools, "id", "echo 0")
+    command(tools, "apt-get", f'echo "$@" >> {done}; case "$*" in *install*) touch {installed};; esac')
+    command(tools, "apt-cache", "echo libllvm16; echo libllvm17t64; echo libllvm19; echo libllvm19-dev; echo libllvm22; echo libllvm23; echo libllvm100")
+    python = command(tools, "python", f"""case "$*" in
+        */llvm.py) [ -e {installed} ] || {{ echo "no working LLVM" >&2; exit 1; }};;
+        "-m venv"*) ;;
+        *) exec {sys.executable} "$@";;
+    esac""")
+
+    def run(**environment):
+        inherited = {name: value for name, value in os.environ.items() if name != llvm.VARIABLE}
+        result = subprocess.run([ROOT / "tools" / "setup.sh", python, tmp_path / "venv"], capture_output=True, text=True, timeout=60,
+                                env={**inherited, "PATH": str(tools), **environment})
+        return result, done.read_text().splitlines() if done.exists() else []
+
+    run.tools = tools
+    return run
+
+
+def test_set_up_says_what_it_installs_before(set_up):
+    """And takes the newest package of those tested, waiting for an apt that is at work."""
+    result, done = set_up()
+    assert result.returncode == 0, result.stderr
+    update, install = done
+    assert update == "update -qq" and install.endswith(" libllvm22") and "DPkg::Lock::Timeout=" in install
+    first, second = result.stdout.splitlines()
+    assert "as root: apt-get update" in first and "as root: apt-get install libllvm22" in second and "NO_APT=1" in first
+
+
+def test_set_up_says_each_thing_before_it_does_it(set_up):
+    command(set_up.tools, "apt-get", 'echo "E: no network" >&2; exit 100')
+    result, _ = set_up()
+    assert result.returncode == 1 and "apt-get update" in result.stdout and result.stderr == "setup: apt-get update failed: E: no network\n"
+
+
+def test_set_up_installs_nothing_if_told_so(set_up):
+    result, done = set_up(NO_APT="1")
+    assert result.returncode == 1 and done == [] and result.stdout == "" and result.stderr == "setup: no working LLVM\n"
+
+
+def test_set_up_without_apt(set_up):
+    (set_up.tools / "apt-get").unlink()
+    result, done = set_up()
+    assert result.returncode == 1 and done == [] and result.stderr == "setup: no working LLVM\n"
+
+
+def test_set_up_does_not_install_what_was_not_tested(set_up):
+    command(set_up.tools, "apt-cache", "echo libllvm16; echo libllvm23")
+    result, done = set_up()
+    assert result.returncode == 1 and done == ["update -qq"] and result.stderr == "setup: no working LLVM (apt knows no such package here)\n"
+
+
+def test_set_up_waits_for_another_update(set_up, tmp_path):
+    """Apt itself waits for the lock of the packages only, not for that of their lists."""
+    command(set_up.tools, "sleep", f"touch {tmp_path}/waited")
+    command(set_up.tools, "apt-get", f'[ -e {tmp_path}/waited ] || {{ echo "E: Could not get lock x." >&2; echo "E: no" >&2; exit 100; }}; touch {tmp_path}/installed')
+    result, _ = set_up()
+    assert result.returncode == 0, result.stderr
+
+
+@pytest.mark.parametrize("program", ["apt-get", "dnf", "pacman", "brew", "conda"])
+def test_message_says_how_to_install(program, monkeypatch, capsys):
+    monkeypatch.setattr(llvm, "choose", lambda environment: None)
+    monkeypatch.delenv(llvm.VARIABLE, raising=False)
+    assert llvm._main([]) == 1
+    error = capsys.readouterr().err
+    assert f"`{program} " in error and error.count("\n") == 1
+
+
+def test_tested_versions_are_printed(capsys):
+    assert llvm._main(["versions"]) == 0
+    assert capsys.readouterr().out == f"{llvm.OLDEST_WORKING} {llvm.NEWEST_TESTED}\n"
 
 
 # --- Registration ---------------------------------------------------------------------------------
