@@ -1,24 +1,32 @@
 """Iterations spread over the processes of a Dask cluster, here or on other machines.
 
 Iterations depend on the seed and their number alone, so any worker may run any of them: a worker opens the scene by itself, runs the iterations that
-it is told, and hands back their sums. Whoever gathers them adds each iteration once. What a worker that dies had in hand Dask gives to another.
+it is told, and hands back their sums. Whoever gathers them adds each iteration once. What a worker that dies had in hand Dask gives to another; what
+one holds that hangs, the gatherer does.
 """
 
 from __future__ import annotations
 
+import asyncio
+import concurrent.futures
 import contextlib
 import logging
 import math
+import multiprocessing
 import os
 import signal
+import statistics
+import threading
 import time
+from collections import deque
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Iterator
 
 import drjit as dr
 
 from . import checkpoint
+from .loading import one_line
 from .opening import Opened, Request
 from .session import Session
 from .sums import Iterations
@@ -31,14 +39,46 @@ BATCHES_PER_WORKER = 2
 """Batches that wait or run at a time: one to run, one to go on with."""
 CONNECTION_SECONDS = 20
 """How long to look for the scheduler."""
+CLOSING_SECONDS = 10.0
+"""Seconds for the scheduler, and for local workers, to end by themselves."""
+POLL_SECONDS = 0.5
+"""Seconds that ``DistributedSession.iterate`` waits for something to come in, at most."""
+LOOKING_SECONDS = 1.0
+"""Seconds between two questions to the scheduler about its workers."""
+ANSWER_SECONDS = 30.0
+"""Seconds after which a scheduler that does not answer is given up."""
+SILENCE = 20.0
+"""Seconds without a heartbeat after which a worker counts as absent, until its next one."""
 PATIENCE = 60.0
 """Seconds without any worker after which the render gives up."""
+OVERDUE_SECONDS, OVERDUE_FACTOR = 30.0, 5.0
+"""A batch is overdue after so many seconds (in which a worker may still open the scene and compile; longer, if the first batch of all came back so
+late), and so many times what it and those before it usually take."""
+HAND_OUTS = 3
+"""How often a batch may become overdue, or its sums may not be fetched; then the render gives up."""
+ATTEMPTS = 2
+"""How often an iteration may fail with an error; then the render gives up."""
+FETCHES, FETCHING_SECONDS = 2, 60.0
+"""Batches whose sums are fetched at a time, which bounds memory, and the seconds that fetching may take."""
 FAILURES_ALLOWED = 10
 """Workers that may die with the same batch in hand."""
+LONGEST_STEP = 2.0
+"""Seconds between two polls that count, at most: while the process that gathers is stopped or busy itself, nobody else is late."""
 
 
 class ClusterError(Exception):
-    """Workers cannot be reached, or fail; the message says why, in one line."""
+    """Workers cannot be reached, or fail; the message says why, in one line. Where a worker raises it, trying again will not help."""
+
+
+class IterationError(Exception):
+    """An iteration failed in the worker at an address, which says why in one line."""
+
+    def __init__(self, address: str, message: str):
+        super().__init__(address, message)
+        self.address, self.message = address, message
+
+    def __str__(self) -> str:
+        return f"a worker failed: {self.message} ({self.address})"
 
 
 @dataclass(frozen=True)
@@ -63,33 +103,45 @@ _thread = ThreadPoolExecutor(1)
 
 
 def run(job: Job, iterations: list[int]) -> tuple[dict[str, Any], Iterations, float]:
-    """Run iterations of a job in this worker; returns their sums, which they are, and the seconds that they took."""
+    """Run iterations of a job in this worker; returns their sums, which they are, and the seconds that they took.
+
+    Raises ``ClusterError`` where the worker cannot open the job's scene, ``IterationError`` where an iteration fails.
+    """
     from distributed import get_worker
 
-    threads = job.threads or max(1, get_worker().state.nthreads)
-    return _thread.submit(_run, job, iterations, threads).result()
+    worker = get_worker()
+    threads = job.threads or max(1, worker.state.nthreads)
+    return _thread.submit(_run, job, iterations, threads, worker.address).result()
 
 
-def _run(job: Job, iterations: list[int], threads: int) -> tuple[dict[str, Any], Iterations, float]:
-    session = _open.get(job.number) or _open_session(job, threads)
+def _run(job: Job, iterations: list[int], threads: int, address: str) -> tuple[dict[str, Any], Iterations, float]:
+    session = _open.get(job.number) or _open_session(job, threads, address)
     _open.clear()                # an error leaves nothing half summed behind
     start = time.perf_counter()
-    for iteration in iterations:
-        session.iterate(iteration)
-    arrays, done = session.sums.take()
+    try:
+        for iteration in iterations:
+            session.iterate(iteration)
+        arrays, done = session.sums.take()
+    except Exception as error:
+        raise IterationError(address, one_line(error)) from None
     _open[job.number] = session
     return arrays, done, time.perf_counter() - start
 
 
-def _open_session(job: Job, threads: int) -> Session:
+def _open_session(job: Job, threads: int, address: str) -> Session:
     _open.clear()
-    dr.set_thread_count(threads)
-    opened = job.request.open()
-    if what := checkpoint.difference(job.identity, opened.identity()):
-        raise ClusterError(f"a worker sees another render than was asked for: {what}")
-    if job.keep_variance:
-        opened.session.keep_variance()
-    opened.session.recall(job.learned)
+    try:
+        dr.set_thread_count(threads)
+        opened = job.request.open()
+        what = checkpoint.difference(job.identity, opened.identity())
+        if not what and job.keep_variance:
+            opened.session.keep_variance()
+        if not what:
+            opened.session.recall(job.learned)
+    except Exception as error:
+        raise ClusterError(f"a worker cannot open the scene: {one_line(error)} ({address})") from None
+    if what:
+        raise ClusterError(f"a worker sees another render than was asked for: {what} ({address})")
     return opened.session
 
 
@@ -98,7 +150,10 @@ def _open_session(job: Job, threads: int) -> Session:
 
 @contextlib.contextmanager
 def connected(workers: int | None, scheduler: str | None) -> Iterator[Any]:
-    """A ``distributed.Client`` of a cluster of so many local processes, or of the scheduler at an address. Raises ``ClusterError``."""
+    """A ``distributed.Client`` of a cluster of so many local processes, or of the scheduler at an address. Raises ``ClusterError``.
+
+    Leaving takes seconds at most, whatever workers and scheduler do; no local worker is left.
+    """
     try:
         import dask
         import distributed
@@ -109,17 +164,54 @@ def connected(workers: int | None, scheduler: str | None) -> Iterator[Any]:
     quiet = {"logging.distributed": "critical", "distributed.scheduler.allowed-failures": FAILURES_ALLOWED}
     with dask.config.set(quiet), contextlib.ExitStack() as stack:
         try:
+            cluster: Any = scheduler
+            if scheduler:
+                _check_address(scheduler)
             if workers:
-                scheduler = stack.enter_context(
-                    distributed.LocalCluster(n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=None,
-                                             memory_limit=None, silence_logs=logging.CRITICAL)
-                )
-            client = stack.enter_context(distributed.Client(scheduler, timeout=CONNECTION_SECONDS))
+                cluster = distributed.LocalCluster(n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=None,
+                                                   memory_limit=None, silence_logs=logging.CRITICAL)
+                stack.callback(_close_cluster, cluster)
+            client = distributed.Client(cluster, timeout=CONNECTION_SECONDS)
+            stack.callback(_close_client, client)
             if workers:
                 client.register_plugin(_interrupt_plugin(distributed))
-        except (OSError, ValueError, TimeoutError) as error:
-            raise ClusterError(f"no scheduler at {scheduler}: {' '.join(str(error).split())}") from error
+        except Exception as error:           # Dask raises errors of many kinds for an address that is none
+            raise ClusterError(_why_not_connected(scheduler, error)) from error
         yield client
+
+
+def _check_address(scheduler: str) -> None:
+    """Raise an error if nothing can be at an address. (A client that finds out by itself may hang when it is closed.)"""
+    import distributed
+
+    scheme, _ = distributed.comm.parse_address(scheduler)
+    distributed.comm.get_address_host_port(scheduler)
+    if scheme == "tls" and not distributed.Security().get_connection_args("client").get("ssl_context"):
+        raise ValueError("Dask's configuration names no certificates; set distributed.comm.tls.ca-file, distributed.comm.tls.client.cert and "
+                         "distributed.comm.tls.client.key")
+
+
+def _why_not_connected(scheduler: str | None, error: Exception) -> str:
+    reason = " ".join(str(error).split()) or type(error).__name__
+    return f"no scheduler at {scheduler}: {reason}" if scheduler else f"cannot start workers: {reason}"
+
+
+def _close_client(client: Any) -> None:
+    """Leave a scheduler, which then forgets what this client had asked for."""
+    with contextlib.suppress(Exception):     # it may not answer any more
+        client.close(timeout=CLOSING_SECONDS)
+
+
+def _close_cluster(cluster: Any) -> None:
+    """End local workers, those that hang by force."""
+    pids = {nanny.pid for nanny in cluster.workers.values()}
+    try:
+        with contextlib.suppress(Exception):
+            cluster.close(timeout=CLOSING_SECONDS)
+    finally:
+        for process in multiprocessing.active_children():
+            if process.pid in pids:
+                process.kill()
 
 
 def _interrupt_plugin(distributed: Any) -> Any:
@@ -134,8 +226,95 @@ def _interrupt_plugin(distributed: Any) -> Any:
     return IgnoreInterrupts()
 
 
+class Watch:
+    """What the scheduler tells about its workers. It is asked now and then, and nobody waits for the answer."""
+
+    def __init__(self, client: Any, news: threading.Event):
+        self._client, self._news = client, news
+        self._question: concurrent.futures.Future | None = None
+        self._last, self._asked, self._last_present = time.monotonic(), -math.inf, 0.0
+        self._heard: dict[str, tuple[float, float]] = {}
+        """For each worker its last heartbeat by the scheduler's clock, and when that was news by this one."""
+        self.now = 0.0
+        """Seconds that this process has watched."""
+        self.present: list[str] = []
+        """Addresses of the workers whose heartbeats come in."""
+        self.silent: set[str] = set()
+        """Addresses of the others that the scheduler knows."""
+        self.holders: dict[str, str] = {}
+        """For each key that a worker has in hand, or whose result it keeps, the worker's address."""
+        self.seen = -math.inf
+        """When that was asked for."""
+
+    def look(self, keys: list[str]) -> None:
+        """Take in the answer, if there is one; ask again, if it is time, about these keys, too. Raises ``ClusterError`` if there is no answer, or no
+        worker, for too long."""
+        moment = time.monotonic()
+        self.now += min(moment - self._last, LONGEST_STEP)
+        self._last = moment
+        if self._client.status != "running":
+            raise ClusterError("the scheduler is gone")
+        if self._question is not None and self._question.done():
+            try:
+                self._take(*self._question.result())
+            except Exception as error:
+                raise ClusterError(f"the scheduler is gone: {one_line(error)}") from error
+            self._question = None
+        if self._question is not None and self.now - self._asked > ANSWER_SECONDS:
+            raise ClusterError(f"the scheduler has not answered for {ANSWER_SECONDS:.0f} s")
+        if self._question is None and self.now - self._asked >= LOOKING_SECONDS:
+            self._asked = self.now
+            self._question = asyncio.run_coroutine_threadsafe(self._ask(keys), self._client.loop.asyncio_loop)
+            self._question.add_done_callback(lambda _: self._news.set())
+        if self.present:
+            self._last_present = self.now
+        elif self.now - self._last_present > PATIENCE:
+            unheard = f"; the scheduler does not hear of the {len(self.silent)} that it knows" if self.silent else ""
+            raise ClusterError(f"there has been no worker for {PATIENCE:.0f} s{unheard}")
+
+    async def _ask(self, keys: list[str]) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
+        scheduler = self._client.scheduler
+        workers = (await scheduler.identity(n_workers=-1))["workers"]
+        return workers, await scheduler.processing(workers=None), await scheduler.who_has(keys=keys)
+
+    def _take(self, workers: dict[str, Any], processing: dict[str, Any], kept: dict[str, Any]) -> None:
+        # Clocks of two machines cannot be compared, but a heartbeat has come in where the scheduler's changes.
+        self._heard = {address: self._heard[address] if address in self._heard and self._heard[address][0] == worker["last_seen"]
+                       else (worker["last_seen"], self.now) for address, worker in workers.items()}
+        self.silent = {address for address, (_, when) in self._heard.items() if self.now - when > SILENCE}
+        self.present = [address for address in workers if address not in self.silent]
+        self.holders = {key: address for address, keys in processing.items() for key in keys}
+        self.holders |= {key: addresses[0] for key, addresses in kept.items() if addresses}
+        self.seen = self._asked
+
+
+@dataclass(eq=False)
+class Copy:
+    """A batch as it was handed out once; ``since`` then, or later, by the watch's clock, it has been on its way."""
+
+    future: Any
+    since: float
+    fetching: concurrent.futures.Future | None = None
+    fetching_since: float = 0.0
+
+
+@dataclass(eq=False)
+class Batch:
+    """Iterations that are under way, perhaps at several workers: the sums that come first count."""
+
+    numbers: list[int]
+    copies: list[Copy] = field(default_factory=list)
+    overdue: int = 0
+    """How often it was overdue, or its sums could not be fetched."""
+    failed_at: list[str] = field(default_factory=list)
+    """Workers in which it ended with an error."""
+
+    def __str__(self) -> str:
+        return f"iteration {self.numbers[0]}" if len(self.numbers) == 1 else f"iterations {self.numbers[0]} to {self.numbers[-1]}"
+
+
 class DistributedSession:
-    """A ``Session`` whose iterations the workers of a cluster run: each ``iterate`` adds what comes in next, which may be several of them.
+    """A ``Session`` whose iterations the workers of a cluster run: each ``iterate`` adds what has come in, several of them or none.
 
     All but ``iterate`` is that of the session ``opened``, in this process, which renders nothing itself but finds out what must be known before.
     """
@@ -144,10 +323,15 @@ class DistributedSession:
         self._client, self._opened, self._threads, self._keep_variance = client, opened, threads, keep_variance
         self._session = opened.session
         self._identity = opened.identity()
-        self._job: Any = None
-        self._waiting: dict[Any, list[int]] = {}
+        self._job: Job | None = None
+        self._news = threading.Event()
+        self._waiting: list[Batch] = []
         self._next = 0
         self._seconds_per_iteration: float | None = None
+        self._usual: deque[float] = deque(maxlen=32)
+        """Seconds per iteration of the last batches."""
+        self._first_took = 0.0
+        """Seconds from handing out the first batch that came back until then."""
         self.gathering = 0.0
         """Seconds that fetching and adding the last batch took: what bounds the number of workers that pay."""
 
@@ -155,36 +339,92 @@ class DistributedSession:
         return getattr(self._session, name)
 
     def iterate(self) -> None:
-        """Add the iterations of the next batch that a worker has finished. Raises ``ClusterError``."""
+        """Add the iterations that workers have finished; wait ``POLL_SECONDS`` for some, at most. Raises ``ClusterError``: what has been added stays."""
         if self._job is None:
             self._begin()
-        self._submit()
-        batch = self._next_finished()
-        start = time.perf_counter()
-        self._waiting.pop(batch)
-        arrays, done, seconds = self._result(batch)
-        batch.release()
-        self._session.sums.merge(arrays, done)
-        self.gathering = time.perf_counter() - start
-        self._seconds_per_iteration = seconds / len(done)
+        end = time.monotonic() + POLL_SECONDS
+        while True:
+            self._watch.look([copy.future.key for batch in self._waiting for copy in batch.copies])
+            self._hand_out()
+            left = end - time.monotonic()
+            if self._gather() or left <= 0:
+                return
+            self._news.wait(left)
+            self._news.clear()
 
     def _begin(self) -> None:
         with dr.suspend_grad():
             self._session.start()
         request = self._opened.request
-        job = Job(f"{os.getpid()}-{time.time_ns()}", replace(request, scene=os.path.abspath(request.scene)), self._session.learned, self._identity,
-                  self._keep_variance, self._threads)
-        self._job = self._client.scatter(job, hash=False)
+        self._job = Job(f"{os.getpid()}-{time.time_ns()}", replace(request, scene=os.path.abspath(request.scene)), self._session.learned,
+                        self._identity, self._keep_variance, self._threads)
+        self._watch = Watch(self._client, self._news)
 
-    def _workers(self) -> int:
-        return len(self._client.scheduler_info(n_workers=-1)["workers"])
+    # Handing out
 
-    def _submit(self) -> None:
-        """Keep the workers busy with the first iterations that are neither done nor under way."""
-        workers = max(1, self._workers())
-        while len(self._waiting) < BATCHES_PER_WORKER * workers and (batch := self._take_numbers(workers)):
-            future = self._client.submit(run, self._job, batch, pure=False, retries=FAILURES_ALLOWED)
-            self._waiting[future] = batch
+    def _hand_out(self) -> None:
+        """Hand out anew what does not come back; keep the workers busy with the first iterations that are neither done nor under way."""
+        present = self._watch.present
+        if not present:
+            return
+        for batch in self._waiting:
+            if self._needs_another(batch):
+                holders = {self._watch.holders.get(copy.future.key) for copy in batch.copies}
+                others = [address for address in present if address not in holders]
+                if untried := [address for address in others if address not in batch.failed_at]:
+                    others = untried
+                if others:
+                    self._send(batch, others)
+        while len(self._waiting) < BATCHES_PER_WORKER * len(present) and (numbers := self._take_numbers(len(present))):
+            self._waiting.append(Batch(numbers))
+            self._send(self._waiting[-1], present if self._watch.silent else None)
+
+    def _send(self, batch: Batch, workers: list[str] | None) -> None:
+        # The job goes with each batch: were it stored in the cluster, its only copy could be that of a worker which hangs.
+        future = self._client.submit(run, self._job, batch.numbers, pure=False, retries=0, workers=workers)
+        future.add_done_callback(lambda _: self._news.set())
+        batch.copies.append(Copy(future, self._watch.now))
+
+    def _needs_another(self, batch: Batch) -> bool:
+        """Whether no worker is likely to finish the batch soon. Raises ``ClusterError`` if that was so too often."""
+        now, alive = self._watch.now, []
+        for copy in list(batch.copies):
+            holder = self._watch.holders.get(copy.future.key)
+            if holder in self._watch.silent:
+                copy.since = now             # whoever holds it is not slow but absent
+            elif holder is None and not copy.future.done() and self._watch.seen - copy.since > SILENCE:
+                self._drop(batch, copy)      # those who might have taken it have left
+            else:
+                alive.append(copy)
+        if not alive:
+            return True
+        limit = self._seconds_allowed()
+        if any(now - copy.since <= limit for copy in alive):
+            return False
+        self._count_overdue(batch, f"no worker has finished {batch} in {limit:.0f} s, {HAND_OUTS} times")
+        for copy in alive:
+            copy.since = now
+        return True
+
+    def _seconds_allowed(self) -> float:
+        """Seconds after which a batch is overdue: never, before the first has come back."""
+        if not self._usual:
+            return math.inf
+        before = max(BATCHES_PER_WORKER, math.ceil(len(self._waiting) / len(self._watch.present)))
+        longest = max(len(batch.numbers) for batch in self._waiting)
+        return max(OVERDUE_SECONDS, 2 * self._first_took) + OVERDUE_FACTOR * before * longest * statistics.median(self._usual)
+
+    @staticmethod
+    def _count_overdue(batch: Batch, message: str) -> None:
+        batch.overdue += 1
+        if batch.overdue >= HAND_OUTS:
+            raise ClusterError(message)
+
+    @staticmethod
+    def _drop(batch: Batch, copy: Copy) -> None:
+        """Ask for a copy no longer; what still comes of it is not looked at."""
+        batch.copies.remove(copy)
+        copy.future.release()
 
     def _take_numbers(self, workers: int) -> list[int]:
         done, planned = self._session.sums.done, self._session.iterations_planned
@@ -201,32 +441,64 @@ class DistributedSession:
             self._next += 1
         return numbers
 
-    def _next_finished(self) -> Any:
+    # Gathering
+
+    def _gather(self) -> bool:
+        """Add what has been fetched, and fetch more of what is finished. Returns whether something was added; raises ``ClusterError`` after it."""
+        added, errors = False, []
+        for batch in list(self._waiting):
+            for copy in list(batch.copies):
+                if batch in self._waiting and copy.fetching is not None and copy.fetching.done():
+                    try:
+                        added |= self._add(batch, copy)
+                    except ClusterError as error:
+                        errors.append(error)
+        if errors:
+            raise errors[0]
+        copies = [copy for batch in self._waiting for copy in batch.copies]
+        free = FETCHES - sum(copy.fetching is not None for copy in copies)
+        for copy in [copy for copy in copies if copy.fetching is None and copy.future.done()][:max(0, free)]:
+            copy.fetching_since = time.perf_counter()
+            copy.fetching = asyncio.run_coroutine_threadsafe(self._fetch(copy.future), self._client.loop.asyncio_loop)
+            copy.fetching.add_done_callback(lambda _: self._news.set())
+        return added
+
+    async def _fetch(self, future: Any) -> tuple[Any, float]:
+        result = await asyncio.wait_for(self._client.gather(future, asynchronous=True), FETCHING_SECONDS)
+        return result, time.perf_counter()
+
+    def _add(self, batch: Batch, copy: Copy) -> bool:
+        """Add a batch that has been fetched. Returns whether it could be; if not, it may be tried once more."""
         import distributed
 
-        last_seen = time.monotonic()
-        while True:
-            try:
-                return next(iter(distributed.wait(list(self._waiting), timeout=1, return_when="FIRST_COMPLETED").done))
-            except (TimeoutError, distributed.TimeoutError):
-                pass
-            if self._client.status != "running":
-                raise ClusterError("the scheduler is gone")
-            if self._workers():
-                last_seen = time.monotonic()
-            elif time.monotonic() - last_seen > PATIENCE:
-                raise ClusterError(f"there has been no worker for {PATIENCE:.0f} s")
-
-    def _result(self, batch: Any) -> tuple[dict[str, Any], Iterations, float]:
-        import distributed
-
+        start = time.perf_counter()
         try:
-            return batch.result()
+            (arrays, done, seconds), fetched = copy.fetching.result()
         except distributed.KilledWorker as error:
             raise ClusterError(f"{FAILURES_ALLOWED} workers died with the same iterations in hand; is there too little memory?") from error
-        except distributed.CancelledError as error:
+        except (distributed.CancelledError, asyncio.CancelledError, concurrent.futures.CancelledError) as error:
             raise ClusterError("the scheduler has forgotten what was asked of it") from error
+        except (TimeoutError, asyncio.TimeoutError):
+            self._drop(batch, copy)
+            self._count_overdue(batch, f"the sums of {batch} could not be fetched within {FETCHING_SECONDS:.0f} s, {HAND_OUTS} times")
+            return False
         except ClusterError:
             raise
+        except ImportError as error:         # the worker lacks what it needs to understand the job
+            raise ClusterError(f"a worker failed: {one_line(error)}") from error
         except Exception as error:
-            raise ClusterError(f"a worker failed: {' '.join(str(error).split())}") from error
+            self._drop(batch, copy)
+            batch.failed_at.append(getattr(error, "address", ""))
+            if len(batch.failed_at) >= ATTEMPTS:
+                raise ClusterError(str(error) if isinstance(error, IterationError) else f"a worker failed: {one_line(error)}") from error
+            return False
+        self._waiting.remove(batch)
+        for other in list(batch.copies):
+            self._drop(batch, other)
+        self._session.sums.merge(arrays, done)
+        self.gathering = fetched - copy.fetching_since + time.perf_counter() - start
+        self._seconds_per_iteration = seconds / len(done)
+        if not self._usual:
+            self._first_took = self._watch.now - copy.since
+        self._usual.append(self._seconds_per_iteration)
+        return True

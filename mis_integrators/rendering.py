@@ -21,6 +21,7 @@ class Interrupt:
     def __init__(self) -> None:
         self.requested = False
         self.have_result = False
+        """Whether there are iterations enough for an image."""
         self.stopped = False
         """Whether an interrupt has stopped what was being done."""
 
@@ -112,7 +113,7 @@ def iterate(
 ) -> None:
     """Iterate until there are as many iterations as ``planned``, ``seconds`` of rendering have passed, or the error reaches its target,
     whichever is first of those that are given, or the user interrupts; but at least as many as an image needs. A session that has enough already is
-    left as it is. Its remarks, if it has some, are said once.
+    left as it is. Its remarks, if it has some, are said once. A session that only waits for others may return from ``iterate`` with nothing new.
     """
 
     def enough() -> bool:
@@ -122,12 +123,15 @@ def iterate(
             or (target is not None and target.reached(session))
         )
 
-    interrupt.have_result = session.iterations > 0
     remarked = False
-    while session.iterations < fewest_iterations(session) or not (enough() or interrupt.requested):
+    while True:
+        interrupt.have_result = session.iterations >= fewest_iterations(session)
+        if interrupt.have_result and (enough() or interrupt.requested):
+            return
         with clock:
             session.iterate()
-        interrupt.have_result = True
+        if not session.iterations:
+            continue
         if not remarked:
             remarked = True
             for remark in getattr(session, "remarks", []):

@@ -1,9 +1,13 @@
 """Renders whose iterations are spread over processes: the image is that of one process, whatever happens to workers."""
 
+import asyncio
 import os
 import signal
 import subprocess
+import sys
+import threading
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +15,7 @@ from lamplit import ROOT, command, read, render, run, same, write_scene
 
 from mis_integrators import checkpoint, cluster
 from mis_integrators.opening import Request
-from mis_integrators.sums import Iterations
+from mis_integrators.sums import Iterations, Sums
 
 pytest.importorskip("distributed", reason="dask.distributed is not installed: pip install 'mis-integrators[cluster]'")
 
@@ -31,6 +35,13 @@ def client():
 def request_for(scene, plugin, spp, **parameters) -> Request:
     return Request(scene=str(scene), variables={"size": "48"}, plugin=plugin, parameters=parameters, variant="llvm_ad_rgb", sensor=0,
                    all_views=False, seed=7, spp=spp, fine=True)
+
+
+def iterate_for(session, seconds, until=lambda: False) -> None:
+    """Poll until something is so, for so many seconds at most."""
+    deadline = time.monotonic() + seconds
+    while time.monotonic() < deadline and not until():
+        session.iterate()
 
 
 def test_image_is_that_of_one_process(scene, tmp_path, client):
@@ -60,7 +71,7 @@ def test_killed_worker_costs_its_iterations_only(scene, client, monkeypatch):
     deadline = time.monotonic() + 60
     while not (victims := [worker for worker, keys in client.processing().items() if keys]) and time.monotonic() < deadline:
         session.iterate()
-    in_hand, before = sum(map(len, session._waiting.values())), session.iterations
+    in_hand, before = sum(len(batch.numbers) for batch in session._waiting), session.iterations
     os.kill(pids[victims[0]], signal.SIGKILL)
     while session.iterations < 60:
         session.iterate()
@@ -76,7 +87,7 @@ def test_worker_that_sees_another_scene_is_an_error(scene, client, tmp_path):
     session = cluster.DistributedSession(client, opened, False, 1)
     (tmp_path / "lamp.xml").write_text((tmp_path / "lamp.xml").read_text().replace("5, 4", "5, 5"))
     with pytest.raises(cluster.ClusterError, match="a worker sees another render.*lamp.xml has changed"):
-        session.iterate()
+        iterate_for(session, 60)
 
 
 def test_workers_are_told_what_a_pilot_found(scene, client):
@@ -119,8 +130,8 @@ def test_processes_of_this_machine_and_ctrl_c(scene, tmp_path):
         while not (tmp_path / "a.checkpoint").exists() and time.monotonic() < deadline and process.poll() is None:
             time.sleep(0.01)
         os.killpg(process.pid, signal.SIGINT)
-        assert process.wait(timeout=60) == 130
-        assert "interrupted after" in process.stderr.read()
+        error = process.communicate(timeout=60)[1]
+        assert process.returncode == 130 and "interrupted after" in error, error
     finally:
         process.kill()
     done = checkpoint.read(tmp_path / "a.checkpoint").done
@@ -160,3 +171,283 @@ def test_numbers_are_handed_out_once(scene):
     while numbers := session._take_numbers(2):
         handed_out += numbers
     assert handed_out == [2, 3, 5, 6, 8, 9, 10, 11]
+
+
+@pytest.fixture
+def impatient(monkeypatch):
+    """Workers are silent, and given up, after seconds."""
+    for name, seconds in (("SILENCE", 2.0), ("PATIENCE", 2.0), ("ANSWER_SECONDS", 2.0), ("SECONDS_PER_BATCH", 0.2), ("CLOSING_SECONDS", 2.0)):
+        monkeypatch.setattr(cluster, name, seconds)
+
+
+def test_stopped_worker_costs_its_iterations_only(scene, client, impatient):
+    """One of two workers hangs with iterations in hand: the other does them, and those that remain; each is summed once."""
+    request = request_for(scene, "bdpm", 60, bdd=0, initial_radius=0.2)
+    whole = request.open().session
+    for _ in range(60):
+        whole.iterate()
+    pids = client.run(os.getpid)
+    session = cluster.DistributedSession(client, request.open(), False, 1)
+    iterate_for(session, 60, lambda: session.iterations >= 3)
+    victim = list(pids)[0]
+    iterate_for(session, 60, lambda: client.processing()[victim])
+    os.kill(pids[victim], signal.SIGSTOP)
+    try:
+        stuck, before = client.processing()[victim], session.iterations
+        iterate_for(session, 60, lambda: session.iterations == 60)
+        assert stuck and before < 60 and session._watch.silent == {victim}
+    finally:
+        os.kill(pids[victim], signal.SIGCONT)
+    assert session.sums.done == Iterations(60)
+    assert same(whole.image(), session.image())
+    iterate_for(session, 20, lambda: not session._watch.silent)     # a worker that is heard of again counts again
+    assert set(session._watch.present) == set(pids)
+
+
+def test_no_worker_is_heard_of(scene, client, impatient):
+    """Before the first result, too. Polls stay short meanwhile, so signals and clocks are heeded."""
+    pids = client.run(os.getpid)
+    session = cluster.DistributedSession(client, request_for(scene, "path", 60).open(), False, 1)
+    for pid in pids.values():
+        os.kill(pid, signal.SIGSTOP)
+    polls, start = [], time.monotonic()
+    try:
+        with pytest.raises(cluster.ClusterError, match="there has been no worker for 2 s.*the 2 that it knows"):
+            while True:
+                polls.append(time.monotonic())
+                session.iterate()
+    finally:
+        for pid in pids.values():
+            os.kill(pid, signal.SIGCONT)
+    assert 4 < time.monotonic() - start < 15 and max(np.diff(polls[1:])) < 2
+    assert session.iterations == 0
+
+
+def test_scheduler_that_hangs(scene, tmp_path, impatient, monkeypatch):
+    """It is waited for in vain for a while, and left within seconds."""
+    monkeypatch.setattr(cluster, "PATIENCE", 60.0)
+    file = tmp_path / "scheduler.json"
+    arguments = ["-c", "from dask.__main__ import main; main()", "scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard",
+                 "--scheduler-file", str(file)]
+    process = subprocess.Popen([sys.executable, *arguments], stderr=subprocess.PIPE, text=True)
+    try:
+        address = next(line.split()[-1] for line in process.stderr if "Scheduler at:" in line)
+        with pytest.raises(cluster.ClusterError, match="the scheduler has not answered for 2 s"):
+            with cluster.connected(None, address) as client:
+                session = cluster.DistributedSession(client, request_for(scene, "path", 4).open(), False, 1)
+                session.iterate()
+                process.send_signal(signal.SIGSTOP)
+                start = time.monotonic()
+                iterate_for(session, 20)
+        assert time.monotonic() - start < 12
+    finally:
+        process.kill()
+
+
+@pytest.mark.parametrize("end", ["time", "SIGTERM"])
+def test_only_worker_is_stopped(scene, tmp_path, end):
+    """The time limit and SIGTERM are heeded while nothing comes in: what there is is written, and no process stays."""
+    import psutil
+
+    options = ["-i", "bdpt", "-D", "size=48", "-o", tmp_path / "a.exr", "--checkpoint", 0.2, "--workers", 1]
+    process = subprocess.Popen(command(scene, *options, *(["--time", 7] if end == "time" else ["--spp", 10**6])), cwd=ROOT, stderr=subprocess.PIPE,
+                               text=True, start_new_session=True)
+    try:
+        deadline = time.monotonic() + 100
+        while not (tmp_path / "a.checkpoint").exists() and time.monotonic() < deadline and process.poll() is None:
+            time.sleep(0.01)
+        workers = [child for child in psutil.Process(process.pid).children() if "spawn_main" in " ".join(child.cmdline())]
+        assert len(workers) == 1
+        workers[0].suspend()
+        start = time.monotonic()
+        if end == "SIGTERM":
+            time.sleep(1)
+            process.send_signal(signal.SIGTERM)
+        error = process.communicate(timeout=60)[1]
+        assert time.monotonic() - start < 20
+        assert process.returncode == (0 if end == "time" else 130), error
+        assert ("interrupted after" in error) == (end == "SIGTERM")
+        assert not workers[0].is_running()
+    finally:
+        process.kill()
+    done = checkpoint.read(tmp_path / "a.checkpoint").done
+    assert 0 < len(done) == read(tmp_path / "a.exr")[0]["iterations"]
+
+
+COUNT_OPENINGS = """
+from mis_integrators.opening import Request
+if not hasattr(Request, "open_itself"):
+    Request.open_itself = Request.open
+    def count(self, *rest):
+        Request.tries += 1
+        return self.open_itself(*rest)
+    Request.open = count
+Request.tries = 0
+"""
+
+
+def test_scene_that_a_worker_cannot_open_is_tried_once(scene, client):
+    client.run(exec, COUNT_OPENINGS, {})
+    session = cluster.DistributedSession(client, request_for(scene, "path", 1).open(), False, 1)
+    (scene.parent / "lamp.xml").write_text("<scene>")
+    with pytest.raises(cluster.ClusterError, match="a worker cannot open the scene: .*lamp.xml.*tcp://127.0.0.1") as raised:
+        iterate_for(session, 60)
+    assert "\n" not in str(raised.value) and "Traceback" not in str(raised.value)
+    assert sum(client.run(eval, "__import__('mis_integrators').opening.Request.tries").values()) == 1
+
+
+def test_iteration_that_fails_is_tried_once_more_elsewhere(scene, client, monkeypatch):
+    session = cluster.DistributedSession(client, request_for(scene, "path", 8).open(), False, 1)
+    numbers = iter([[0], [1, -1], [2]])                 # the sums refuse a negative iteration, or numpy such a seed
+    monkeypatch.setattr(session, "_take_numbers", lambda workers: next(numbers, []))
+    sent, send = [], session._send
+    monkeypatch.setattr(session, "_send", lambda batch, workers: (sent.append(batch), send(batch, workers)))
+    with pytest.raises(cluster.ClusterError, match="a worker failed: .*negative.*tcp://127.0.0.1"):
+        iterate_for(session, 60)
+    (failed,) = [batch for batch in session._waiting if batch.failed_at]
+    assert failed.numbers == [1, -1] and sent.count(failed) == 2 and set(failed.failed_at) == set(client.run(os.getpid))
+    assert session.sums.done in (Iterations(1), Iterations(1, (2,)), Iterations(0, (2,)), Iterations())
+
+
+class FakeFuture:
+    def __init__(self, key: str, workers):
+        self.key, self.workers, self.result, self.released, self._finished = key, workers, None, False, False
+        self._callbacks = []
+
+    def add_done_callback(self, callback):
+        self._callbacks.append(callback)
+
+    def done(self) -> bool:
+        return self._finished
+
+    def finish(self, result) -> None:
+        self.result, self._finished = result, True
+        for callback in self._callbacks:
+            callback(self)
+
+    def release(self) -> None:
+        self.released = True
+
+
+class FakeClient:
+    """A client of two workers that do nothing until they are told to: what is handed out, and by whom it is held, is in ``futures``."""
+
+    status = "running"
+
+    def __init__(self):
+        self.futures, self.heartbeats = [], {"one": 0.0, "two": 0.0}
+        self.loop = SimpleNamespace(asyncio_loop=asyncio.new_event_loop())
+        self.scheduler = self
+        threading.Thread(target=self.loop.asyncio_loop.run_forever, daemon=True).start()
+
+    def submit(self, function, job, numbers, pure, retries, workers):
+        assert retries == 0
+        loads = {name: sum(future.workers == [name] for future in self.futures) for name in workers or self.heartbeats}
+        self.futures.append(FakeFuture(f"{len(self.futures)}: {numbers}", [min(loads, key=loads.get)]))
+        return self.futures[-1]
+
+    async def identity(self, n_workers):
+        return {"workers": {name: {"last_seen": seen} for name, seen in self.heartbeats.items()}}
+
+    async def processing(self, workers):
+        return {name: [future.key for future in self.futures if future.workers == [name] and not (future.done() or future.released)]
+                for name in self.heartbeats}
+
+    async def who_has(self, keys):
+        return {future.key: future.workers for future in self.futures if future.key in keys and future.done()}
+
+    async def gather(self, future, asynchronous):
+        if isinstance(future.result, Exception):
+            raise future.result
+        return future.result
+
+
+@pytest.fixture
+def fakes(scene, monkeypatch):
+    """A session of five iterations with a fake client; the other sums are how often each iteration was added."""
+    monkeypatch.setattr(cluster, "POLL_SECONDS", 0.1)
+    monkeypatch.setattr(cluster, "LOOKING_SECONDS", 0.0)
+    for name in ("SILENCE", "PATIENCE", "ANSWER_SECONDS"):
+        monkeypatch.setattr(cluster, name, float("inf"))
+    client, session = FakeClient(), SimpleNamespace(sums=Sums(), iterations_planned=5, learned={}, start=lambda: None)
+    opened = SimpleNamespace(session=session, identity=dict, request=request_for(scene, "path", 5))
+    yield client, cluster.DistributedSession(client, opened, False, 1)
+    client.loop.asyncio_loop.call_soon_threadsafe(client.loop.asyncio_loop.stop)
+
+
+def sums_of(*numbers):
+    return {"count": np.bincount(numbers, minlength=5).astype(float)}, Iterations(0, numbers), 0.1 * len(numbers)
+
+
+def pass_time(session, seconds) -> None:
+    """Let seconds pass in which nothing comes in."""
+    session._watch.now += seconds
+    for _ in range(2):
+        session.iterate()
+
+
+def test_overdue_batches_are_handed_to_others_and_duplicates_dropped(fakes):
+    client, session = fakes
+    session.iterate()
+    assert [future.key for future in client.futures] == ["0: [0]", "1: [1]", "2: [2]", "3: [3]"] and session.sums.done == Iterations()
+    pass_time(session, 10000)                            # before the first result nobody knows how long it takes
+    assert len(client.futures) == 4
+    session._watch.now = 10.0
+    for batch in session._waiting:
+        batch.copies[0].since = 10.0
+    client.futures[0].finish(sums_of(0))
+    iterate_for(session, 10, lambda: len(client.futures) == 5)
+    assert session.sums.done == Iterations(1) and client.futures[0].released and client.futures[4].key == "4: [4]"
+    pass_time(session, 20)
+    assert len(client.futures) == 5                      # 30 seconds are allowed, and ten times that of an iteration
+    pass_time(session, 20)
+    again = client.futures[5:]
+    assert [future.key.partition(" ")[2] for future in again] == ["[1]", "[2]", "[3]", "[4]"]
+    for future, first in zip(again, client.futures[1:5]):
+        assert future.workers != first.workers and not first.released
+    client.futures[1].finish(sums_of(1))                 # the first copy comes after all, and so does the second, at the same time
+    again[0].finish(sums_of(1))
+    again[1].finish(sums_of(2))                          # of this one only the second comes in time
+    iterate_for(session, 10, lambda: len(session.sums.done) == 3)
+    assert again[0].released and client.futures[1].released and client.futures[2].released
+    client.futures[2].finish(sums_of(2))
+    pass_time(session, 1)
+    with pytest.raises(cluster.ClusterError, match="no worker has finished iteration [34] in 31 s, 3 times"):
+        pass_time(session, 60)
+        pass_time(session, 60)
+    assert session.sums.done == Iterations(3)
+    np.testing.assert_array_equal(session.sums["count"], [1, 1, 1, 0, 0])
+
+
+def test_time_in_which_the_gatherer_itself_was_stopped_does_not_count(fakes, monkeypatch):
+    client, session = fakes
+    session.iterate()
+    later = time.monotonic() + 10000
+    monkeypatch.setattr(cluster.time, "monotonic", lambda: later)
+    session._watch.look([])
+    monkeypatch.undo()
+    assert session._watch.now < 5 and not session._watch.silent
+
+
+def test_sums_that_cannot_be_fetched(fakes, monkeypatch):
+    """They are asked of another worker, three times at most."""
+    client, session = fakes
+    session._session.iterations_planned = 1
+    session.iterate()
+    for count in (1, 2):
+        client.futures[-1].finish(TimeoutError())
+        iterate_for(session, 10, lambda: len(client.futures) == count + 1)
+    client.futures[-1].finish(TimeoutError())
+    with pytest.raises(cluster.ClusterError, match="the sums of iteration 0 could not be fetched"):
+        iterate_for(session, 10)
+
+
+@pytest.mark.parametrize("address, message", [
+    ("tls://127.0.0.1:9", "distributed.comm.tls.ca-file"), ("nonsense", "no scheduler at nonsense: "), ("http://x:1", "no scheduler at http://x:1: "),
+    ("::::", "no scheduler at ::::"), ("tcp://127.0.0.1:x", "no scheduler at tcp://127.0.0.1:x: "), ("inproc://1", "no scheduler at inproc://1: ")])
+def test_addresses_that_are_none(address, message, monkeypatch):
+    monkeypatch.setattr(cluster, "CONNECTION_SECONDS", 1)
+    with pytest.raises(cluster.ClusterError, match=message) as raised:
+        with cluster.connected(None, address):
+            pass
+    assert "\n" not in str(raised.value)
