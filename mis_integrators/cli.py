@@ -22,7 +22,7 @@ from .progress import Progress
 from .rendering import Chore, Clock, Interrupt, fewest_iterations, iterate
 from .session import Session
 from .stopping import TargetError
-from .transport import traits
+from .transport.traits import unfinite_data
 from .untrusted import Malformed
 
 EXIT_OK, EXIT_SCENE, EXIT_USAGE, EXIT_OUTPUT, EXIT_CHECKPOINT, EXIT_CLUSTER, EXIT_INTERRUPTED = 0, 1, 2, 3, 4, 5, 130
@@ -73,8 +73,8 @@ def _render_alone(options: argparse.Namespace, interrupt: Interrupt) -> int:
             learned = _follow(options) if options.like else {}
             needs_views = "--all-views" if options.all_views else "--frames" if options.frames else None
             opened = _request(options).open(needs_views)
-            for description in getattr(traits, "unfinite_data", lambda _: [])(opened.loaded.scene):
-                _warn(f"{description}: values that are not finite (NaN or infinite); what they light or colour is left out of the image")
+            for description in unfinite_data(opened.loaded.scene):
+                _warn(f"{description} (NaN or infinite): what they light or colour is left out of the image")
             session: Any = opened.session
             if learned:
                 _recall_image(session, learned, options)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 from typing import Any, Iterable
 
 LONGEST_JSON = 1 << 24
@@ -141,7 +142,7 @@ class Fields:
 
 def is_number(value: object) -> bool:
     """Whether a JSON value is a finite number."""
-    return type(value) in (int, float) and abs(value) <= 1.7e308  # type: ignore[operator]
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
 
 
 def is_text(value: object) -> bool:

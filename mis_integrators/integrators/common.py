@@ -107,9 +107,10 @@ class IterativeIntegrator(mi.AdjointIntegrator):
                                      f"camera_paths = {camera_paths}")
 
     def say_unfinite(self, session):
-        """Warns where values of a session that are not finite were left out."""
+        """Warns where values of a session that are not finite were left out, and names the data of the scene that may be to blame."""
         if pixels := session.unfinite_pixels():
-            mi.Log(mi.LogLevel.Warn, f"{self.plugin}: {pixels} pixels had values that are not finite, which are left out")
+            causes = "; ".join(unfinite_data(session.scene))
+            mi.Log(mi.LogLevel.Warn, f"{self.plugin}: {pixels} pixels had values that are not finite, which are left out" + (f": {causes}" if causes else ""))
 
     def _sensor(self, scene, sensor):
         check_variant(scene, self.plugin)
