@@ -386,8 +386,16 @@ def test_fingerprint_is_of_every_source(tmp_path):
     shutil.copytree(ROOT / "mis_integrators", tmp_path / "mis_integrators", ignore=shutil.ignore_patterns("__pycache__"))
     before = fingerprint_of(tmp_path)
     assert before == fingerprint_of(ROOT) and len(before.strip()) == 12
-    module = tmp_path / "mis_integrators" / "weights" / "mis2.py"
+    module = tmp_path / "mis_integrators" / "weights" / "heuristics.py"
     module.write_text(module.read_text() + "\n")
     changed = fingerprint_of(tmp_path)
     module.rename(module.with_name("mis9.py"))
     assert len({before, changed, fingerprint_of(tmp_path)}) == 3
+
+
+def test_texel_is_named_from_python(spotted, tmp_path, capfd):
+    scene = mi.load_file(str(spotted), picture=str(tmp_path / "nan.exr"), size="16")
+    image = np.array(mi.load_dict({"type": "bdpt"}).render(scene, spp=4))
+    assert np.isfinite(image).all()
+    said = "".join(capfd.readouterr())
+    assert said.count("bdpt: ") == 1 and "reflectance.data of BitmapTexture" in said

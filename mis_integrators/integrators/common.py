@@ -13,7 +13,7 @@ from ..transport.film import Accumulator, shared_wavelengths, variance_channels
 from ..transport.packing import rounded_up
 from ..transport.random import mix
 from ..transport.recording import settle
-from ..transport.traits import UnsupportedScene, check_film, check_scene, check_variant
+from ..transport.traits import UnsupportedScene, check_film, check_scene, check_variant, unfinite_data
 from ..turns import TURN, by_turns
 from ..untrusted import Fields
 from .parameters import Parameters
