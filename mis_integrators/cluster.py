@@ -160,7 +160,8 @@ def connected(workers: int | None, scheduler: str | None) -> Iterator[Any]:
     except ImportError as error:
         raise ClusterError(f"dask.distributed is missing ({error}): pip install 'mis-integrators[cluster]'") from error
 
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    for name in ("distributed", "distributed.client"):       # Dask sets levels for both when it is imported
+        logging.getLogger(name).setLevel(logging.CRITICAL)
     quiet = {"logging.distributed": "critical", "distributed.scheduler.allowed-failures": FAILURES_ALLOWED}
     with dask.config.set(quiet), contextlib.ExitStack() as stack:
         try:
@@ -366,6 +367,9 @@ class DistributedSession:
         """Hand out anew what does not come back; keep the workers busy with the first iterations that are neither done nor under way."""
         present = self._watch.present
         if not present:
+            for batch in self._waiting:
+                for copy in batch.copies:
+                    copy.since = self._watch.now     # nobody is slow where nobody is
             return
         for batch in self._waiting:
             if self._needs_another(batch):
@@ -456,7 +460,7 @@ class DistributedSession:
         if errors:
             raise errors[0]
         copies = [copy for batch in self._waiting for copy in batch.copies]
-        free = FETCHES - sum(copy.fetching is not None for copy in copies)
+        free = FETCHES - sum(copy.fetching is not None and self._watch.holders.get(copy.future.key) not in self._watch.silent for copy in copies)
         for copy in [copy for copy in copies if copy.fetching is None and copy.future.done()][:max(0, free)]:
             copy.fetching_since = time.perf_counter()
             copy.fetching = asyncio.run_coroutine_threadsafe(self._fetch(copy.future), self._client.loop.asyncio_loop)

@@ -223,23 +223,22 @@ def test_no_worker_is_heard_of(scene, client, impatient):
     assert session.iterations == 0
 
 
-def test_scheduler_that_hangs(scene, tmp_path, impatient, monkeypatch):
-    """It is waited for in vain for a while, and left within seconds."""
+@pytest.mark.parametrize("end, message", [(signal.SIGSTOP, "the scheduler has not answered for 2 s"), (signal.SIGKILL, "the scheduler is gone")])
+def test_scheduler_that_ends(scene, impatient, monkeypatch, capfd, end, message):
+    """One that hangs is waited for in vain for a while; both are left within seconds, and Dask says nothing of its own."""
     monkeypatch.setattr(cluster, "PATIENCE", 60.0)
-    file = tmp_path / "scheduler.json"
-    arguments = ["-c", "from dask.__main__ import main; main()", "scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard",
-                 "--scheduler-file", str(file)]
+    arguments = ["-c", "from dask.__main__ import main; main()", "scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard"]
     process = subprocess.Popen([sys.executable, *arguments], stderr=subprocess.PIPE, text=True)
     try:
         address = next(line.split()[-1] for line in process.stderr if "Scheduler at:" in line)
-        with pytest.raises(cluster.ClusterError, match="the scheduler has not answered for 2 s"):
+        with pytest.raises(cluster.ClusterError, match=message):
             with cluster.connected(None, address) as client:
                 session = cluster.DistributedSession(client, request_for(scene, "path", 4).open(), False, 1)
                 session.iterate()
-                process.send_signal(signal.SIGSTOP)
+                process.send_signal(end)
                 start = time.monotonic()
                 iterate_for(session, 20)
-        assert time.monotonic() - start < 12
+        assert time.monotonic() - start < 12 and capfd.readouterr().err == ""
     finally:
         process.kill()
 
@@ -372,7 +371,9 @@ def fakes(scene, monkeypatch):
     client, session = FakeClient(), SimpleNamespace(sums=Sums(), iterations_planned=5, learned={}, start=lambda: None)
     opened = SimpleNamespace(session=session, identity=dict, request=request_for(scene, "path", 5))
     yield client, cluster.DistributedSession(client, opened, False, 1)
-    client.loop.asyncio_loop.call_soon_threadsafe(client.loop.asyncio_loop.stop)
+    loop = client.loop.asyncio_loop
+    asyncio.run_coroutine_threadsafe(asyncio.sleep(0.1), loop).result()
+    loop.call_soon_threadsafe(loop.stop)
 
 
 def sums_of(*numbers):
@@ -440,6 +441,35 @@ def test_sums_that_cannot_be_fetched(fakes, monkeypatch):
     client.futures[-1].finish(TimeoutError())
     with pytest.raises(cluster.ClusterError, match="the sums of iteration 0 could not be fetched"):
         iterate_for(session, 10)
+
+
+def test_sums_in_a_worker_that_hangs_are_asked_of_another(fakes, monkeypatch):
+    """Batches were finished, but their sums cannot be fetched: this keeps nobody from fetching those of others."""
+    client, session = fakes
+    session.iterate()
+    hanging = [future for future in client.futures if future.workers == ["one"]]
+    never = asyncio.run_coroutine_threadsafe(asyncio.sleep(1000), client.loop.asyncio_loop)
+    monkeypatch.setattr(client, "gather", lambda future, asynchronous, gather=client.gather:
+                        asyncio.wrap_future(never, loop=client.loop.asyncio_loop) if future in hanging else gather(future, asynchronous))
+    for future in hanging:
+        future.finish(None)
+    pass_time(session, 0)
+    monkeypatch.setattr(cluster, "SILENCE", 0.5)
+    for _ in range(8):
+        client.heartbeats["two"] += 1
+        session.iterate()
+    assert session._watch.silent == {"one"} and [future.workers for future in client.futures] == [["one"], ["two"]] * 2 + [["two"]] * 2
+    for future in client.futures[1:]:
+        if future not in hanging:
+            future.finish(sums_of(*eval(future.key.partition(" ")[2])))
+
+    def beat():
+        client.heartbeats["two"] += 1
+        return len(session.sums.done) == 4
+
+    iterate_for(session, 10, beat)
+    assert session.sums.done == Iterations(4) and all(future.released for future in client.futures[:6])
+    never.cancel()
 
 
 @pytest.mark.parametrize("address, message", [
