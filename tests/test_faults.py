@@ -141,7 +141,7 @@ def test_bad_pixels_of_many_views(scene, rgb):
     loaded = loading.load(scene, {"size": "16"}, "volpath_multiview", {})
 
     def session():
-        return make_session(loaded.integrator, loaded.scene, loaded.scene.sensors()[0], 3, 16)
+        return make_session(loaded.integrator, loaded.scene, loaded.scene.sensors()[0], 3, 64)
 
     clean, spoiled = session(), session()
     add = ViewAccumulator.add
@@ -163,7 +163,8 @@ def test_bad_pixels_of_many_views(scene, rgb):
     one, other = clean.image(), spoiled.image()
     changed = ~np.isclose(one, other, rtol=1e-4, atol=1e-6).all(axis=2)
     assert 0 < spoiled.unfinite_pixels() <= 18 and changed.sum() <= 18 and np.isfinite(other).all()
-    assert other[changed].mean() == pytest.approx(one[changed].mean(), rel=0.5)
+    # Five of eight iterations of the same eight paths a pixel, over 18 pixels: a standard deviation of about 3 %.
+    assert other[changed].mean() == pytest.approx(one[changed].mean(), rel=0.2)
 
 
 def test_black_image_is_said(scene, tmp_path, capsys):
