@@ -169,13 +169,17 @@ def connected(workers: int | None, scheduler: str | None) -> Iterator[Any]:
             if scheduler:
                 _check_address(scheduler)
             if workers:
-                cluster = distributed.LocalCluster(n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=None,
+                stack.enter_context(_no_process_left())
+                # Its workers come later: were they waited for here, an interrupt would leave nothing that could be closed.
+                cluster = distributed.LocalCluster(n_workers=0, threads_per_worker=1, processes=True, dashboard_address=None,
                                                    memory_limit=None, silence_logs=logging.CRITICAL)
                 stack.callback(_close_cluster, cluster)
+                cluster.scale(workers)
             client = distributed.Client(cluster, timeout=CONNECTION_SECONDS)
             stack.callback(_close_client, client)
             if workers:
                 client.register_plugin(_interrupt_plugin(distributed))
+                client.wait_for_workers(workers, timeout=PATIENCE)
         except Exception as error:           # Dask raises errors of many kinds for an address that is none
             raise ClusterError(_why_not_connected(scheduler, error)) from error
         yield client
@@ -204,14 +208,21 @@ def _close_client(client: Any) -> None:
 
 
 def _close_cluster(cluster: Any) -> None:
-    """End local workers, those that hang by force."""
-    pids = {nanny.pid for nanny in cluster.workers.values()}
+    """Let local workers end."""
+    with contextlib.suppress(Exception):     # one that hangs may not
+        cluster.close(timeout=CLOSING_SECONDS)
+    cluster.shutdown_on_close = False        # else Dask tries again at exit
+
+
+@contextlib.contextmanager
+def _no_process_left() -> Iterator[None]:
+    """End worker processes that were started in this context by force, if they are still there: a process that is stopped would be waited for at exit."""
+    before = multiprocessing.active_children()
     try:
-        with contextlib.suppress(Exception):
-            cluster.close(timeout=CLOSING_SECONDS)
+        yield
     finally:
         for process in multiprocessing.active_children():
-            if process.pid in pids:
+            if process not in before and process.name.startswith("Dask Worker"):
                 process.kill()
 
 

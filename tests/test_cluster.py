@@ -273,6 +273,25 @@ def test_only_worker_is_stopped(scene, tmp_path, end):
     assert 0 < len(done) == read(tmp_path / "a.exr")[0]["iterations"]
 
 
+def test_worker_that_is_stopped_while_it_starts(scene, tmp_path):
+    """Interrupted then, the command ends at once, says one line, and leaves no process."""
+    import psutil
+
+    process = subprocess.Popen(command(scene, "-o", tmp_path / "a.exr", "--workers", 1), cwd=ROOT, stderr=subprocess.PIPE, text=True)
+    try:
+        workers, deadline = [], time.monotonic() + 60
+        while not workers and time.monotonic() < deadline:
+            workers = [child for child in psutil.Process(process.pid).children() if "spawn_main" in " ".join(child.cmdline())]
+        workers[0].suspend()
+        time.sleep(1)
+        process.send_signal(signal.SIGTERM)
+        error = process.communicate(timeout=30)[1]
+    finally:
+        process.kill()
+    assert process.returncode == 130 and error == "mis-render: interrupted, nothing written\n"
+    assert not workers[0].is_running()
+
+
 COUNT_OPENINGS = """
 from mis_integrators.opening import Request
 if not hasattr(Request, "open_itself"):
