@@ -216,7 +216,7 @@ def _close_cluster(cluster: Any) -> None:
 
 @contextlib.contextmanager
 def _no_process_left() -> Iterator[None]:
-    """End worker processes that were started in this context by force, if they are still there: a process that is stopped would be waited for at exit."""
+    """End worker processes that were started in this context by force, if they are still there. (One that is stopped would be waited for at exit.)"""
     before = multiprocessing.active_children()
     try:
         yield
@@ -351,7 +351,8 @@ class DistributedSession:
         return getattr(self._session, name)
 
     def iterate(self) -> None:
-        """Add the iterations that workers have finished; wait ``POLL_SECONDS`` for some, at most. Raises ``ClusterError``: what has been added stays."""
+        """Add the iterations that workers have finished; wait ``POLL_SECONDS`` for some, at most. Raises ``ClusterError``; what has been added stays.
+        """
         if self._job is None:
             self._begin()
         end = time.monotonic() + POLL_SECONDS
