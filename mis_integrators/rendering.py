@@ -125,11 +125,13 @@ def iterate(
 
     remarked = False
     while True:
-        interrupt.have_result = session.iterations >= fewest_iterations(session)
-        if interrupt.have_result and (enough() or interrupt.requested):
+        interrupt.have_result = session.iterations > 0
+        if session.iterations >= fewest_iterations(session) and (enough() or interrupt.requested):
             return
         with clock:
             session.iterate()
+        if interrupt.stopped:
+            raise KeyboardInterrupt              # a library has dropped it
         if not session.iterations:
             continue
         if not remarked:
