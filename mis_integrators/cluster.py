@@ -172,7 +172,8 @@ def connected(workers: int | None, scheduler: str | None) -> Iterator[Any]:
                 stack.enter_context(_no_process_left())
                 # Its workers come later: were they waited for here, an interrupt would leave nothing that could be closed.
                 cluster = distributed.LocalCluster(n_workers=0, threads_per_worker=1, processes=True, dashboard_address=None,
-                                                   memory_limit=None, silence_logs=logging.CRITICAL)
+                                                   scheduler_kwargs={"dashboard_address": "127.0.0.1:0"}, memory_limit=None,
+                                                   silence_logs=logging.CRITICAL)
                 stack.callback(_close_cluster, cluster)
                 cluster.scale(workers)
             client = distributed.Client(cluster, timeout=CONNECTION_SECONDS)

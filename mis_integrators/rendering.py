@@ -124,12 +124,11 @@ def iterate(
         )
 
     remarked = False
-    while True:
-        interrupt.have_result = session.iterations > 0
-        if session.iterations >= fewest_iterations(session) and (enough() or interrupt.requested):
-            return
+    interrupt.have_result = session.iterations > 0
+    while session.iterations < fewest_iterations(session) or not (enough() or interrupt.requested):
         with clock:
             session.iterate()
+        interrupt.have_result = session.iterations > 0       # before a chore shows that there is something
         if interrupt.stopped:
             raise KeyboardInterrupt              # a library has dropped it
         if not session.iterations:

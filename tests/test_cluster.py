@@ -1,6 +1,7 @@
 """Renders whose iterations are spread over processes: the image is that of one process, whatever happens to workers."""
 
 import asyncio
+import contextlib
 import os
 import signal
 import subprocess
@@ -243,11 +244,20 @@ def test_scheduler_that_ends(scene, impatient, monkeypatch, capfd, end, message)
         process.kill()
 
 
+def workers_of(process) -> list:
+    """Its worker processes, for psutil."""
+    import psutil
+
+    found = []
+    for child in psutil.Process(process.pid).children():
+        with contextlib.suppress(psutil.Error):          # others of its children may have ended meanwhile
+            found += [child] if "spawn_main" in " ".join(child.cmdline()) else []
+    return found
+
+
 @pytest.mark.parametrize("end", ["time", "SIGTERM"])
 def test_only_worker_is_stopped(scene, tmp_path, end):
     """The time limit and SIGTERM are heeded while nothing comes in: what there is is written, and no process stays."""
-    import psutil
-
     options = ["-i", "bdpt", "-D", "size=48", "-o", tmp_path / "a.exr", "--checkpoint", 0.2, "--workers", 1]
     process = subprocess.Popen(command(scene, *options, *(["--time", 7] if end == "time" else ["--spp", 10**6])), cwd=ROOT, stderr=subprocess.PIPE,
                                text=True, start_new_session=True)
@@ -255,7 +265,7 @@ def test_only_worker_is_stopped(scene, tmp_path, end):
         deadline = time.monotonic() + 100
         while not (tmp_path / "a.checkpoint").exists() and time.monotonic() < deadline and process.poll() is None:
             time.sleep(0.01)
-        workers = [child for child in psutil.Process(process.pid).children() if "spawn_main" in " ".join(child.cmdline())]
+        workers = workers_of(process)
         assert len(workers) == 1
         workers[0].suspend()
         start = time.monotonic()
@@ -275,13 +285,11 @@ def test_only_worker_is_stopped(scene, tmp_path, end):
 
 def test_worker_that_is_stopped_while_it_starts(scene, tmp_path):
     """Interrupted then, the command ends at once, says one line, and leaves no process."""
-    import psutil
-
     process = subprocess.Popen(command(scene, "-o", tmp_path / "a.exr", "--workers", 1), cwd=ROOT, stderr=subprocess.PIPE, text=True)
     try:
         workers, deadline = [], time.monotonic() + 60
         while not workers and time.monotonic() < deadline:
-            workers = [child for child in psutil.Process(process.pid).children() if "spawn_main" in " ".join(child.cmdline())]
+            workers = workers_of(process)
         workers[0].suspend()
         time.sleep(1)
         process.send_signal(signal.SIGTERM)
