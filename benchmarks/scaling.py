@@ -47,13 +47,13 @@ def iterations_a_second(request: Request, workers: int, seconds: float) -> tuple
     """Iterations a second once all workers have compiled, the mean seconds to gather a batch, and the mean iterations of one."""
     with cluster.connected(workers, None) as client:
         session = cluster.DistributedSession(client, request.open(), False, 1)
-        for _ in range(BATCHES_BEFORE * workers):
+        while session.batches < BATCHES_BEFORE * workers:
             session.iterate()
-        start, done, batches, gathering = time.perf_counter(), session.iterations, 0, 0.0
+        start, done, before, gathering = time.perf_counter(), session.iterations, session.batches, []
         while time.perf_counter() - start < seconds:
+            batches = session.batches
             session.iterate()
-            batches += 1
-            gathering += session.gathering
+            gathering += [session.gathering] * (session.batches > batches)
         dr.sync_thread()
-        count = session.iterations - done
-        return count / (time.perf_counter() - start), gathering / batches, count / batches
+        count, batches = session.iterations - done, session.batches - before
+        return count / (time.perf_counter() - start), sum(gathering) / max(len(gathering), 1), count / max(batches, 1)

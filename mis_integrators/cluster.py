@@ -345,6 +345,8 @@ class DistributedSession:
         """Seconds per iteration of the last batches."""
         self._first_took = 0.0
         """Seconds from handing out the first batch that came back until then."""
+        self.batches = 0
+        """Batches that were added."""
         self.gathering = 0.0
         """Seconds that fetching and adding the last batch took: what bounds the number of workers that pay."""
 
@@ -489,6 +491,7 @@ class DistributedSession:
         import distributed
 
         start = time.perf_counter()
+        assert copy.fetching is not None
         try:
             (arrays, done, seconds), fetched = copy.fetching.result()
         except distributed.KilledWorker as error:
@@ -513,6 +516,7 @@ class DistributedSession:
         for other in list(batch.copies):
             self._drop(batch, other)
         self._session.sums.merge(arrays, done)
+        self.batches += 1
         self.gathering = fetched - copy.fetching_since + time.perf_counter() - start
         self._seconds_per_iteration = seconds / len(done)
         if not self._usual:

@@ -93,7 +93,7 @@ class IterativeIntegrator(mi.AdjointIntegrator):
         """Iterations of `camera_paths` that make `spp` camera paths a pixel; None (no planned end) if `spp` is 0."""
         if not spp:
             return None
-        iterations = math.ceil(spp / camera_paths)
+        iterations = -(-spp // camera_paths)
         if self.variance and iterations < 2:
             raise ValueError(f'{self.plugin}: parameter "variance" needs at least two iterations; ask for spp > '
                              f'{camera_paths}')
