@@ -10,14 +10,14 @@ import signal
 
 SIGNALS = signal.SIGINT, signal.SIGTERM
 EXIT_INTERRUPTED = 130
-"""As of ``mis_integrators.cli``."""
+"""As of ``mis_integrators.app.cli``."""
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Run ``mis-render`` with the arguments (default: those of the process) and return its exit code."""
     for number in SIGNALS:
         signal.signal(number, _stop)
-    from mis_integrators import cli
+    from mis_integrators.app import cli
 
     try:
         return cli.main(arguments)

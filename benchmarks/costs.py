@@ -16,7 +16,7 @@ import numpy as np
 from mis_integrators.integrators import costs, light_tracing
 from mis_integrators.integrators.choice import PHOTON_MAPPERS, name_of
 from mis_integrators.integrators.unidirectional import PathSession
-from mis_integrators.transport.census import mean_segments
+from mis_integrators.paths.path_length_statistics import mean_segments
 from reports import show, tell
 from scene_files import open_scene, scaled_size
 

@@ -8,7 +8,7 @@ from typing import Callable, Sequence
 import numpy as np
 
 from methods import Method, SessionMaker, base_of
-from mis_integrators import loading
+from mis_integrators.app import loading
 from mis_integrators.analysis.metrics import References, flip
 from scene_files import OpenScene
 from turns import Contender, Snapshot, take_turns

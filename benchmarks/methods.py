@@ -8,8 +8,9 @@ from typing import Sequence
 
 import mitsuba as mi
 
-from mis_integrators import _plugins, loading
-from mis_integrators.session import MitsubaSession, Session
+from mis_integrators import _plugins
+from mis_integrators.app import loading
+from mis_integrators.core.session import MitsubaSession, Session
 from scene_files import OpenScene
 
 PASS_SECONDS = 0.2

@@ -18,8 +18,8 @@ import mitsuba as mi
 import numpy as np
 
 from mis_integrators.analysis.metrics import RELATIVE_OFFSET
-from mis_integrators import loading
-from mis_integrators.session import PATHS_PER_PASS
+from mis_integrators.app import loading
+from mis_integrators.core.session import PATHS_PER_PASS
 from mis_integrators.volume.shifts import SHIFTS, Sections, majorant_at, optical_depth
 from mis_integrators.volume.views import views_of
 from reports import Row, save, show, tell

@@ -16,7 +16,7 @@ from methods import Method
 from mis_integrators.analysis import charts
 from mis_integrators.analysis.metrics import relative_differences
 from mis_integrators.analysis.zooms import telling_windows
-from mis_integrators.output import write_png
+from mis_integrators.app.output import write_png
 from multiview import Race
 from reports import Row, machine
 

@@ -13,8 +13,8 @@ import OpenEXR
 
 import mis_integrators
 from mis_integrators.analysis.metrics import References
-from mis_integrators.output import write_exr
-from mis_integrators.transport.traits import has_media
+from mis_integrators.app.output import write_exr
+from mis_integrators.core.traits import has_media
 from methods import Method, SessionMaker, parse_method
 from scene_files import OpenScene, fingerprint
 

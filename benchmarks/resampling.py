@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from methods import Method, SessionMaker, parse_method
-from mis_integrators import loading
+from mis_integrators.app import loading
 from mis_integrators.analysis.charts import Line
 from mis_integrators.analysis.confidence import ratio_interval
 from mis_integrators.analysis.metrics import References, errors

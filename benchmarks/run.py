@@ -8,7 +8,7 @@ from pathlib import Path
 
 import mis_integrators  # noqa: F401  (makes LLVM known and registers the plugins)
 import mitsuba as mi
-from mis_integrators import loading
+from mis_integrators.app import loading
 
 mi.set_variant("llvm_ad_rgb")
 

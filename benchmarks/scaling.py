@@ -13,8 +13,8 @@ import time
 
 import drjit as dr
 
-from mis_integrators import cluster
-from mis_integrators.opening import Request
+from mis_integrators.app import cluster
+from mis_integrators.app.request import Request
 from reports import Row, save, show, tell
 from scene_files import scaled_size
 

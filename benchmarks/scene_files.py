@@ -9,7 +9,7 @@ from xml.etree import ElementTree
 
 import mitsuba as mi
 
-from mis_integrators import loading
+from mis_integrators.app import loading
 
 BUNDLED = Path(__file__).resolve().parent.parent / "scenes"
 

@@ -8,7 +8,7 @@ from typing import Sequence
 import mitsuba as mi
 
 from methods import Method, SessionMaker, parse_method
-from mis_integrators import loading
+from mis_integrators.app import loading
 from mis_integrators.analysis.metrics import References
 from mis_integrators.analysis.stability import Point, breaks, choose, judge
 from references import colours, find_references

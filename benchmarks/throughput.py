@@ -12,7 +12,7 @@ import mitsuba as mi
 
 from memory import PeakMemory
 from methods import Method, SessionMaker
-from mis_integrators.transport.gather import mean_photon_count
+from mis_integrators.photons.gather import mean_photon_count
 from reports import Row, save, show, tell
 from scene_files import OpenScene, open_scene
 from turns import Contender, take_turns

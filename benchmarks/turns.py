@@ -10,7 +10,7 @@ from typing import Callable, Sequence
 import drjit as dr
 import numpy as np
 
-from mis_integrators.session import Session
+from mis_integrators.core.session import Session
 from references import colours
 
 SLICE_SECONDS = 0.5

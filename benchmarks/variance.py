@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from methods import Method
-from mis_integrators import loading
+from mis_integrators.app import loading
 from mis_integrators.analysis.metrics import trimmed_mean
 from mis_integrators.analysis.variance_maps import best_single, relative_variance, share_worse
-from mis_integrators.transport.traits import scene_bounds
+from mis_integrators.core.traits import scene_bounds
 from reports import Row, console, save, show, tell
 from scene_files import OpenScene, open_scene, scaled_size
 

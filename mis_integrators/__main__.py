@@ -9,7 +9,7 @@ def main(arguments: list[str]) -> int:
     """Run the command that the first argument names, and return its exit code."""
     name, *rest = arguments or [""]
     if name == "doctor" and not rest:
-        from . import doctor
+        from .app import doctor
 
         return doctor.main()
     if name == "render":

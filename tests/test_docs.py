@@ -11,7 +11,8 @@ from pathlib import Path
 import mitsuba as mi
 import pytest
 
-from mis_integrators import _plugins, options
+from mis_integrators import _plugins
+from mis_integrators.app import options
 
 ROOT = Path(__file__).parent.parent
 PAGES = sorted((ROOT / "docs").glob("*.md"))

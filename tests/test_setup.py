@@ -311,7 +311,7 @@ def test_scalar_variant_says_what_the_plugins_need():
 
 @pytest.mark.parametrize("name, version", [("mitsuba", "3.10.0"), ("mitsuba", "4.0.0.dev1"), ("drjit", "1.6.0")])
 def test_newer_version_is_one_line(name, version):
-    result = run_python(f"import drjit, mitsuba; {name}.__version__ = '{version}'\nimport mis_integrators, mis_integrators.loading")
+    result = run_python(f"import drjit, mitsuba; {name}.__version__ = '{version}'\nimport mis_integrators, mis_integrators.app.loading")
     assert result.returncode == 0 and result.stderr.count("\n") == 1
     assert f"{name} {version} may not work: the newest tested are mitsuba 3.9 and drjit 1.5" in result.stderr
 

@@ -18,7 +18,9 @@ from hypothesis.extra.numpy import arrays
 import discrete_worlds as worlds
 import test_resampling
 from test_resampling import test_any_pmf_is_unbiased, test_densities_are_those_of_the_variance, test_variance_is_exact  # noqa: F401
-from mis_integrators.weights import heuristics, mis2, mis3, recursion
+import mis2
+import mis3
+from mis_integrators.weights import heuristics, recursion
 
 GENERATED = [(K, seed) for K in (2, 3, 4, 5) for seed in range(6)]
 

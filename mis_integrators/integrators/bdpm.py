@@ -7,19 +7,19 @@ import time
 import drjit as dr
 import mitsuba as mi
 
-from ..transport.camera_pass import film_sample_count, trace_camera_paths
-from ..transport.coverage import covered_share
-from ..transport.film import splat_samples
-from ..transport.gather import gather_photons
-from ..transport.light_pass import trace_light_paths
-from ..transport.lights import Lights
-from ..transport.packing import rounded_up
-from ..transport.photon_map import PhotonMap, build_photon_map, smallest_cell
-from ..transport.recording import recorder
-from ..transport.traits import SceneTraits, lookup
-from ..untrusted import Fields
+from ..paths.camera_pass import film_sample_count, trace_camera_paths
+from ..photons.coverage import covered_share
+from ..core.film import splat_samples
+from ..photons.gather import gather_photons
+from ..paths.light_pass import trace_light_paths
+from ..lights.lights import Lights
+from ..core.packing import rounded_up
+from ..photons.grid import PhotonMap, build_photon_map, smallest_cell
+from ..core.recording import recorder
+from ..core.traits import SceneTraits, lookup
+from ..core.untrusted import Fields
 from .common import MOST_LIGHT_PATHS, IterativeIntegrator, IterativeSession
-from .pilot import choose_radii
+from ..pilot.run import choose_radii
 from .schedule import read_radius, shrunk
 
 SPARE_PHOTONS = 1 << 20

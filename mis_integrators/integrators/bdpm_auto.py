@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import mitsuba as mi
 
-from ..transport.traits import check_scene, has_media
-from ..untrusted import Fields
+from ..core.traits import check_scene, has_media
+from ..core.untrusted import Fields
 from ..volume.traits import check_volume_scene
 from .bdpm import BDPM
 from .choice import CANDIDATES, Decision, choose, handed_on, new_session

@@ -5,7 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from .heuristic import HeuristicWeights
+from ..mis.heuristic import HeuristicWeights
 from .weighted import WeightedBDPM, WeightedSession
 
 

@@ -7,11 +7,11 @@ import math
 import drjit as dr
 import mitsuba as mi
 
-from ..transport.irradiance_cache import IrradianceCache
-from ..transport.light_pass import trace_light_paths
+from ..photons.irradiance_cache import IrradianceCache
+from ..paths.light_pass import trace_light_paths
 from .common import MOST_LIGHT_PATHS
-from .optimal import OptimalWeights
-from .surroundings import Surroundings
+from ..mis.optimal import OptimalWeights
+from ..mis.neighbour_radiance import Surroundings
 from .weighted import WeightedBDPM, WeightedSession
 
 USUAL_FROZEN_PATHS = 1 << 17

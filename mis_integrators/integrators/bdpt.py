@@ -7,19 +7,18 @@ from functools import partial
 import drjit as dr
 import mitsuba as mi
 
-from ..transport.connections import by_path, join, join_sensor, list_pairs, visible
-from ..transport.film import (as_camera_weights, colour_channels, expected_weight, splat_channels, splat_samples,
-                              with_colour)
-from ..transport.lenses import Lens
-from ..transport.lights import Lights
-from ..transport.packing import rounded_up
-from ..transport.random import next_2d, vertex_streams
-from ..transport.recording import lanes, recorder
-from ..transport.spectra import channel_mean
-from ..transport.subpaths import read_vertices, trace_camera_subpaths, trace_light_subpaths
-from ..transport.traits import SceneTraits
+from ..paths.connect import by_path, join, join_sensor, list_pairs, visible
+from ..core.film import as_camera_weights, colour_channels, expected_weight, splat_channels, splat_samples, with_colour
+from ..paths.sensor import Lens
+from ..lights.lights import Lights
+from ..core.packing import rounded_up
+from ..core.random import next_2d, vertex_streams
+from ..core.recording import lanes, recorder
+from ..core.spectra import channel_mean
+from ..paths.subpaths import read_vertices, trace_camera_subpaths, trace_light_subpaths
+from ..core.traits import SceneTraits
 from .common import MOST_LIGHT_PATHS, IterativeIntegrator, IterativeSession
-from .connection_weights import ConnectionWeights
+from ..mis.vertex_merging import ConnectionWeights
 from .pyramid import Ledger, camera_images, sensor_images, technique_channels, with_rest
 
 CHUNK = 1 << 19

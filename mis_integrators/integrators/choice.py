@@ -13,12 +13,12 @@ from dataclasses import dataclass, field
 import mitsuba as mi
 import numpy as np
 
-from ..transport.census import mean_segments
-from ..transport.radius import relative_weights, usual_mean
-from ..transport.recording import lanes
-from ..transport.spectra import channel_mean
+from ..paths.path_length_statistics import mean_segments
+from ..pilot.radius import relative_weights, usual_mean
+from ..core.recording import lanes
+from ..core.spectra import channel_mean
 from . import costs
-from .pilot import FEWEST_ITERATIONS, PILOT_INDEX, UNPLANNED_ITERATIONS, pilot_pixels
+from ..pilot.run import FEWEST_ITERATIONS, PILOT_INDEX, UNPLANNED_ITERATIONS, pilot_pixels
 from .unidirectional import PathSession
 
 PHOTON_MAPPERS = FIRST, OPT2, LATER, OPT3 = ("bdpm", {"bdd": 0}), ("bdpm_opt2", {}), ("bdpm", {"bdd": 1}), ("bdpm_opt3", {})

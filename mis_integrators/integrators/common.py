@@ -8,14 +8,14 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..transport.camera_pass import film_sample_count, with_gaps
-from ..transport.film import Accumulator, shared_wavelengths, variance_channels
-from ..transport.packing import rounded_up
-from ..transport.random import mix
-from ..transport.recording import settle
-from ..transport.traits import UnsupportedScene, check_film, check_scene, check_variant, unfinite_data
-from ..turns import TURN, by_turns
-from ..untrusted import Fields
+from ..paths.camera_pass import film_sample_count, with_gaps
+from ..core.film import Accumulator, shared_wavelengths, variance_channels
+from ..core.packing import rounded_up
+from ..core.random import mix
+from ..core.recording import settle
+from ..core.traits import UnsupportedScene, check_film, check_scene, check_variant, unfinite_data
+from ..core.render_lock import TURN, by_turns
+from ..core.untrusted import Fields
 from .parameters import Parameters
 
 
@@ -50,7 +50,7 @@ class IterativeIntegrator(mi.AdjointIntegrator):
         """Reads the subclass's own parameters (there need not be any)."""
 
     def new_session(self, scene, sensor, seed, iterations):
-        """The object that runs iterations; see `mis_integrators.session.Session`. Every subclass has its own."""
+        """The object that runs iterations; see `mis_integrators.core.session.Session`. Every subclass has its own."""
         raise TypeError(f"{type(self).__name__} does not define new_session")
 
     def check(self, scene, sensor):
@@ -163,7 +163,7 @@ class IterativeSession:
 
     @property
     def sums(self):
-        """What has been rendered so far (`mis_integrators.sums.Sums`)."""
+        """What has been rendered so far (`mis_integrators.core.sums.Sums`)."""
         return self.accumulator.sums
 
     @property

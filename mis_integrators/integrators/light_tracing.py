@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..transport.radius import relative_weights, usual_mean
+from ..pilot.radius import relative_weights, usual_mean
 from . import costs
 
 LEAST, MOST = 1 / 8, 8.0

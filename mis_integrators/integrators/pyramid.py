@@ -9,7 +9,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from ..transport.film import colour_channels
+from ..core.film import colour_channels
 
 
 def technique_names(longest):

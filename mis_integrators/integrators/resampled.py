@@ -6,26 +6,26 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..transport.cache_points import CacheGrid
-from ..transport.camera_vertices import STEP, hit_layout, sum_before, trace_camera_vertices
-from ..transport.connections import join_sensor, list_draws
-from ..transport.film import as_camera_weights, colour_channels, expected_weight, splat_channels, splat_samples, with_colour
-from ..transport.junctions import scattered_mean
-from ..transport.lenses import Lens
-from ..transport.light_ends import END, LightEnds, list_ends
-from ..transport.light_starts import sample_light_starts
-from ..transport.lights import Lights
-from ..transport.packing import from_numpy, rounded_up, to_numpy
-from ..transport.proposals import Proposals, cumulative_sums
-from ..transport.random import mix, next_2d, vertex_streams
-from ..transport.recording import lanes, recorder
-from ..transport.spectra import channel_mean
-from ..transport.subpaths import junction_of, read_vertices, seen_normal, trace_light_subpaths
-from ..transport.traits import SceneTraits
-from ..untrusted import Fields
+from ..resampling.cache_points import CacheGrid
+from ..paths.camera_vertices import STEP, hit_layout, sum_before, trace_camera_vertices
+from ..paths.connect import join_sensor, list_draws
+from ..core.film import as_camera_weights, colour_channels, expected_weight, splat_channels, splat_samples, with_colour
+from ..paths.vertex import scattered_mean
+from ..paths.sensor import Lens
+from ..resampling.light_vertices import END, LightEnds, list_ends
+from ..paths.light_starts import sample_light_starts
+from ..lights.lights import Lights
+from ..core.packing import from_numpy, rounded_up, to_numpy
+from ..resampling.proposals import Proposals, cumulative_sums
+from ..core.random import mix, next_2d, vertex_streams
+from ..core.recording import lanes, recorder
+from ..core.spectra import channel_mean
+from ..paths.subpaths import junction_of, read_vertices, seen_normal, trace_light_subpaths
+from ..core.traits import SceneTraits
+from ..core.untrusted import Fields
 from .common import IterativeIntegrator, IterativeSession
 from .light_tracing import LEAST, MOST, best_ratio, observed_noise, path_costs
-from .resampled_weights import LENGTHS, ResampledWeights, around, doubt, guessed_weight, ignorant, tabulate
+from ..mis.resampling import LENGTHS, ResampledWeights, around, doubt, guessed_weight, ignorant, tabulate
 
 CHUNK = 1 << 18
 """Camera paths, and as many light sub-paths, traced at once at most; larger films are traced in parts (bounds memory), which share their proposals."""

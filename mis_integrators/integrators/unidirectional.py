@@ -5,9 +5,9 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from ..transport.camera_pass import film_sample_count, start_camera_paths
-from ..transport.film import splat_samples
-from ..untrusted import Fields
+from ..paths.camera_pass import film_sample_count, start_camera_paths
+from ..core.film import splat_samples
+from ..core.untrusted import Fields
 from .common import IterativeSession
 
 BUSY = 1 << 19

@@ -6,15 +6,15 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..transport.merging import merge, vertex_map
-from ..transport.packing import to_numpy
-from ..transport.photon_map import smallest_cell
-from ..transport.recording import lanes
-from ..transport.subpaths import read_vertices
-from ..untrusted import Fields
+from ..photons.merge import merge, vertex_map
+from ..core.packing import to_numpy
+from ..photons.grid import smallest_cell
+from ..core.recording import lanes
+from ..paths.subpaths import read_vertices
+from ..core.untrusted import Fields
 from .bdpt import BDPT, BDPTSession
 from .common import MOST_LIGHT_PATHS
-from .connection_weights import ConnectionWeights
+from ..mis.vertex_merging import ConnectionWeights
 from .schedule import read_radius, shrunk
 
 RADIUS_SHARE = 0.004

@@ -8,12 +8,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..transport.film import colour_channels, colour_matrix
-from ..transport.lights import Lights
-from ..transport.random import mix, streams
-from ..transport.recording import recorder
-from ..transport.traits import UnsupportedScene, check_film, check_variant
-from ..turns import by_turns
+from ..core.film import colour_channels, colour_matrix
+from ..lights.lights import Lights
+from ..core.random import mix, streams
+from ..core.recording import recorder
+from ..core.traits import UnsupportedScene, check_film, check_variant
+from ..core.render_lock import by_turns
 from ..volume.films import OWN, SHARED, ViewAccumulator, own_values, splat, write_film
 from ..volume.lines import common_nulls, connect, follow_nulls, sight
 from ..volume.pivots import NOWHERE, ON_SURFACE, OWN as OWN_BRANCH, of_paths, pivot_surface, trace_first_segments

@@ -5,9 +5,9 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from ..transport.camera_pass import STATE, trace_camera_paths
-from ..transport.gather import gather_photons, vertex_section
-from ..transport.light_pass import trace_light_paths
+from ..paths.camera_pass import STATE, trace_camera_paths
+from ..photons.gather import gather_photons, vertex_section
+from ..paths.light_pass import trace_light_paths
 from .bdpm import BDPM, BDPMSession
 
 

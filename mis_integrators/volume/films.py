@@ -12,8 +12,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..sums import Sums
-from ..transport.film import add_squares, colour_channels, finite_pixels, spread
+from ..core.sums import Sums
+from ..core.film import add_squares, colour_channels, finite_pixels, spread
 
 SHARED = 4
 """Channels of what all paths bring: colour, weight."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from ..transport.spectra import channel_mean
+from ..core.spectra import channel_mean
 
 FAINT = 0.05
 """Transmittance below which the estimate on the way to a light plays roulette."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from ..transport.lights import mis_power
-from ..transport.random import next_2d
-from ..transport.roulette import russian_roulette
+from ..lights.lights import mis_power
+from ..core.random import next_2d
+from ..paths.roulette import russian_roulette
 from .media import collision, section, transmittance
 
 

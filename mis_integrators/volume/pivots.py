@@ -5,8 +5,8 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from ..transport.random import streams
-from ..transport.spectra import channel_mean
+from ..core.random import streams
+from ..core.spectra import channel_mean
 from .media import collision, section
 
 NOWHERE, IN_MEDIUM, ON_SURFACE = range(3)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from ..transport.lights import mis_power
-from ..transport.random import next_2d, streams
+from ..lights.lights import mis_power
+from ..core.random import next_2d, streams
 from .paths import direct_light, incident_radiance, scattering_interaction
 from .pivots import IN_MEDIUM, NOWHERE, ON_SURFACE, OWN, pivot_surface
 

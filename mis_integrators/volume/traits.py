@@ -6,8 +6,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..transport.guide import infinite_emitters
-from ..transport.traits import UnsupportedScene, check_emitters, check_variant, scene_objects, used_bsdfs
+from ..lights.environment_guide import infinite_emitters
+from ..core.traits import UnsupportedScene, check_emitters, check_variant, scene_objects, used_bsdfs
 from .media import point_in
 
 

@@ -8,8 +8,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..transport.random import next_2d
-from ..transport.traits import UnsupportedScene
+from ..core.random import next_2d
+from ..core.traits import UnsupportedScene
 
 SENSORS = {"PerspectiveCamera": "perspective", "ThinLensCamera": "thinlens"}
 MAX_VIEWS = 1024

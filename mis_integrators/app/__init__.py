@@ -1,0 +1,1 @@
+"""The command ``mis-render``: options, the loop of a render, checkpoints, clusters, what is written."""

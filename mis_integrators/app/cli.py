@@ -1,0 +1,321 @@
+"""The command ``mis-render``: render a Mitsuba scene to an EXR file, and a PNG beside it."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import math
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from . import checkpoint, cluster, loading, output, reproduce
+from .checkpoint import Checkpoint, CheckpointError
+from .request import Request
+from .options import parse, versions
+from .progress import Progress
+from .render_loop import Chore, Clock, Interrupt, fewest_iterations, iterate
+from ..core.session import Session
+from .target_error import TargetError
+from ..core.traits import unfinite_data
+from ..core.untrusted import Malformed
+
+EXIT_OK, EXIT_SCENE, EXIT_USAGE, EXIT_OUTPUT, EXIT_CHECKPOINT, EXIT_CLUSTER, EXIT_INTERRUPTED = 0, 1, 2, 3, 4, 5, 130
+
+
+class Failure(Exception):
+    """An error to report in one line, and the exit code."""
+
+    def __init__(self, code: int, message: str):
+        super().__init__(message)
+        self.code = code
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run ``mis-render`` with the arguments (default: those of the process) and return its exit code."""
+    options = parse(arguments)
+    interrupt = Interrupt()
+    try:
+        with interrupt, np.errstate(all="ignore"):       # values that are not finite are left out, and said once
+            return _run(options, interrupt)
+    except BaseException as error:
+        # Libraries turn an interrupt that reaches them into errors of any kind.
+        if interrupt.stopped or isinstance(error, KeyboardInterrupt):
+            print("mis-render: interrupted, nothing written", file=sys.stderr)
+            return EXIT_INTERRUPTED
+        if not isinstance(error, Failure):
+            raise
+        print(f"mis-render: {error}", file=sys.stderr)
+        return error.code
+
+
+def _run(options: argparse.Namespace, interrupt: Interrupt) -> int:
+    _check_outputs(options)
+    with contextlib.ExitStack() as stack:
+        try:
+            stack.enter_context(output.alone(options.output))
+        except OSError as error:
+            raise Failure(EXIT_OUTPUT, f"cannot write {options.output}: {error.strerror or error}") from error
+        try:
+            return _render_alone(options, interrupt)
+        except MemoryError as error:
+            raise Failure(EXIT_SCENE, f"{OUT_OF_MEMORY}; render a smaller film, or fewer light paths an iteration") from error
+
+
+def _render_alone(options: argparse.Namespace, interrupt: Interrupt) -> int:
+    with contextlib.ExitStack() as stack:
+        try:
+            learned = _follow(options) if options.like else {}
+            needs_views = "--all-views" if options.all_views else "--frames" if options.frames else None
+            opened = _request(options).open(needs_views)
+            for description in unfinite_data(opened.loaded.scene):
+                _warn(f"{description} (NaN or infinite): what they light or colour is left out of the image")
+            session: Any = opened.session
+            if learned:
+                _recall_image(session, learned, options)
+            identity = opened.identity() if options.checkpoint else {}
+            keep_variance = bool(options.checkpoint or options.target_error)
+            if keep_variance:
+                session.keep_variance()
+            clock = _resume(options, identity, session) if options.checkpoint else Clock()
+            target = TargetError(options.target_error) if options.target_error else None
+            if options.workers or options.scheduler:
+                client = stack.enter_context(cluster.connected(options.workers, options.scheduler))
+                threads = max(1, dr.thread_count() // options.workers) if options.workers else None
+                session = cluster.DistributedSession(client, opened, keep_variance, threads)
+            kept, broken = _render(session, opened.sensor, options, identity, clock, target, interrupt)
+        except (*loading.SCENE_ERRORS, cluster.ClusterError) as error:
+            raise _failure(error) from error
+
+        metadata = _metadata(options, opened.loaded, session, clock)
+        metadata[reproduce.ATTRIBUTE] = reproduce.attribute(options, session, opened.session.learned)
+        if pixels := session.unfinite_pixels():
+            metadata["unfinitePixels"] = pixels
+            _warn(f"{pixels} pixels had values that are not finite (NaN or infinite) in some iterations; those values are left out")
+        if target:
+            target.update(session)
+            metadata["relativeError"] = target.error
+            if target.black:
+                _warn("the image is black, so that its relative error says nothing: is there light, and does the camera look at it?")
+        # Before the workers are left, which may take long.
+        written = _write(options, session, metadata, options.output, kept)
+        for suffix in (".preview.exr", ".preview.png"):
+            options.output.with_suffix(suffix).unlink(missing_ok=True)
+    report = (
+        f"{metadata['spp']} samples per pixel in {clock.rendering:.1f} s (and {clock.compiling:.1f} s of "
+        f"compiling){_about_error(target)}: {written}"
+    )
+    if broken:
+        failure = _failure(broken)
+        raise Failure(failure.code, f"{failure}; what was rendered before is written, {report}") from broken
+    if interrupt.requested:
+        print(f"mis-render: interrupted after {report}", file=sys.stderr)
+        return EXIT_INTERRUPTED
+    if not options.quiet:
+        print(report, file=sys.stderr)
+    return EXIT_OK
+
+
+OUT_OF_MEMORY = "there is not enough memory"
+
+
+def _failure(error: BaseException) -> Failure:
+    """What to report of an error of the scene, of its rendering, or of the workers."""
+    if isinstance(error, cluster.ClusterError):
+        return Failure(EXIT_CLUSTER, str(error))
+    if isinstance(error, MemoryError):
+        return Failure(EXIT_SCENE, OUT_OF_MEMORY)
+    known = isinstance(error, loading.SCENE_ERRORS)
+    return Failure(EXIT_SCENE, loading.one_line(error) if known else f"{type(error).__name__}: {loading.one_line(error)}")
+
+
+def _warn(text: str) -> None:
+    """Say what the user must know, however quiet all else is to be."""
+    print(f"mis-render: {text}", file=sys.stderr)
+
+
+def _follow(options: argparse.Namespace) -> dict[str, Any]:
+    """Set the options to those of the image of ``--like``; returns what its session had learned."""
+    recipe = reproduce.read(options.like)
+    for name, value in recipe.options.items():
+        setattr(options, name, value)
+    if recipe.remark and not options.quiet:
+        print(f"mis-render: {options.like} {recipe.remark}", file=sys.stderr)
+    return recipe.learned
+
+
+def _recall_image(session: Session, learned: dict[str, Any], options: argparse.Namespace) -> None:
+    try:
+        session.recall(learned)
+    except Malformed as error:
+        raise Malformed(f"--like {options.like}: its header: {error}") from None
+
+
+def _request(options: argparse.Namespace) -> Request:
+    unbounded = options.time or (options.target_error and not options.spp)
+    return Request(
+        scene=str(options.scene),
+        variables=dict(options.variables),
+        plugin=options.plugin,
+        parameters={name: loading.parse_value(text) for name, text in options.parameters},
+        variant=options.variant,
+        sensor=options.sensor,
+        all_views=options.all_views,
+        seed=options.seed,
+        spp=0 if unbounded else options.spp,
+        fine=bool(options.target_error or options.workers or options.scheduler),
+    )
+
+
+def _about_error(target: TargetError | None) -> str:
+    if target is None:
+        return ""
+    if math.isinf(target.error):
+        return ", relative error unknown after one iteration"
+    return f", relative error {target.error:.3g}{'' if target.error <= target.target else f' (target {target.target:g} not reached)'}"
+
+
+def _metadata(
+    options: argparse.Namespace, loaded: loading.LoadedScene, session: Session, clock: Clock
+) -> dict[str, str | int | float]:
+    return {
+        "integrator": loaded.plugin,
+        **loaded.parameters,
+        **session.settings,
+        "spp": session.iterations * session.samples_per_iteration,
+        "iterations": session.iterations,
+        "seed": options.seed,
+        "variant": options.variant,
+        "versions": versions(),
+        "renderTime": clock.rendering,
+        "compileTime": clock.compiling,
+    }
+
+
+def _render(
+    session: Session,
+    sensor: mi.Sensor,
+    options: argparse.Namespace,
+    identity: dict[str, Any],
+    clock: Clock,
+    target: TargetError | None,
+    interrupt: Interrupt,
+) -> tuple[Path | None, Exception | None]:
+    """Iterate as long as the options say; returns the checkpoint that holds all of it, if there is one, and the error that ended it after there was
+    enough for an image, if one did."""
+    width, height = sensor.film().crop_size()
+    pixels = getattr(session, "pixels", width * height)
+    if options.time and hasattr(session, "plan_time"):
+        session.plan_time(options.time)
+    planned = None if options.time else session.iterations_planned
+    with (
+        Progress(lambda: pixels * session.samples_per_iteration, planned, options.time, options.quiet) as progress,
+        dr.scoped_set_flag(dr.JitFlag.KernelHistory),
+    ):
+        asked = options.spp or sensor.sampler().sample_count()
+        if planned and planned * session.samples_per_iteration > asked:
+            progress.say(
+                f"{asked} samples per pixel rounded up to {planned * session.samples_per_iteration}: "
+                f"{planned} iterations of {session.samples_per_iteration}"
+            )
+        path = checkpoint.beside(options.output)
+        keep = Chore(str(path), options.checkpoint or math.inf, lambda: _keep(path, identity, session, clock), progress.warn)
+        preview = options.output.with_suffix(".preview.exr")
+        show = Chore(str(preview), options.preview or math.inf, lambda: _preview(session, options, preview), progress.warn)
+        broken = None
+        try:
+            iterate(session, planned, options.time, target, clock, [keep, show], progress, interrupt)
+        except Exception as error:
+            if session.iterations < fewest_iterations(session):
+                raise
+            broken = error
+        if not options.checkpoint:
+            return None, broken
+        keep.now()
+        return None if keep.failure else path, broken
+
+
+def _keep(path: Path, identity: dict[str, Any], session: Session, clock: Clock) -> None:
+    sums = session.sums
+    checkpoint.write(
+        path, Checkpoint(identity, session.learned, sums.done, clock.rendering, clock.compiling, sums.arrays())
+    )
+
+
+def _resume(options: argparse.Namespace, identity: dict[str, Any], session: Session) -> Clock:
+    """Let the session go on from the checkpoint, if it shall and there is one."""
+    path = checkpoint.beside(options.output)
+    if not os.path.lexists(path):
+        return Clock()
+    if not options.resume:
+        raise Failure(EXIT_CHECKPOINT, f"{path} holds an earlier render: --resume goes on from it; remove it to start anew")
+    try:
+        found = checkpoint.read(path)
+        if what := checkpoint.difference(found.identity, identity):
+            raise CheckpointError(f"{path} is of another render: {what}")
+        session.recall(dict(found.learned))
+        shapes = {name: array.shape for name, array in found.arrays.items()}
+        if len(found.done) and shapes != session.sum_shapes():
+            raise CheckpointError(f"{path} is no checkpoint of this render: its sums have other names or shapes")
+        session.sums.merge(found.arrays, found.done)
+    except Malformed as error:
+        raise Failure(EXIT_CHECKPOINT, f"cannot resume: {path} is no checkpoint of this render: {error}") from error
+    except (CheckpointError, OSError, MemoryError) as error:
+        raise Failure(EXIT_CHECKPOINT, f"cannot resume: {error or OUT_OF_MEMORY}") from error
+    for written in (path, options.output, options.output.with_suffix(".png")):
+        output.remove_leftovers(written)
+    return Clock(found.seconds, found.compiling)
+
+
+def _preview(session: Any, options: argparse.Namespace, path: Path) -> None:
+    """Write the image so far, if there is one."""
+    if session.iterations < fewest_iterations(session):
+        return
+    image = output.contact_sheet(session.view_images()) if options.all_views else session.image()
+    output.write_exr(path, image, session.channels, {"iterations": session.iterations})
+    output.write_png(path.with_suffix(".png"), image, session.channels)
+
+
+def _write(
+    options: argparse.Namespace, session: Any, metadata: dict[str, str | int | float], path: Path, kept: Path | None
+) -> str:
+    png, channels = path.with_suffix(".png"), session.channels
+    views = session.view_images() if options.all_views or options.frames else []
+    image = output.contact_sheet(views) if options.all_views else session.image()
+    writing, written = path, ""
+    try:
+        output.write_exr(path, image, channels, metadata)
+        writing, written = png, str(path)
+        if output.write_png(png, image, channels):
+            written += f" and {png}"
+        if options.frames:
+            for number, view in enumerate(views):
+                writing = output.frame_path(path, number)
+                output.write_png(writing, view, channels)
+            written += f", {len(views)} frames from {output.frame_path(path, 0)}"
+        return written
+    except OSError as error:
+        rest = f"; {written} is written" if written else f"; {kept} holds what was rendered, for --resume" if kept else ""
+        raise Failure(EXIT_OUTPUT, f"cannot write {writing}: {error.strerror or error}{rest}") from error
+
+
+def _check_outputs(options: argparse.Namespace) -> None:
+    """Refuse, before anything is rendered, what cannot be written in the end."""
+    image = options.output
+    files = [image, image.with_suffix(".png")]
+    if options.preview:
+        files += [image.with_suffix(".preview.exr"), image.with_suffix(".preview.png")]
+    for file in files:
+        try:
+            output.make_writable(file)
+        except OSError as error:
+            raise Failure(EXIT_OUTPUT, f"cannot write {file}: {error.strerror or error}") from error
+
+
+if __name__ == "__main__":
+    sys.exit(main())

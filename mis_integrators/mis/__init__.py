@@ -1,0 +1,1 @@
+"""Weights of multiple importance sampling as renders use them: one file a theory."""

@@ -1,0 +1,82 @@
+"""Where transport and the heuristics of connections meet: Veach's weights as the state of sub-paths (see `weights.bidirectional`).
+
+The weights are functions of the joint path alone. Not in them: Russian roulette, and the choices at delta surfaces, taken as alike from both
+sides. They cost noise, never light.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from ..paths.light_starts import seen_from
+from ..paths.subpaths import STATES
+from ..weights import bidirectional as theory
+
+
+class ConnectionWeights:
+    """Hooks of `transport.subpaths`, and the weights of joined sub-paths.
+
+    `beta`: Veach's exponent; `ratio`: light sub-paths over camera paths, of the whole crop window; `eta` [m^2]: pi R^2 N of merging, or 0.
+    """
+
+    states = STATES
+
+    def __init__(self, lights, beta, ratio, eta=0.0):
+        self.lights, self.beta, self.ratio, self.eta = lights, beta, ratio, eta
+
+    @staticmethod
+    def blank(width):
+        """A state of that width."""
+        return [dr.zeros(mi.Float, width), dr.zeros(mi.Float, width)]
+
+    # ------------------------------------------------------------------ hooks of the sub-paths
+
+    def lit(self, si, source, reachable, active, flux=None):
+        ds = seen_from(si, source, active)
+        cosine = dr.maximum(dr.abs(dr.dot(si.n, ds.d)), 1e-6)
+        direct = self.lights.pdf_direct(si, ds, active)
+        near, far = theory.light_start(cosine * self.lights.emission_ratio(si, ds, active), direct * dr.rcp(cosine))
+        flags = ds.emitter.flags()
+        met = ~(mi.has_flag(flags, mi.EmitterFlags.DeltaPosition) | mi.has_flag(flags, mi.EmitterFlags.DeltaDirection))
+        return [dr.select(reachable, near, 0), dr.select(reachable & met, far, 0)]
+
+    def seen(self, density, active):
+        return [dr.select(active & (density > 0), theory.camera_start(density, self.ratio), 0), mi.Float(0)]
+
+    def left(self, state, p_forward, p_back, delta, scattered=None):
+        near, far = state
+        return [near, dr.select(delta, far, theory.far_of(self._nearer(state, p_back), p_forward))]
+
+    def arrived(self, state, density, si=None, squared=None, depth=None):
+        return [dr.select(density > 0, theory.reciprocal(density), 0), state[1]]
+
+    def met(self, state, direct, emission, sampled):
+        ratio = dr.select(sampled > 0, direct * theory.reciprocal(sampled), 0)
+        return theory.met(ratio, direct * emission, state[1], self.beta)
+
+    def direct(self, state, direct, emission, sampled, p_back, delta):
+        ratio = dr.select(delta, 0, sampled * theory.reciprocal(direct))
+        return theory.connection(ratio, 1, emission, self._nearer(state, p_back), self.beta)
+
+    # ------------------------------------------------------------------ joined sub-paths
+
+    def _nearer(self, state, p_back):
+        return theory.nearer(*state, p_back, self.beta, self.eta)
+
+    def connected(self, connection, camera, light):
+        """Weight of a `Connection` of two kept vertices."""
+        a_light = self._nearer([light[name] for name in self.states], connection.back_at_light)
+        a_camera = self._nearer([camera[name] for name in self.states], connection.back_at_camera)
+        return theory.connection(connection.density_at_light, a_light, connection.density_at_camera, a_camera, self.beta)
+
+    def merged(self, camera, state, back_at_light, back_at_camera):
+        """Weight of merging a camera vertex with a light vertex of that `state` (arguments as of `weigh` of `transport.merging.merge`)."""
+        a_light = theory.nearer(*state, back_at_light, self.beta)
+        a_camera = theory.nearer(camera["near"], camera["far"], back_at_camera, self.beta)
+        return theory.merging(a_light, a_camera, self.eta, self.beta)
+
+    def seen_by_sensor(self, connection, light):
+        """Weight of a `LensConnection` of a light vertex."""
+        a_light = self._nearer([light[name] for name in self.states], connection.back)
+        return theory.connection(connection.density * (1 / self.ratio), a_light, 0, 0, self.beta)

@@ -1,0 +1,1 @@
+"""Light sub-paths drawn anew for each camera vertex: cache points, probabilities, draws."""
