@@ -1,6 +1,8 @@
-"""The program ``mis-render``: a module of its own, so that signals are heeded before anything large is imported.
+"""The program ``mis-render``: a module of its own, so that signals are heeded before anything large
+is imported.
 
-Importing the package imports Mitsuba and Dr.Jit, which takes half a second or more; a Ctrl-C meanwhile would be a traceback of theirs.
+Importing the package imports Mitsuba and Dr.Jit, which takes half a second or more; a Ctrl-C
+meanwhile would be a traceback of theirs.
 """
 
 from __future__ import annotations
@@ -14,7 +16,8 @@ EXIT_INTERRUPTED = 130
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run ``mis-render`` with the arguments (default: those of the process) and return its exit code."""
+    """Run ``mis-render`` with the arguments (default: those of the process) and return its exit
+    code."""
     for number in SIGNALS:
         signal.signal(number, _stop)
     from mis_integrators.app import cli

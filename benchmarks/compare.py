@@ -7,21 +7,33 @@ from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
 
-import numpy as np
-
-import regressions
-from measuring import Measured, Measurement, measure
 from mis_integrators.analysis.confidence import log_ratio_error, mean_interval, ratio_interval
 from mis_integrators.analysis.metrics import Errors, decompose, efficiency, errors
 from mis_integrators.analysis.stability import CLOSE
+
+import numpy as np
+import regressions
+from measuring import Measured, Measurement, measure
 from references import find_references
 from reports import Row, console, save, show, tell
 from scene_files import open_scene, scaled_size
 
 LATE = 1.15
 """Times the usual seconds, beyond which a render is not one of equal time."""
-COLUMNS = ("method", "iterations", "seconds", "first", "relMSE", "relMSE ratio", "trimmed ratio", "MSE ratio", "FLIP", "bias share",
-           "cost ratio", "settings")
+COLUMNS = (
+    "method",
+    "iterations",
+    "seconds",
+    "first",
+    "relMSE",
+    "relMSE ratio",
+    "trimmed ratio",
+    "MSE ratio",
+    "FLIP",
+    "bias share",
+    "cost ratio",
+    "settings",
+)
 
 
 def run(options: argparse.Namespace) -> None:
@@ -40,8 +52,13 @@ def run(options: argparse.Namespace) -> None:
         save(options.out, "compare", rows, vars(options))
         name = measurement.opened.name
         failures[name] = measurement.failures
-        pictures.append(f'<h2 id="{name}">{name}</h2>' + pages.pictures(measurement, found, options.out))
-        page.sections = [pages.summary(rows, failures, f"({measurement.asked} each, {options.seeds} seeds)"), *pictures]
+        pictures.append(
+            f'<h2 id="{name}">{name}</h2>' + pages.pictures(measurement, found, options.out)
+        )
+        page.sections = [
+            pages.summary(rows, failures, f"({measurement.asked} each, {options.seeds} seeds)"),
+            *pictures,
+        ]
         page.write()
     console.print(f"page: {page.path}")
     if options.record:
@@ -54,29 +71,53 @@ def measure_scene(path: Path, options: argparse.Namespace, marks: list[float]) -
     """The renders that the options ask for."""
     opened = open_scene(path, scaled_size(path, options.scale))
     references = find_references(opened, options, tell)
-    return measure(opened, options.integrators, references, options.time, options.spp, options.seeds, marks, tell)
+    return measure(
+        opened,
+        options.integrators,
+        references,
+        options.time,
+        options.spp,
+        options.seeds,
+        marks,
+        tell,
+    )
 
 
 def show_comparison(rows: list[Row], measurement: Measurement, options: argparse.Namespace) -> None:
     """Print the table of one scene, with intervals."""
     much = f"{options.spp} samples per pixel" if options.spp else f"{options.time:g} s each"
-    shown = [{**row, **{name: _with_interval(row, name) for name in ("relMSE ratio", "cost ratio")}} for row in rows]
-    show(f"{measurement.opened.name}: {much}, {options.seeds} seeds, ratios to {measurement.base.method.label}", shown, COLUMNS)
+    shown = [
+        {**row, **{name: _with_interval(row, name) for name in ("relMSE ratio", "cost ratio")}}
+        for row in rows
+    ]
+    show(
+        f"{measurement.opened.name}: {much}, {options.seeds} seeds, ratios to {measurement.base.method.label}",
+        shown,
+        COLUMNS,
+    )
     for label, reason in measurement.failures.items():
         console.print(f"{label} cannot render {measurement.opened.name}: {reason}")
 
 
 def compare(measurement: Measurement) -> list[Row]:
-    """One row a method: mean errors over the seeds, and ratios to the base with their confidence intervals."""
-    every = {measured.method.label: _figures(measured, measurement) for measured in measurement.methods}
+    """One row a method: mean errors over the seeds, and ratios to the base with their confidence
+    intervals."""
+    every = {
+        measured.method.label: _figures(measured, measurement) for measured in measurement.methods
+    }
     base = every[measurement.base.method.label]
-    return [_row(measured, every[measured.method.label], base, measurement) for measured in measurement.methods]
+    return [
+        _row(measured, every[measured.method.label], base, measurement)
+        for measured in measurement.methods
+    ]
 
 
 def _figures(measured: Measured, measurement: Measurement) -> dict[str, list[float]]:
     """Errors and costs of each seed's render, by name."""
     judged = [errors(image, measurement.references) for image in measured.images]
-    figures = {field.name: [getattr(error, field.name) for error in judged] for field in fields(Errors)}
+    figures = {
+        field.name: [getattr(error, field.name) for error in judged] for field in fields(Errors)
+    }
     figures["cost"] = [run.last.seconds / run.last.samples_per_pixel for run in measured.runs]
     perceived = measured.perceived(measurement.references)
     figures["flip"] = [perceived[0]] if perceived else []
@@ -141,30 +182,51 @@ def _row(measured: Measured, mine: dict, base: dict, measurement: Measurement) -
 
 
 def told_apart(row: Row, better: Row) -> bool:
-    """Whether a method's error (relMSE without the worst 0.1 %) is beyond the noise above that of a better one: by pairs of seeds, 95 %."""
-    mine, other = ([float(value) for value in one["trimmed by seed"].split()] for one in (row, better))
+    """Whether a method's error (relMSE without the worst 0.1 %) is beyond the noise above that of a
+    better one: by pairs of seeds, 95 %."""
+    mine, other = (
+        [float(value) for value in one["trimmed by seed"].split()] for one in (row, better)
+    )
     return ratio_interval(mine, other).low > 1
 
 
 def too_late(row: Row, rows: Sequence[Row]) -> bool:
-    """Whether the single iteration of a method took longer than others' renders of the scene: its error is not one at equal time."""
-    return row["iterations"] <= 1 and row["seconds"] > LATE * float(np.median([other["seconds"] for other in rows]))
+    """Whether the single iteration of a method took longer than others' renders of the scene: its
+    error is not one at equal time."""
+    return row["iterations"] <= 1 and row["seconds"] > LATE * float(
+        np.median([other["seconds"] for other in rows])
+    )
 
 
 def winner(rows: Sequence[Row]) -> Row:
     """The least error of those of one scene that kept to the time."""
-    return min((row for row in rows if not too_late(row, rows)), key=lambda row: row["trimmed ratio"])
+    return min(
+        (row for row in rows if not too_late(row, rows)), key=lambda row: row["trimmed ratio"]
+    )
 
 
 def winners(rows: list[Row]) -> list[Row]:
-    """One row a scene: its least error, in ratios to the base, and the methods that are about as good or cannot be told apart."""
+    """One row a scene: its least error, in ratios to the base, and the methods that are about as
+    good or cannot be told apart."""
     found: list[Row] = []
     for scene in dict.fromkeys(row["scene"] for row in rows):
         mine = [row for row in rows if row["scene"] == scene]
         best = winner(mine)
-        close = [row["method"] for row in mine
-                 if row is not best and not too_late(row, mine) and (row["trimmed ratio"] <= CLOSE * best["trimmed ratio"] or not told_apart(row, best))]
-        found.append({"scene": scene, "best": best["method"], "error over path's": best["trimmed ratio"], "about as good": ", ".join(close) or "-"})
+        close = [
+            row["method"]
+            for row in mine
+            if row is not best
+            and not too_late(row, mine)
+            and (row["trimmed ratio"] <= CLOSE * best["trimmed ratio"] or not told_apart(row, best))
+        ]
+        found.append(
+            {
+                "scene": scene,
+                "best": best["method"],
+                "error over path's": best["trimmed ratio"],
+                "about as good": ", ".join(close) or "-",
+            }
+        )
     return found
 
 

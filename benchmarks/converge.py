@@ -1,19 +1,28 @@
-"""Error against time: snapshots of one run at increasing times, slopes on logarithmic axes, and the front of speed and accuracy."""
+"""Error against time: snapshots of one run at increasing times, slopes on logarithmic axes, and the
+front of speed and accuracy."""
 
 from __future__ import annotations
 
 import argparse
 
-import numpy as np
-
-from compare import measure_scene
-from measuring import Measured, Measurement
 from mis_integrators.analysis.confidence import mean_interval, slope_interval
 from mis_integrators.analysis.fronts import pareto_front
 from mis_integrators.analysis.metrics import decompose, errors
+
+import numpy as np
+from compare import measure_scene
+from measuring import Measured, Measurement
 from reports import Row, console, save, show
 
-COLUMNS = ("method", "slope", "slope low", "slope high", "slope trimmed", "relMSE at the end", "on the front")
+COLUMNS = (
+    "method",
+    "slope",
+    "slope low",
+    "slope high",
+    "slope trimmed",
+    "relMSE at the end",
+    "on the front",
+)
 
 
 def run(options: argparse.Namespace) -> None:
@@ -27,7 +36,11 @@ def run(options: argparse.Namespace) -> None:
         measurement = measure_scene(path, options, marks(options.time, options.snapshots))
         found = converge(measurement)
         fitted = fit_slopes(measurement, found)
-        show(f"{measurement.opened.name}: relMSE is proportional to samples, i.e. time without set-up, to the power of the slope", fitted, COLUMNS)
+        show(
+            f"{measurement.opened.name}: relMSE is proportional to samples, i.e. time without set-up, to the power of the slope",
+            fitted,
+            COLUMNS,
+        )
         points, slopes = points + found, slopes + fitted
         save(options.out, "converge", points, vars(options))
         save(options.out, "slopes", slopes, vars(options))
@@ -38,11 +51,12 @@ def run(options: argparse.Namespace) -> None:
 
 def marks(seconds: float, count: int) -> list[float]:
     """Times of the snapshots before the last: each half the next."""
-    return [seconds / 2 ** power for power in range(count - 1, 0, -1)]
+    return [seconds / 2**power for power in range(count - 1, 0, -1)]
 
 
 def converge(measurement: Measurement) -> list[Row]:
-    """One row a method and snapshot: mean error over the seeds with its interval, bias and variance apart."""
+    """One row a method and snapshot: mean error over the seeds with its interval, bias and variance
+    apart."""
     rows: list[Row] = []
     for measured in measurement.methods:
         for number in range(measured.common_snapshots):
@@ -73,30 +87,38 @@ def _row(measured: Measured, number: int, measurement: Measurement) -> Row:
 
 
 def fit_slopes(measurement: Measurement, rows: list[Row]) -> list[Row]:
-    """One row a method: the exponent of the rendering in its error, one fit a seed, with the interval of their mean.
+    """One row a method: the exponent of the rendering in its error, one fit a seed, with the
+    interval of their mean.
 
-    The fit is against samples per pixel, that is time without what goes before the first iteration: a pilot would otherwise pass for convergence.
+    The fit is against samples per pixel, that is time without what goes before the first iteration:
+    a pilot would otherwise pass for convergence.
     """
     fitted: list[Row] = []
     for measured in measurement.methods:
         mine = [row for row in rows if row["method"] == measured.method.label]
-        slope, trimmed = (slope_interval([_curve(run.snapshots, name, measurement) for run in measured.runs])
-                          for name in ("relmse", "relmse_trimmed"))
-        fitted.append({
-            "scene": measurement.opened.name,
-            "method": measured.method.label,
-            "slope": slope.value,
-            "slope low": slope.low,
-            "slope high": slope.high,
-            "slope trimmed": trimmed.value,
-            "slope trimmed low": trimmed.low,
-            "slope trimmed high": trimmed.high,
-            "relMSE at the end": mine[-1]["relMSE"],
-            "on the front": any(row["on the front"] for row in mine),
-        })
+        slope, trimmed = (
+            slope_interval([_curve(run.snapshots, name, measurement) for run in measured.runs])
+            for name in ("relmse", "relmse_trimmed")
+        )
+        fitted.append(
+            {
+                "scene": measurement.opened.name,
+                "method": measured.method.label,
+                "slope": slope.value,
+                "slope low": slope.low,
+                "slope high": slope.high,
+                "slope trimmed": trimmed.value,
+                "slope trimmed low": trimmed.low,
+                "slope trimmed high": trimmed.high,
+                "relMSE at the end": mine[-1]["relMSE"],
+                "on the front": any(row["on the front"] for row in mine),
+            }
+        )
     return fitted
 
 
 def _curve(snapshots, name: str, measurement: Measurement) -> tuple[list[float], list[float]]:
-    return ([snapshot.samples_per_pixel for snapshot in snapshots],
-            [getattr(errors(snapshot.image, measurement.references), name) for snapshot in snapshots])
+    return (
+        [snapshot.samples_per_pixel for snapshot in snapshots],
+        [getattr(errors(snapshot.image, measurement.references), name) for snapshot in snapshots],
+    )

@@ -21,7 +21,8 @@ def freeze(options: argparse.Namespace) -> None:
 
 
 def check(options: argparse.Namespace) -> None:
-    """Compare the bundled scenes with what was frozen; list the changes, if any, and exit with code 1."""
+    """Compare the bundled scenes with what was frozen; list the changes, if any, and exit with code
+    1."""
     frozen, found = json.loads(RECORD.read_text()), current()
     changes = [
         f"{name}: {_change(frozen.get(name), found.get(name))}"

@@ -1,15 +1,16 @@
-"""Renders of several methods under several seeds, taking turns, with snapshots on the way: what `compare` and `converge` judge."""
+"""Renders of several methods under several seeds, taking turns, with snapshots on the way: what
+`compare` and `converge` judge."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Callable, Sequence
+
+from mis_integrators.analysis.metrics import References, flip
+from mis_integrators.app import loading
 
 import numpy as np
-
 from methods import Method, SessionMaker, base_of
-from mis_integrators.app import loading
-from mis_integrators.analysis.metrics import References, flip
 from scene_files import OpenScene
 from turns import Contender, Snapshot, take_turns
 
@@ -89,7 +90,8 @@ def measure(
     marks: Sequence[float],
     tell: Callable[[str], None],
 ) -> Measurement:
-    """Render by every method that can render the scene. ``marks``: seconds at which to take snapshots besides the last."""
+    """Render by every method that can render the scene. ``marks``: seconds at which to take
+    snapshots besides the last."""
     makers, failures = [], {}
     for method in methods:
         tell(f"{opened.name}: compiling {method.label}")
@@ -101,10 +103,30 @@ def measure(
         raise SystemExit(f"{opened.name}: no method can render it: {failures}")
     found = [Measured(maker.method, maker.warm_up_seconds) for maker in makers]
     for seed in range(seeds):
-        contenders = [Contender.begin(maker.method.label, maker.make, seed, marks, maker.iteration_seconds) for maker in makers]
-        take_turns(contenders, seconds, lambda text: tell(f"{opened.name}, seed {seed + 1} of {seeds}: {text}"), spp)
+        contenders = [
+            Contender.begin(maker.method.label, maker.make, seed, marks, maker.iteration_seconds)
+            for maker in makers
+        ]
+        take_turns(
+            contenders,
+            seconds,
+            lambda text: tell(f"{opened.name}, seed {seed + 1} of {seeds}: {text}"),
+            spp,
+        )
         for measured, contender in zip(found, contenders):
-            if not contender.snapshots or contender.snapshots[-1].iterations < contender.session.iterations:
+            if (
+                not contender.snapshots
+                or contender.snapshots[-1].iterations < contender.session.iterations
+            ):
                 contender.take_snapshot()
-            measured.runs.append(Run(contender.snapshots, contender.first, contender.compiling, dict(contender.session.settings)))
-    return Measurement(opened, references, found, failures, f"{spp} spp" if spp else f"{seconds:g} s")
+            measured.runs.append(
+                Run(
+                    contender.snapshots,
+                    contender.first,
+                    contender.compiling,
+                    dict(contender.session.settings),
+                )
+            )
+    return Measurement(
+        opened, references, found, failures, f"{spp} spp" if spp else f"{seconds:g} s"
+    )

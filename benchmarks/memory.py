@@ -14,7 +14,8 @@ _MIB = 1 << 20
 class PeakMemory:
     """Peak memory since this object was made.
 
-    The process' own peak starts afresh on Linux only; elsewhere it is the peak since the process began.
+    The process' own peak starts afresh on Linux only; elsewhere it is the peak since the process
+    began.
     """
 
     def __init__(self) -> None:

@@ -1,26 +1,51 @@
-"""Integrators as the command line names them (``bdpm:bdd=0,alpha=0.8``), and the sessions that run them."""
+"""Integrators as the command line names them (``bdpm:bdd=0,alpha=0.8``), and the sessions that run
+them."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Sequence
-
-import mitsuba as mi
 
 from mis_integrators import _plugins
 from mis_integrators.app import loading
 from mis_integrators.core.session import MitsubaSession, Session
+
+import mitsuba as mi
 from scene_files import OpenScene
 
 PASS_SECONDS = 0.2
-"""What one pass of one of Mitsuba's own integrators should take: short, but long beside its start."""
+"""What one pass of one of Mitsuba's own integrators should take: short, but long beside its
+start."""
 
-# All defaults: what this package does not register is left out, so a plugin may be named here before it exists.
-COMPARED = ("path", "ptracer", "bdpm:bdd=0", "bdpm:bdd=1", "bdpm_balance", "bdpm_opt2", "bdpm_opt3", "bdpm_auto", "bdpt", "vcm", "pcbpt", "bdpt_ris")
+# All defaults: what this package does not register is left out, so a plugin may be named here
+# before it exists.
+COMPARED = (
+    "path",
+    "ptracer",
+    "bdpm:bdd=0",
+    "bdpm:bdd=1",
+    "bdpm_balance",
+    "bdpm_opt2",
+    "bdpm_opt3",
+    "bdpm_auto",
+    "bdpt",
+    "vcm",
+    "pcbpt",
+    "bdpt_ris",
+)
 """What is compared unless said otherwise; ratios are to the first."""
-VARIED = ("bdpm:bdd=0", "bdpm:bdd=1", "bdpm:bdd=2", "bdpm_balance", "bdpm_opt3", "bdpm_opt2:mix_diffuse=true", "bdpm_opt3:mix_diffuse=true")
-"""What variance maps are made of unless said otherwise: strategies that merge, alone and together."""
+VARIED = (
+    "bdpm:bdd=0",
+    "bdpm:bdd=1",
+    "bdpm:bdd=2",
+    "bdpm_balance",
+    "bdpm_opt3",
+    "bdpm_opt2:mix_diffuse=true",
+    "bdpm_opt3:mix_diffuse=true",
+)
+"""What variance maps are made of unless said otherwise: strategies that merge, alone and
+together."""
 BASE = "path"
 """What ratios are to, if it is among the methods; else the first of them."""
 MITSUBAS = ("path", "ptracer", "volpath", "volpathmis", "direct", "prb")
@@ -56,7 +81,11 @@ def parse_method(text: str) -> Method:
 def registered(labels: Sequence[str]) -> list[Method]:
     """The methods among these whose plugins exist."""
     methods = [parse_method(label) for label in labels]
-    return [method for method in methods if method.plugin in _plugins.PLUGINS or method.plugin in MITSUBAS]
+    return [
+        method
+        for method in methods
+        if method.plugin in _plugins.PLUGINS or method.plugin in MITSUBAS
+    ]
 
 
 def base_of(methods: Sequence[Method]) -> int:
@@ -67,10 +96,18 @@ def base_of(methods: Sequence[Method]) -> int:
 class SessionMaker:
     """Makes sessions of one integrator on one scene, after having compiled what they need."""
 
-    def __init__(self, method: Method, opened: OpenScene, seconds: float, spp: int | None = None, warm_up: bool = True):
-        """``seconds``: what each session will be given; a session may plan with it. ``spp``: or the samples per pixel that each will
-        take; a pass of one of Mitsuba's own integrators then divides them. ``warm_up``: compile now, with a session to throw away,
-        whose last iteration tells ``iteration_seconds``."""
+    def __init__(
+        self,
+        method: Method,
+        opened: OpenScene,
+        seconds: float,
+        spp: int | None = None,
+        warm_up: bool = True,
+    ):
+        """``seconds``: what each session will be given; a session may plan with it. ``spp``: or the
+        samples per pixel that each will take; a pass of one of Mitsuba's own integrators then
+        divides them. ``warm_up``: compile now, with a session to throw away, whose last iteration
+        tells ``iteration_seconds``."""
         self.method, self.opened, self.seconds = method, opened, seconds
         self._integrator = method.integrator(opened)
         self._spp = 0
@@ -91,14 +128,17 @@ class SessionMaker:
     def make(self, seed: int) -> Session:
         """A session that renders until it is stopped."""
         if self._spp:
-            return MitsubaSession(self._integrator, self.opened.scene, self.opened.sensor, seed, self._spp)
+            return MitsubaSession(
+                self._integrator, self.opened.scene, self.opened.sensor, seed, self._spp
+            )
         session = self._integrator.session(self.opened.scene, self.opened.sensor, seed=seed, spp=0)
         if hasattr(session, "plan_time") and self.seconds:
             session.plan_time(self.seconds)
         return session
 
     def _samples_per_pass(self) -> int:
-        """Samples per pixel that one of Mitsuba's own integrators takes in about ``PASS_SECONDS``."""
+        """Samples per pixel that one of Mitsuba's own integrators takes in about
+        ``PASS_SECONDS``."""
         spp = 4
         session = MitsubaSession(self._integrator, self.opened.scene, self.opened.sensor, 0, spp)
         session.iterate()

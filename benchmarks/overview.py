@@ -1,5 +1,5 @@
-"""Everything on one page: pictures and errors after equal time, convergence, variance maps, many views, stability; within a given
-time."""
+"""Everything on one page: pictures and errors after equal time, convergence, variance maps, many
+views, stability; within a given time."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ from scene_files import open_scene, scaled_size
 from sweeps import SWEEPS
 
 COMPILING_SECONDS = 2.5
-"""Rough guess of what kernels and set-up cost for a method and scene on an idle machine; only the plan depends on it."""
+"""Rough guess of what kernels and set-up cost for a method and scene on an idle machine; only the
+plan depends on it."""
 SHORTEST = 1.5
 """Least rendering seconds of a method, whatever the plan."""
 VARIANCE_SECONDS = 12.0
@@ -31,9 +32,14 @@ def run(options: argparse.Namespace) -> None:
     start = time.perf_counter()
     options.time = options.time or planned_time(options)
     expected = overhead(options) + rendering(options, options.time)
-    console.print(f"{len(options.scenes)} scenes, {len(options.integrators)} methods, {options.seeds} seeds, {options.time:.1f} s each: about "
-                  f"{expected / 60:.0f} minutes, references not counted", highlight=False)
-    console.print(f"(rendering {rendering(options, options.time) / 60:.0f}, compiling, variance maps and sweeps {overhead(options) / 60:.0f})")
+    console.print(
+        f"{len(options.scenes)} scenes, {len(options.integrators)} methods, {options.seeds} seeds, {options.time:.1f} s each: about "
+        f"{expected / 60:.0f} minutes, references not counted",
+        highlight=False,
+    )
+    console.print(
+        f"(rendering {rendering(options, options.time) / 60:.0f}, compiling, variance maps and sweeps {overhead(options) / 60:.0f})"
+    )
 
     rows: list[Row] = []
     failures: dict[str, dict[str, str]] = {}
@@ -43,39 +49,76 @@ def run(options: argparse.Namespace) -> None:
     slopes: list[Row] = []
     varied: list[Row] = []
     for path in options.scenes:
-        measurement = compare.measure_scene(path, options, converge.marks(options.time, options.snapshots))
+        measurement = compare.measure_scene(
+            path, options, converge.marks(options.time, options.snapshots)
+        )
         name = measurement.opened.name
         found = compare.compare(measurement)
         compare.show_comparison(found, measurement, options)
         curve = converge.converge(measurement)
         fitted = converge.fit_slopes(measurement, curve)
-        rows, points, slopes, failures[name] = rows + found, points + curve, slopes + fitted, measurement.failures
+        rows, points, slopes, failures[name] = (
+            rows + found,
+            points + curve,
+            slopes + fitted,
+            measurement.failures,
+        )
         small = open_scene(path, scaled_size(path, options.variance_scale))
         maps = argparse.Namespace(**{**vars(options), "integrators": options.varied})
         varied += variance.compare(small, 1, maps)
-        for kind, kept in (("compare", rows), ("converge", points), ("slopes", slopes), ("variance", varied)):
+        for kind, kept in (
+            ("compare", rows),
+            ("converge", points),
+            ("slopes", slopes),
+            ("variance", varied),
+        ):
             save(options.out, kind, kept, vars(options))
-        scenes.append(f'<h2 id="{name}">{name}</h2>' + pages.pictures(measurement, found, options.out)
-                      + pages.convergence(measurement, curve, fitted, options.out)
-                      + pages.variance(name, variance.picture_of(small, 1, options)))
+        scenes.append(
+            f'<h2 id="{name}">{name}</h2>'
+            + pages.pictures(measurement, found, options.out)
+            + pages.convergence(measurement, curve, fitted, options.out)
+            + pages.variance(name, variance.picture_of(small, 1, options))
+        )
         write(page, pages, rows, failures, scenes, "", options)
     show("Variance of one iteration, best single strategy = 1", varied, variance.COLUMNS)
-    sweeps = pages.stability(stability.sweep_all(options), options.out, options.integrators) if options.sweeps else ""
+    sweeps = (
+        pages.stability(stability.sweep_all(options), options.out, options.integrators)
+        if options.sweeps
+        else ""
+    )
     if options.view_scenes:
         sweeps = view_counts.section(options, options.out) + sweeps
     sweeps += resampling.section(options.resampled, options) if options.resampled else ""
-    write(page, pages, rows, failures, scenes, pages.choices(compare.winners(rows)) + sweeps, options)
+    write(
+        page, pages, rows, failures, scenes, pages.choices(compare.winners(rows)) + sweeps, options
+    )
     (options.out / "which_scene.md").write_text(stability.as_markdown(compare.winners(rows)))
     console.print(f"page: {page.path} after {(time.perf_counter() - start) / 60:.1f} minutes")
 
 
 def write(page, pages, rows, failures, scenes, sweeps: str, options: argparse.Namespace) -> None:
     """The page as far as it has come."""
-    much = f"at {options.spp} samples per pixel" if options.spp else f"after {options.time:.1f} s of rendering"
-    parts = [(part, name) for part, name in (("views", "many views"), ("stability", "stability"), ("resampling", "resampling"))
-             if f'id="{part}"' in sweeps]
+    much = (
+        f"at {options.spp} samples per pixel"
+        if options.spp
+        else f"after {options.time:.1f} s of rendering"
+    )
+    parts = [
+        (part, name)
+        for part, name in (
+            ("views", "many views"),
+            ("stability", "stability"),
+            ("resampling", "resampling"),
+        )
+        if f'id="{part}"' in sweeps
+    ]
     links = "".join(f'<a href="#{part}">{name}</a>' for part, name in parts)
-    page.sections = [pages.summary(rows, failures, f"{much}, {options.seeds} seeds"), f"<nav>{links}</nav>", *scenes, sweeps]
+    page.sections = [
+        pages.summary(rows, failures, f"{much}, {options.seeds} seeds"),
+        f"<nav>{links}</nav>",
+        *scenes,
+        sweeps,
+    ]
     page.write()
 
 
@@ -87,14 +130,39 @@ def rendering(options: argparse.Namespace, seconds: float) -> float:
 def overhead(options: argparse.Namespace) -> float:
     """Seconds of everything else: compiling, variance maps, sweeps."""
     scenes = len(options.scenes) * (len(options.integrators) * COMPILING_SECONDS + VARIANCE_SECONDS)
-    values = [(sweep, len(sweep.methods(options.integrators)) * len(sweep.scenes(options.coarse)))
-              for sweep in SWEEPS if sweep.name in options.sweeps]
+    values = [
+        (sweep, len(sweep.methods(options.integrators)) * len(sweep.scenes(options.coarse)))
+        for sweep in SWEEPS
+        if sweep.name in options.sweeps
+    ]
     points = sum(count for _, count in values) * options.point_time
-    compiling = sum((0.3 if sweep.of_method else 1.0) * count for sweep, count in values) * 0.5 * COMPILING_SECONDS
-    views = sum(options.view_seeds * options.view_time * max(count, view_counts.FEW) + COMPILING_SECONDS for count in options.view_counts)
-    drawn = sum(len(sweep.chosen(options.coarse)) for sweep in resampling.SWEEPS if sweep.name in options.parameters)
-    resampled = len(options.resampled) * drawn * len(resampling.METHODS) * (options.draw_seeds * options.draw_time + COMPILING_SECONDS)
-    return scenes + points + compiling + resampled + len(options.view_scenes) * (1 + len(options.view_weights)) * views
+    compiling = (
+        sum((0.3 if sweep.of_method else 1.0) * count for sweep, count in values)
+        * 0.5
+        * COMPILING_SECONDS
+    )
+    views = sum(
+        options.view_seeds * options.view_time * max(count, view_counts.FEW) + COMPILING_SECONDS
+        for count in options.view_counts
+    )
+    drawn = sum(
+        len(sweep.chosen(options.coarse))
+        for sweep in resampling.SWEEPS
+        if sweep.name in options.parameters
+    )
+    resampled = (
+        len(options.resampled)
+        * drawn
+        * len(resampling.METHODS)
+        * (options.draw_seeds * options.draw_time + COMPILING_SECONDS)
+    )
+    return (
+        scenes
+        + points
+        + compiling
+        + resampled
+        + len(options.view_scenes) * (1 + len(options.view_weights)) * views
+    )
 
 
 def planned_time(options: argparse.Namespace) -> float:

@@ -1,57 +1,75 @@
-"""Pairs of independent reference images: beside the scene, or made once by long runs and kept for later."""
+"""Pairs of independent reference images: beside the scene, or made once by long runs and kept for
+later."""
 
 from __future__ import annotations
 
 import argparse
 import json
 import time
+from collections.abc import Callable
 from pathlib import Path
-from typing import Callable
-
-import numpy as np
-import OpenEXR
 
 import mis_integrators
 from mis_integrators.analysis.metrics import References
 from mis_integrators.app.output import write_exr
 from mis_integrators.core.traits import has_media
+
+import numpy as np
+import OpenEXR
 from methods import Method, SessionMaker, parse_method
 from scene_files import OpenScene, fingerprint
 
 COLOURS = ("R", "G", "B")
 
 RECIPE = json.loads(Path(__file__).with_name("references.json").read_text())
-"""Scenes that path cannot render in reasonable time: what makes their references, and which other methods must agree with them."""
+"""Scenes that path cannot render in reasonable time: what makes their references, and which other
+methods must agree with them."""
 
 
 def add_options(command: argparse.ArgumentParser) -> None:
     """The options that ``find_references`` reads."""
     add_folder(command)
-    command.add_argument("--reference-time", type=float, default=30, metavar="SECONDS",
-                         help="rendering seconds of each of the two references (default: 30)")
-    command.add_argument("--reference-method", type=parse_method, metavar="PLUGIN[:...]",
-                         help="what renders them (default: path, or for the scenes that it cannot do bdpm "
-                         "with a radius below the pixels' size)")
+    command.add_argument(
+        "--reference-time",
+        type=float,
+        default=30,
+        metavar="SECONDS",
+        help="rendering seconds of each of the two references (default: 30)",
+    )
+    command.add_argument(
+        "--reference-method",
+        type=parse_method,
+        metavar="PLUGIN[:...]",
+        help="what renders them (default: path, or for the scenes that it cannot do bdpm "
+        "with a radius below the pixels' size)",
+    )
 
 
 def add_folder(command: argparse.ArgumentParser) -> None:
     """The option that names where references are kept."""
-    command.add_argument("--references", type=Path, default=Path("out/references"), metavar="DIR",
-                         help="where references are kept that do not lie beside the scene "
-                         "(default: out/references)")
+    command.add_argument(
+        "--references",
+        type=Path,
+        default=Path("out/references"),
+        metavar="DIR",
+        help="where references are kept that do not lie beside the scene (default: out/references)",
+    )
 
 
 def recipe(opened: OpenScene) -> dict:
-    """How the references of a scene are made, ``method``, and the methods that must agree, ``opinions``: path, where there are media volpath, unless
-    `references.json` knows better."""
-    return RECIPE.get(opened.name, {"method": "volpath" if has_media(opened.scene) else "path", "opinions": []})
+    """How the references of a scene are made, ``method``, and the methods that must agree,
+    ``opinions``: path, where there are media volpath, unless `references.json` knows better."""
+    return RECIPE.get(
+        opened.name, {"method": "volpath" if has_media(opened.scene) else "path", "opinions": []}
+    )
 
 
 def find_references(
     opened: OpenScene, options: argparse.Namespace, tell: Callable[[str], None]
 ) -> References:
-    """References beside the scene (``NAME.exr`` and ``NAME_2.exr``, if of the film's size), else those kept
-    from an earlier run, else new ones, which are then kept. ``options``: see ``add_options``."""
+    """References beside the scene (``NAME.exr`` and ``NAME_2.exr``, if of the film's size), else
+    those kept from an earlier run, else new ones, which are then kept. ``options``: see
+    ``add_options``."""
     beside = _beside(opened)
     if beside:
         return References(*beside, origin="beside the scene", noisy=False)
@@ -90,14 +108,18 @@ def _wanted(opened: OpenScene, options: argparse.Namespace) -> tuple[list[Path],
     """Where the kept references of a scene lie, their record, and what must stand in it."""
     width, height = opened.size
     kept = _paths(options.references, f"{opened.name}_{width}x{height}")
-    return kept, kept[0].with_suffix(".json"), {
-        "scene": opened.name,
-        "fingerprint": fingerprint(opened),
-        "size": [width, height],
-        "method": _method(opened, options).label,
-        "inherited": opened.inherited,
-        "seconds_at_least": options.reference_time,
-    }
+    return (
+        kept,
+        kept[0].with_suffix(".json"),
+        {
+            "scene": opened.name,
+            "fingerprint": fingerprint(opened),
+            "size": [width, height],
+            "method": _method(opened, options).label,
+            "inherited": opened.inherited,
+            "seconds_at_least": options.reference_time,
+        },
+    )
 
 
 def read_colours(path: Path) -> np.ndarray:
@@ -128,7 +150,11 @@ def _usable(record: Path, made_with: dict) -> bool:
 
 
 def _make(
-    opened: OpenScene, method: Method, seconds: float, paths: list[Path], tell: Callable[[str], None]
+    opened: OpenScene,
+    method: Method,
+    seconds: float,
+    paths: list[Path],
+    tell: Callable[[str], None],
 ) -> list[int]:
     """Render the references; returns the iterations of each."""
     maker = SessionMaker(method, opened, seconds)

@@ -1,4 +1,5 @@
-"""What a benchmark leaves: a table in the terminal, and the rows as CSV and JSON with the machine."""
+"""What a benchmark leaves: a table in the terminal, and the rows as CSV and JSON with the
+machine."""
 
 from __future__ import annotations
 
@@ -9,15 +10,15 @@ import os
 import platform
 import subprocess
 import time
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Mapping, Sequence
+
+import mis_integrators
 
 import drjit as dr
 import mitsuba as mi
 from rich.console import Console
 from rich.table import Table
-
-import mis_integrators
 
 Row = Mapping[str, str | int | float | None]
 
@@ -46,23 +47,46 @@ def save(directory: Path, name: str, rows: Sequence[Row], settings: Mapping) -> 
         writer = csv.DictWriter(file, fieldnames=list(rows[0]) if rows else [])
         writer.writeheader()
         writer.writerows(rows)
-    (directory / f"{name}.json").write_text(json.dumps(document(rows, settings), indent=1, default=str) + "\n")
+    (directory / f"{name}.json").write_text(
+        json.dumps(document(rows, settings), indent=1, default=str) + "\n"
+    )
 
 
 def document(rows: Sequence[Row], settings: Mapping) -> dict:
-    """What JSON files hold: the rows, how they were asked for, and the class of machine; figures that are no numbers become null."""
+    """What JSON files hold: the rows, how they were asked for, and the class of machine; figures
+    that are no numbers become null."""
     kept = {name: value for name, value in settings.items() if not callable(value)}
-    kept = {name: [_plain(one) for one in value] if isinstance(value, list) else _plain(value) for name, value in kept.items()}
-    numbers = [{key: None if isinstance(value, float) and not math.isfinite(value) else value for key, value in row.items()} for row in rows]
+    kept = {
+        name: [_plain(one) for one in value] if isinstance(value, list) else _plain(value)
+        for name, value in kept.items()
+    }
+    numbers = [
+        {
+            key: None if isinstance(value, float) and not math.isfinite(value) else value
+            for key, value in row.items()
+        }
+        for row in rows
+    ]
     return {"settings": kept, "machine": machine(), "rows": numbers}
 
 
 def commit() -> str | None:
-    """The commit of this checkout, with a "+" if files differ from it; ``None`` outside a repository."""
+    """The commit of this checkout, with a "+" if files differ from it; ``None`` outside a
+    repository."""
+
     def git(*arguments):
-        return subprocess.run(["git", *arguments], cwd=Path(__file__).parent, capture_output=True, text=True, check=True).stdout.strip()
+        return subprocess.run(
+            ["git", *arguments],
+            cwd=Path(__file__).parent,
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout.strip()
+
     try:
-        return git("rev-parse", "--short=12", "HEAD") + ("+" if git("status", "--porcelain", "--untracked-files=no") else "")
+        return git("rev-parse", "--short=12", "HEAD") + (
+            "+" if git("status", "--porcelain", "--untracked-files=no") else ""
+        )
     except (OSError, subprocess.CalledProcessError):
         return None
 
@@ -101,7 +125,9 @@ def _processor() -> str:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:
         return platform.processor()
-    return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), "")
+    return next(
+        (line.partition(":")[2].strip() for line in lines if line.startswith("model name")), ""
+    )
 
 
 def _text(value: str | int | float | None) -> str:

@@ -1,17 +1,18 @@
-"""Does resampling pay: light sub-paths M, draws N, cache points N_c and the target distribution, beside `bdpt`, at equal time."""
+"""Does resampling pay: light sub-paths M, draws N, cache points N_c and the target distribution,
+beside `bdpt`, at equal time."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
 
-import numpy as np
-
-from methods import Method, SessionMaker, parse_method
-from mis_integrators.app import loading
 from mis_integrators.analysis.charts import Line
 from mis_integrators.analysis.confidence import ratio_interval
 from mis_integrators.analysis.metrics import References, errors
+from mis_integrators.app import loading
+
+import numpy as np
+from methods import Method, SessionMaker, parse_method
 from references import colours, find_references
 from reports import Row, console, save, show, tell
 from scene_files import OpenScene, open_scene, scaled_size
@@ -26,7 +27,11 @@ SWEEPS = (
 BASE = "bdpt"
 METHODS = (BASE, "pcbpt", "bdpt_ris", "bdpt_ris:target=f_y_f_yz")
 """What is compared: ratios are to the first, which has none of the parameters."""
-MEASURES = {"MAPE ratio": "MAPE, equal time", "noise ratio": "noise of an iteration", "cost ratio": "cost of an iteration"}
+MEASURES = {
+    "MAPE ratio": "MAPE, equal time",
+    "noise ratio": "noise of an iteration",
+    "cost ratio": "cost of an iteration",
+}
 """What is drawn: column of the table, and title of the chart."""
 COLUMNS = ("sweep", "value", "method", "iterations", *MEASURES, "relMSE ratio")
 
@@ -55,7 +60,9 @@ def section(scenes: list[Path], options: argparse.Namespace) -> str:
     return pages.resampling(rows, options.out)
 
 
-def sweep_scene(opened: OpenScene, references: References, options: argparse.Namespace) -> list[Row]:
+def sweep_scene(
+    opened: OpenScene, references: References, options: argparse.Namespace
+) -> list[Row]:
     """One row a sweep, value and method."""
     rows: list[Row] = []
     for sweep in SWEEPS:
@@ -65,8 +72,11 @@ def sweep_scene(opened: OpenScene, references: References, options: argparse.Nam
     return rows
 
 
-def measure_value(opened: OpenScene, references: References, sweep: Sweep, value: int, options: argparse.Namespace) -> list[Row]:
-    """Rows of one value: every method renders `draw_time` seconds a seed, side by side; first iterations, with the pilots of pmfs, are free."""
+def measure_value(
+    opened: OpenScene, references: References, sweep: Sweep, value: int, options: argparse.Namespace
+) -> list[Row]:
+    """Rows of one value: every method renders `draw_time` seconds a seed, side by side; first
+    iterations, with the pilots of pmfs, are free."""
     methods = [with_value(parse_method(label), sweep.parameter, value) for label in METHODS]
     makers = {}
     for method in methods:
@@ -81,33 +91,65 @@ def measure_value(opened: OpenScene, references: References, sweep: Sweep, value
         for contender in contenders:
             contender.session.iterate()
             contender.setting_up = 0.0
-        take_turns(contenders, options.draw_time, lambda text: tell(f"{opened.name}: {sweep.name} = {value:g}: {text}"))
+        take_turns(
+            contenders,
+            options.draw_time,
+            lambda text: tell(f"{opened.name}: {sweep.name} = {value:g}: {text}"),
+        )
         for contender in contenders:
             figures[contender.label].append(judge(contender, references))
     if BASE not in figures:
         return []
-    return [row(opened, sweep, value, label, mine, figures[BASE]) for label, mine in figures.items()]
+    return [
+        row(opened, sweep, value, label, mine, figures[BASE]) for label, mine in figures.items()
+    ]
 
 
 def with_value(method: Method, parameter: str, value: int) -> Method:
     """The method with a parameter set, under its own name; `BASE` as it is."""
-    return method if method.label == BASE else Method(method.label, method.plugin, {**method.parameters, parameter: int(value)})
+    return (
+        method
+        if method.label == BASE
+        else Method(method.label, method.plugin, {**method.parameters, parameter: int(value)})
+    )
 
 
 def judge(contender: Contender, references: References) -> dict[str, float]:
-    """Errors and cost of one render; `noise`: what relMSE without the worst pixels would be after one iteration."""
+    """Errors and cost of one render; `noise`: what relMSE without the worst pixels would be after
+    one iteration."""
     found, iterations = errors(colours(contender.session), references), contender.session.iterations
-    return {"MAPE": found.mape, "relMSE": found.relmse_trimmed, "noise": found.relmse_trimmed * iterations, "iterations": iterations,
-            "cost": float(np.median(contender.seconds))}
+    return {
+        "MAPE": found.mape,
+        "relMSE": found.relmse_trimmed,
+        "noise": found.relmse_trimmed * iterations,
+        "iterations": iterations,
+        "cost": float(np.median(contender.seconds)),
+    }
 
 
-def row(opened: OpenScene, sweep: Sweep, value: float, label: str, mine: list[dict[str, float]], base: list[dict[str, float]]) -> Row:
+def row(
+    opened: OpenScene,
+    sweep: Sweep,
+    value: float,
+    label: str,
+    mine: list[dict[str, float]],
+    base: list[dict[str, float]],
+) -> Row:
     """Ratios to the base, with 95 % intervals over the seeds."""
-    found: dict[str, str | int | float | None] = {"scene": opened.name, "sweep": sweep.name, "value": value, "method": label,
-                                                  "iterations": round(np.mean([one["iterations"] for one in mine]))}
+    found: dict[str, str | int | float | None] = {
+        "scene": opened.name,
+        "sweep": sweep.name,
+        "value": value,
+        "method": label,
+        "iterations": round(np.mean([one["iterations"] for one in mine])),
+    }
     for name in ("MAPE", "relMSE", "noise", "cost"):
         ratio = ratio_interval([one[name] for one in mine], [one[name] for one in base])
-        found |= {f"{name} ratio": ratio.value, f"{name} ratio low": ratio.low, f"{name} ratio high": ratio.high}
+        found |= {
+            f"{name} ratio": ratio.value,
+            f"{name} ratio low": ratio.low,
+            f"{name} ratio high": ratio.high,
+        }
     return found
 
 
@@ -117,5 +159,10 @@ def lines(rows: list[Row], sweep: Sweep, measure: str) -> dict[str, Line]:
     for label in METHODS[1:]:
         mine = [r for r in rows if r["sweep"] == sweep.name and r["method"] == label]
         if mine:
-            found[label] = Line(*([r[key] for r in mine] for key in ("value", measure, f"{measure} low", f"{measure} high")))
+            found[label] = Line(
+                *(
+                    [r[key] for r in mine]
+                    for key in ("value", measure, f"{measure} low", f"{measure} high")
+                )
+            )
     return found

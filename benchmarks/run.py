@@ -7,8 +7,9 @@ import argparse
 from pathlib import Path
 
 import mis_integrators  # noqa: F401  (makes LLVM known and registers the plugins)
-import mitsuba as mi
 from mis_integrators.app import loading
+
+import mitsuba as mi
 
 mi.set_variant("llvm_ad_rgb")
 
@@ -44,52 +45,125 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(required=True, metavar="SUB-COMMAND")
 
     command = _measuring(commands, "throughput", throughput)
-    command.add_argument("--sizes", type=int, nargs="+", default=[128, 256, 512, 1024], metavar="PIXELS",
-                         help="edges of the square film (default: 128 256 512 1024)")
-    command.add_argument("--light-paths", type=int, nargs="*", metavar="N",
-                         default=[10_000, 30_000, 100_000, 300_000, 1_000_000],
-                         help=f"light paths an iteration, at {throughput.SIZE_OF_SWEEP} pixels; as many as "
-                         "pixels are measured at every size (default: 10000 30000 100000 300000 1000000)")
-    command.add_argument("--full", action="store_true", help="every number of light paths at every size")
-    command.add_argument("--quick", action="store_true", help="only 256 pixels and as many light paths")
-    command.add_argument("--photons", type=_positive, default=10, help="photons a gather (default: 10)")
-    command.add_argument("--time", type=_positive, default=3, metavar="SECONDS",
-                         help="what bdpm, bdpm with edge probes, and path have each (default: 3)")
+    command.add_argument(
+        "--sizes",
+        type=int,
+        nargs="+",
+        default=[128, 256, 512, 1024],
+        metavar="PIXELS",
+        help="edges of the square film (default: 128 256 512 1024)",
+    )
+    command.add_argument(
+        "--light-paths",
+        type=int,
+        nargs="*",
+        metavar="N",
+        default=[10_000, 30_000, 100_000, 300_000, 1_000_000],
+        help=f"light paths an iteration, at {throughput.SIZE_OF_SWEEP} pixels; as many as "
+        "pixels are measured at every size (default: 10000 30000 100000 300000 1000000)",
+    )
+    command.add_argument(
+        "--full", action="store_true", help="every number of light paths at every size"
+    )
+    command.add_argument(
+        "--quick", action="store_true", help="only 256 pixels and as many light paths"
+    )
+    command.add_argument(
+        "--photons", type=_positive, default=10, help="photons a gather (default: 10)"
+    )
+    command.add_argument(
+        "--time",
+        type=_positive,
+        default=3,
+        metavar="SECONDS",
+        help="what bdpm, bdpm with edge probes, and path have each (default: 3)",
+    )
 
     command = _measuring(commands, "page", overview)
     _renders(command, None)
     _compares_with_references(command)
     command.set_defaults(seeds=2)
-    command.add_argument("--minutes", type=_positive, default=24, metavar="MINUTES", help="what all should take, if --time is not given (default: 24)")
-    command.add_argument("--snapshots", type=int, default=5, metavar="N", help="at times T, T/2, T/4, ... (default: 5)")
-    command.add_argument("--varied", nargs="+", type=_method, default=registered(VARIED), metavar="PLUGIN[:...]",
-                         help=f"methods of the variance maps (default: {' '.join(method.label for method in registered(VARIED))})")
-    command.add_argument("--variance-scale", type=_positive, default=0.5, metavar="SCALE", help="film size of variance maps (default: 0.5)")
+    command.add_argument(
+        "--minutes",
+        type=_positive,
+        default=24,
+        metavar="MINUTES",
+        help="what all should take, if --time is not given (default: 24)",
+    )
+    command.add_argument(
+        "--snapshots",
+        type=int,
+        default=5,
+        metavar="N",
+        help="at times T, T/2, T/4, ... (default: 5)",
+    )
+    command.add_argument(
+        "--varied",
+        nargs="+",
+        type=_method,
+        default=registered(VARIED),
+        metavar="PLUGIN[:...]",
+        help=f"methods of the variance maps (default: {' '.join(method.label for method in registered(VARIED))})",
+    )
+    command.add_argument(
+        "--variance-scale",
+        type=_positive,
+        default=0.5,
+        metavar="SCALE",
+        help="film size of variance maps (default: 0.5)",
+    )
     _variance(command, 16)
     _sweeps(command, 0.4)
-    command.add_argument("--every-value", dest="coarse", action="store_false", help="all values of the sweeps instead of every other")
+    command.add_argument(
+        "--every-value",
+        dest="coarse",
+        action="store_false",
+        help="all values of the sweeps instead of every other",
+    )
     _views(command, (2, 8, 16, 64), 0.08, 2, 0.5)
-    command.add_argument("--resampled", nargs="*", type=_file, default=[path for path in bundled() if path.stem == "door"], metavar="FILE.xml",
-                         help="scenes of the sweeps of resampling (default: door)")
+    command.add_argument(
+        "--resampled",
+        nargs="*",
+        type=_file,
+        default=[path for path in bundled() if path.stem == "door"],
+        metavar="FILE.xml",
+        help="scenes of the sweeps of resampling (default: door)",
+    )
     _resampling(command, 1.0)
 
     command = _measuring(commands, "compare", compare)
     _renders(command, 10)
     _compares_with_references(command)
-    command.add_argument("--baseline", type=_file, metavar="FILE",
-                         help="figures of an earlier run (compare.json or benchmarks/history/*.json): print what became slower or noisier")
-    command.add_argument("--record", action="store_true", help="keep the figures in benchmarks/history")
+    command.add_argument(
+        "--baseline",
+        type=_file,
+        metavar="FILE",
+        help="figures of an earlier run (compare.json or benchmarks/history/*.json): print what became slower or noisier",
+    )
+    command.add_argument(
+        "--record", action="store_true", help="keep the figures in benchmarks/history"
+    )
 
     command = _measuring(commands, "converge", converge)
     _renders(command, 16)
     _compares_with_references(command)
-    command.add_argument("--snapshots", type=int, default=6, metavar="N", help="at times T, T/2, T/4, ... (default: 6)")
+    command.add_argument(
+        "--snapshots",
+        type=int,
+        default=6,
+        metavar="N",
+        help="at times T, T/2, T/4, ... (default: 6)",
+    )
 
     command = _measuring(commands, "variance", variance)
     _chooses(command, VARIED, "some of them bdpm: ratios are to the best of these")
-    command.add_argument("--camera-paths", type=int, nargs="+", default=[1], metavar="N", help="N_B (default: 1)")
+    command.add_argument(
+        "--camera-paths", type=int, nargs="+", default=[1], metavar="N", help="N_B (default: 1)"
+    )
     _variance(command, 24)
-    command.add_argument("--scale", type=_positive, default=1, help="film size, scene's own = 1 (default: 1)")
+    command.add_argument(
+        "--scale", type=_positive, default=1, help="film size, scene's own = 1 (default: 1)"
+    )
 
     command = _measuring(commands, "stability", stability, scenes=False)
     _chooses(command, COMPARED, "each swept where it knows the parameter")
@@ -105,53 +179,141 @@ def _parser() -> argparse.ArgumentParser:
 
     command = _measuring(commands, "radius", radius)
     command.add_argument("--bdd", type=int, nargs="+", default=[0, 1], help="(default: 0 1)")
-    command.add_argument("--time", type=_positive, nargs="+", default=[5, 60], metavar="SECONDS",
-                         help="seconds for which the automatic radius is chosen and judged (default: 5 60)")
-    command.add_argument("--rendering", type=_positive, default=10, metavar="SECONDS",
-                         help="what each radius renders; its error at other times follows (default: 10)")
-    command.add_argument("--pilots", type=int, default=1, help="how many choices of the automatic radius are judged (default: 1)")
-    command.add_argument("--radii", type=int, default=11, help="how many, factor sqrt 2 (default: 11)")
-    command.add_argument("--scale", type=_positive, default=1, help="film size, scene's own = 1 (default: 1)")
+    command.add_argument(
+        "--time",
+        type=_positive,
+        nargs="+",
+        default=[5, 60],
+        metavar="SECONDS",
+        help="seconds for which the automatic radius is chosen and judged (default: 5 60)",
+    )
+    command.add_argument(
+        "--rendering",
+        type=_positive,
+        default=10,
+        metavar="SECONDS",
+        help="what each radius renders; its error at other times follows (default: 10)",
+    )
+    command.add_argument(
+        "--pilots",
+        type=int,
+        default=1,
+        help="how many choices of the automatic radius are judged (default: 1)",
+    )
+    command.add_argument(
+        "--radii", type=int, default=11, help="how many, factor sqrt 2 (default: 11)"
+    )
+    command.add_argument(
+        "--scale", type=_positive, default=1, help="film size, scene's own = 1 (default: 1)"
+    )
     references.add_options(command)
 
     command = _measuring(commands, "references", opinions)
-    command.add_argument("--integrators", nargs="+", type=_method, metavar="PLUGIN[:name=value,...]",
-                         help="methods that must agree (default: those of references.json that there are)")
-    command.add_argument("--again", action="store_true", help="ask them about references that were there before, too")
-    command.add_argument("--time", type=_positive, default=20, metavar="SECONDS", help="rendering seconds of each of their two renders (default: 20)")
-    command.add_argument("--scale", type=_positive, default=1, help="film size, scene's own = 1 (default: 1)")
+    command.add_argument(
+        "--integrators",
+        nargs="+",
+        type=_method,
+        metavar="PLUGIN[:name=value,...]",
+        help="methods that must agree (default: those of references.json that there are)",
+    )
+    command.add_argument(
+        "--again", action="store_true", help="ask them about references that were there before, too"
+    )
+    command.add_argument(
+        "--time",
+        type=_positive,
+        default=20,
+        metavar="SECONDS",
+        help="rendering seconds of each of their two renders (default: 20)",
+    )
+    command.add_argument(
+        "--scale", type=_positive, default=1, help="film size, scene's own = 1 (default: 1)"
+    )
     references.add_options(command)
     _sweeps(command, 0.4)
-    command.add_argument("--every-value", dest="coarse", action="store_false", help="all values of the sweeps instead of every other")
+    command.add_argument(
+        "--every-value",
+        dest="coarse",
+        action="store_false",
+        help="all values of the sweeps instead of every other",
+    )
 
     command = _measuring(commands, "multiview", multiview)
     command.set_defaults(scenes=multiview.SCENES)
-    command.add_argument("--weights", nargs="+", default=["mis", "mwis"], help="weights of volpath_multiview (default: mis mwis)")
-    command.add_argument("--time", type=_positive, default=5, metavar="SECONDS", help="rendering seconds of each (default: 5)")
-    command.add_argument("--seeds", type=int, default=8, help="renders of each, at least two (default: 8)")
-    command.add_argument("--scale", type=_positive, default=1, help="film size, scene's own = 1 (default: 1)")
-    command.add_argument("--charts", action="store_true", help="draw the shifted densities (needs matplotlib)")
+    command.add_argument(
+        "--weights",
+        nargs="+",
+        default=["mis", "mwis"],
+        help="weights of volpath_multiview (default: mis mwis)",
+    )
+    command.add_argument(
+        "--time",
+        type=_positive,
+        default=5,
+        metavar="SECONDS",
+        help="rendering seconds of each (default: 5)",
+    )
+    command.add_argument(
+        "--seeds", type=int, default=8, help="renders of each, at least two (default: 8)"
+    )
+    command.add_argument(
+        "--scale", type=_positive, default=1, help="film size, scene's own = 1 (default: 1)"
+    )
+    command.add_argument(
+        "--charts", action="store_true", help="draw the shifted densities (needs matplotlib)"
+    )
 
     command = _measuring(commands, "costs", costs)
-    command.add_argument("--plugins", nargs="+", choices=costs.PLUGINS, default=costs.PLUGINS, metavar="PLUGIN",
-                         help=f"those whose prices are fitted anew (default: {' '.join(costs.PLUGINS)})")
-    command.add_argument("--scale", type=_positive, default=1, help="film size, scene's own = 1 (default: 1)")
+    command.add_argument(
+        "--plugins",
+        nargs="+",
+        choices=costs.PLUGINS,
+        default=costs.PLUGINS,
+        metavar="PLUGIN",
+        help=f"those whose prices are fitted anew (default: {' '.join(costs.PLUGINS)})",
+    )
+    command.add_argument(
+        "--scale", type=_positive, default=1, help="film size, scene's own = 1 (default: 1)"
+    )
 
     command = _measuring(commands, "views", view_counts, scenes=False)
     _views(command, view_counts.COUNTS, 0.25, 3, 1)
 
     command = _measuring(commands, "view-weights", view_weights)
     command.set_defaults(scenes=[BUNDLED / "multiview" / "fly_through.xml"])
-    command.add_argument("--seeds", type=int, default=24, help="renders, at least two (default: 24)")
-    command.add_argument("--iterations", type=int, default=8, help="of each, one sample a pixel (default: 8)")
-    command.add_argument("--groups", type=int, default=8, help="groups of pixels, equally large (default: 8)")
-    command.add_argument("--scale", type=_positive, default=1, help="film size, scene's own = 1 (default: 1)")
+    command.add_argument(
+        "--seeds", type=int, default=24, help="renders, at least two (default: 24)"
+    )
+    command.add_argument(
+        "--iterations", type=int, default=8, help="of each, one sample a pixel (default: 8)"
+    )
+    command.add_argument(
+        "--groups", type=int, default=8, help="groups of pixels, equally large (default: 8)"
+    )
+    command.add_argument(
+        "--scale", type=_positive, default=1, help="film size, scene's own = 1 (default: 1)"
+    )
 
     command = _measuring(commands, "scaling", scaling)
     _chooses(command, ("bdpm",), "each by itself")
-    command.add_argument("--workers", type=int, nargs="+", default=[1, 2], metavar="N", help="local processes of one thread (default: 1 2)")
-    command.add_argument("--time", type=_positive, default=20, metavar="SECONDS", help="for which each is measured (default: 20)")
-    command.add_argument("--scale", type=_positive, default=1, help="film size, scene's own = 1 (default: 1)")
+    command.add_argument(
+        "--workers",
+        type=int,
+        nargs="+",
+        default=[1, 2],
+        metavar="N",
+        help="local processes of one thread (default: 1 2)",
+    )
+    command.add_argument(
+        "--time",
+        type=_positive,
+        default=20,
+        metavar="SECONDS",
+        help="for which each is measured (default: 20)",
+    )
+    command.add_argument(
+        "--scale", type=_positive, default=1, help="film size, scene's own = 1 (default: 1)"
+    )
 
     for name, function in (("freeze-scenes", freezing.freeze), ("check-scenes", freezing.check)):
         command = commands.add_parser(name, help=function.__doc__, description=function.__doc__)
@@ -160,7 +322,8 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _method(text: str) -> Method:
-    """A method whose plugin exists: else references would be rendered before that is said. What its parameters do to a scene is another matter."""
+    """A method whose plugin exists: else references would be rendered before that is said. What its
+    parameters do to a scene is another matter."""
     try:
         method = parse_method(text)
         mi.load_dict({"type": method.plugin})
@@ -189,10 +352,21 @@ def _measuring(commands, name: str, module, scenes: bool = True) -> argparse.Arg
     """A sub-command with the options that all measurements have."""
     command = commands.add_parser(name, help=module.__doc__, description=module.__doc__)
     if scenes:
-        command.add_argument("--scenes", nargs="+", type=_file, default=bundled(), metavar="FILE.xml",
-                             help="scene files (default: the bundled ones)")
-    command.add_argument("--out", type=Path, default=Path("out/benchmarks"), metavar="DIR",
-                         help="where CSV and JSON files go (default: out/benchmarks)")
+        command.add_argument(
+            "--scenes",
+            nargs="+",
+            type=_file,
+            default=bundled(),
+            metavar="FILE.xml",
+            help="scene files (default: the bundled ones)",
+        )
+    command.add_argument(
+        "--out",
+        type=Path,
+        default=Path("out/benchmarks"),
+        metavar="DIR",
+        help="where CSV and JSON files go (default: out/benchmarks)",
+    )
     command.set_defaults(run=module.run)
     return command
 
@@ -200,62 +374,168 @@ def _measuring(commands, name: str, module, scenes: bool = True) -> argparse.Arg
 def _chooses(command: argparse.ArgumentParser, labels: tuple[str, ...], what: str) -> None:
     """Which methods; by default those of the labels whose plugins there are."""
     methods = registered(labels)
-    command.add_argument("--integrators", nargs="+", type=_method, metavar="PLUGIN[:name=value,...]", default=methods,
-                         help=f"methods, {what} (default: {' '.join(method.label for method in methods)})")
+    command.add_argument(
+        "--integrators",
+        nargs="+",
+        type=_method,
+        metavar="PLUGIN[:name=value,...]",
+        default=methods,
+        help=f"methods, {what} (default: {' '.join(method.label for method in methods)})",
+    )
 
 
 def _variance(command: argparse.ArgumentParser, iterations: int) -> None:
     """How variance is measured."""
-    command.add_argument("--iterations", type=int, default=iterations, help=f"for variances (default: {iterations})")
-    command.add_argument("--radius", type=_positive, metavar="R", help="merge radius of variance maps (default: a share of the scene's diagonal)")
-    command.add_argument("--radius-share", type=_positive, default=0.005, metavar="SHARE", help="(default: 0.005)")
+    command.add_argument(
+        "--iterations", type=int, default=iterations, help=f"for variances (default: {iterations})"
+    )
+    command.add_argument(
+        "--radius",
+        type=_positive,
+        metavar="R",
+        help="merge radius of variance maps (default: a share of the scene's diagonal)",
+    )
+    command.add_argument(
+        "--radius-share", type=_positive, default=0.005, metavar="SHARE", help="(default: 0.005)"
+    )
 
 
 def _sweeps(command: argparse.ArgumentParser, seconds: float) -> None:
     """Which parameters are swept, and how carefully."""
     names = [sweep.name for sweep in SWEEPS]
-    command.add_argument("--sweeps", nargs="*", choices=names, default=names, metavar="NAME", help=f"(default: {' '.join(names)})")
-    command.add_argument("--size", type=int, default=64, metavar="PIXELS", help="edge of the film (default: 64)")
-    command.add_argument("--point-time", type=_positive, default=seconds, metavar="SECONDS",
-                         help=f"rendering seconds of each point (default: {seconds})")
-    command.add_argument("--room-reference-time", type=_positive, default=10, metavar="SECONDS",
-                         help="rendering seconds of each of the two references of the scene swept (default: 10)")
+    command.add_argument(
+        "--sweeps",
+        nargs="*",
+        choices=names,
+        default=names,
+        metavar="NAME",
+        help=f"(default: {' '.join(names)})",
+    )
+    command.add_argument(
+        "--size", type=int, default=64, metavar="PIXELS", help="edge of the film (default: 64)"
+    )
+    command.add_argument(
+        "--point-time",
+        type=_positive,
+        default=seconds,
+        metavar="SECONDS",
+        help=f"rendering seconds of each point (default: {seconds})",
+    )
+    command.add_argument(
+        "--room-reference-time",
+        type=_positive,
+        default=10,
+        metavar="SECONDS",
+        help="rendering seconds of each of the two references of the scene swept (default: 10)",
+    )
 
 
-def _views(command: argparse.ArgumentParser, counts: tuple[int, ...], seconds: float, seeds: int, scale: float) -> None:
+def _views(
+    command: argparse.ArgumentParser,
+    counts: tuple[int, ...],
+    seconds: float,
+    seeds: int,
+    scale: float,
+) -> None:
     """Which numbers of views of which scenes are compared, and how carefully."""
-    command.add_argument("--view-scenes", nargs="*", type=_file, default=view_counts.SCENES, metavar="FILE.xml",
-                         help="scenes with several views (default: the bundled ones whose views overlap)")
-    command.add_argument("--view-counts", nargs="+", type=int, default=list(counts), metavar="N",
-                         help=f"how many of their views (default: {' '.join(map(str, counts))})")
-    command.add_argument("--view-weights", nargs="+", default=["mis"], metavar="WEIGHTS", help="weights of volpath_multiview (default: mis)")
-    command.add_argument("--view-time", type=_positive, default=seconds, metavar="SECONDS",
-                         help=f"rendering seconds of each for every view, for 16 at least (default: {seconds})")
-    command.add_argument("--view-seeds", type=int, default=seeds, metavar="N", help=f"renders of each, at least two (default: {seeds})")
-    command.add_argument("--view-scale", type=_positive, default=scale, metavar="SCALE", help=f"film size, scene's own = 1 (default: {scale:g})")
+    command.add_argument(
+        "--view-scenes",
+        nargs="*",
+        type=_file,
+        default=view_counts.SCENES,
+        metavar="FILE.xml",
+        help="scenes with several views (default: the bundled ones whose views overlap)",
+    )
+    command.add_argument(
+        "--view-counts",
+        nargs="+",
+        type=int,
+        default=list(counts),
+        metavar="N",
+        help=f"how many of their views (default: {' '.join(map(str, counts))})",
+    )
+    command.add_argument(
+        "--view-weights",
+        nargs="+",
+        default=["mis"],
+        metavar="WEIGHTS",
+        help="weights of volpath_multiview (default: mis)",
+    )
+    command.add_argument(
+        "--view-time",
+        type=_positive,
+        default=seconds,
+        metavar="SECONDS",
+        help=f"rendering seconds of each for every view, for 16 at least (default: {seconds})",
+    )
+    command.add_argument(
+        "--view-seeds",
+        type=int,
+        default=seeds,
+        metavar="N",
+        help=f"renders of each, at least two (default: {seeds})",
+    )
+    command.add_argument(
+        "--view-scale",
+        type=_positive,
+        default=scale,
+        metavar="SCALE",
+        help=f"film size, scene's own = 1 (default: {scale:g})",
+    )
 
 
 def _resampling(command: argparse.ArgumentParser, seconds: float) -> None:
     """Which parameters of resampled connections are swept, and how carefully."""
     names = [sweep.name for sweep in resampling.SWEEPS]
-    command.add_argument("--parameters", nargs="*", choices=names, default=names, metavar="NAME", help=f"of resampling (default: {' '.join(names)})")
-    command.add_argument("--draw-time", type=_positive, default=seconds, metavar="SECONDS",
-                         help=f"rendering seconds of each setting and seed of resampling (default: {seconds:g})")
-    command.add_argument("--draw-seeds", type=int, default=2, metavar="N", help="renders of each (default: 2)")
-    command.add_argument("--resampling-scale", type=_positive, default=0.35, metavar="SCALE", help="film size, scene's own = 1 (default: 0.35)")
+    command.add_argument(
+        "--parameters",
+        nargs="*",
+        choices=names,
+        default=names,
+        metavar="NAME",
+        help=f"of resampling (default: {' '.join(names)})",
+    )
+    command.add_argument(
+        "--draw-time",
+        type=_positive,
+        default=seconds,
+        metavar="SECONDS",
+        help=f"rendering seconds of each setting and seed of resampling (default: {seconds:g})",
+    )
+    command.add_argument(
+        "--draw-seeds", type=int, default=2, metavar="N", help="renders of each (default: 2)"
+    )
+    command.add_argument(
+        "--resampling-scale",
+        type=_positive,
+        default=0.35,
+        metavar="SCALE",
+        help="film size, scene's own = 1 (default: 0.35)",
+    )
 
 
 def _renders(command: argparse.ArgumentParser, seconds: float | None) -> None:
     """What is rendered, and how long."""
     _chooses(command, COMPARED, "ratios are to path, or to the first where it is not among them")
-    command.add_argument("--time", type=_positive, default=seconds, metavar="SECONDS",
-                         help=f"rendering seconds of each (default: {seconds or 'as fits'})")
-    command.add_argument("--spp", type=int, metavar="N", help="samples per pixel of each, instead of equal time")
+    command.add_argument(
+        "--time",
+        type=_positive,
+        default=seconds,
+        metavar="SECONDS",
+        help=f"rendering seconds of each (default: {seconds or 'as fits'})",
+    )
+    command.add_argument(
+        "--spp", type=int, metavar="N", help="samples per pixel of each, instead of equal time"
+    )
 
 
 def _compares_with_references(command: argparse.ArgumentParser) -> None:
-    command.add_argument("--seeds", type=int, default=3, help="renders of each method (default: 3; page: 2)")
-    command.add_argument("--scale", type=_positive, default=1, help="film size, scene's own = 1 (default: 1)")
+    command.add_argument(
+        "--seeds", type=int, default=3, help="renders of each method (default: 3; page: 2)"
+    )
+    command.add_argument(
+        "--scale", type=_positive, default=1, help="film size, scene's own = 1 (default: 1)"
+    )
     references.add_options(command)
 
 

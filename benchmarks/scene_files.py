@@ -7,16 +7,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree
 
-import mitsuba as mi
-
 from mis_integrators.app import loading
+
+import mitsuba as mi
 
 BUNDLED = Path(__file__).resolve().parent.parent / "scenes"
 
 
 @dataclass
 class OpenScene:
-    """A loaded scene: its file, what its own integrator hands on to others, its sensor and film size."""
+    """A loaded scene: its file, what its own integrator hands on to others, its sensor and film
+    size."""
 
     path: Path | None
     """``None`` for a scene that no file holds."""
@@ -61,7 +62,9 @@ def open_scene(path: Path, size: tuple[int, int] | None = None) -> OpenScene:
         film = mi.traverse(loaded.scene.sensors()[0])
         film["film.size"] = mi.ScalarVector2u(*size)
         film.update()
-    inherited = {name: loaded.parameters[name] for name in loading.INHERITED if name in loaded.parameters}
+    inherited = {
+        name: loaded.parameters[name] for name in loading.INHERITED if name in loaded.parameters
+    }
     return OpenScene(path, loaded.scene, inherited)
 
 

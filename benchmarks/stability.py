@@ -1,16 +1,17 @@
-"""Sweeps in which methods fail: error against one parameter of a small scene or of the methods, where each breaks, which to choose."""
+"""Sweeps in which methods fail: error against one parameter of a small scene or of the methods,
+where each breaks, which to choose."""
 
 from __future__ import annotations
 
 import argparse
-from typing import Sequence
+from collections.abc import Sequence
 
-import mitsuba as mi
-
-from methods import Method, SessionMaker, parse_method
-from mis_integrators.app import loading
 from mis_integrators.analysis.metrics import References
 from mis_integrators.analysis.stability import Point, breaks, choose, judge
+from mis_integrators.app import loading
+
+import mitsuba as mi
+from methods import Method, SessionMaker, parse_method
 from references import colours, find_references
 from reports import Row, console, save, show, tell
 from scene_files import OpenScene
@@ -52,8 +53,9 @@ def sweep_all(options: argparse.Namespace) -> list[tuple[Sweep, Points]]:
 
 
 def measure_sweep(sweep: Sweep, methods: Sequence[Method], options: argparse.Namespace) -> Points:
-    """Errors of all methods that the sweep concerns, `point_time` seconds of rendering each after a first iteration that is free (pilots,
-    recording: this is about what a method can do, not about how soon it starts)."""
+    """Errors of all methods that the sweep concerns, `point_time` seconds of rendering each after a
+    first iteration that is free (pilots, recording: this is about what a method can do, not about
+    how soon it starts)."""
     seconds = options.point_time
     values = sweep.scenes(options.coarse)
     points: Points = {}
@@ -69,21 +71,28 @@ def measure_sweep(sweep: Sweep, methods: Sequence[Method], options: argparse.Nam
                 continue
             tell(f"{sweep.name} = {value:g}: compiling {method.label}")
             try:
-                contender = Contender.begin(method.label, SessionMaker(tried, opened, seconds, warm_up=False).make, seed=7)
+                contender = Contender.begin(
+                    method.label, SessionMaker(tried, opened, seconds, warm_up=False).make, seed=7
+                )
                 contender.session.iterate()
             except loading.SCENE_ERRORS as error:
-                console.print(f"{sweep.name} = {value:g}: {method.label} left out: {loading.one_line(error)}")
+                console.print(
+                    f"{sweep.name} = {value:g}: {method.label} left out: {loading.one_line(error)}"
+                )
                 continue
             contender.setting_up = 0.0
             contenders.append(contender)
         take_turns(contenders, seconds, lambda text: tell(f"{sweep.name} = {value:g}: {text}"))
         for contender in contenders:
-            points.setdefault(contender.label, []).append(judge(value, colours(contender.session), references))
+            points.setdefault(contender.label, []).append(
+                judge(value, colours(contender.session), references)
+            )
     return {label: found for label, found in points.items() if len(found) == len(values)}
 
 
 def _with_value(method: Method, sweep: Sweep, value: float) -> Method | None:
-    """The method at a value of the sweep; ``None`` if the sweep is about a parameter that its plugin does not know."""
+    """The method at a value of the sweep; ``None`` if the sweep is about a parameter that its
+    plugin does not know."""
     if not sweep.of_method:
         return method
     changed = Method(method.label, method.plugin, {**method.parameters, sweep.parameter: value})
@@ -101,8 +110,11 @@ def knows(plugin: str, parameter: str, value: float) -> bool:
 
 def sweep_references(sweep: Sweep, opened: OpenScene, options: argparse.Namespace) -> References:
     """Two halves by the sweep's reference method, kept like those of scenes."""
-    how = argparse.Namespace(references=options.references, reference_time=options.room_reference_time,
-                             reference_method=parse_method(sweep.reference))
+    how = argparse.Namespace(
+        references=options.references,
+        reference_time=options.room_reference_time,
+        reference_method=parse_method(sweep.reference),
+    )
     return find_references(opened, how, tell)
 
 
@@ -117,19 +129,38 @@ def prepare(options: argparse.Namespace) -> None:
 def point_rows(sweep: Sweep, points: Points) -> list[Row]:
     """One row a method and value."""
     return [
-        {"sweep": sweep.name, "value": point.value, "method": label, "relMSE trimmed": point.error, "mean deviation": point.deviation,
-         "deviation error": point.deviation_error, "mean is off": point.mean_is_off, "breaks": broken}
-        for label, mine in points.items() for point, broken in zip(mine, breaks(mine))
+        {
+            "sweep": sweep.name,
+            "value": point.value,
+            "method": label,
+            "relMSE trimmed": point.error,
+            "mean deviation": point.deviation,
+            "deviation error": point.deviation_error,
+            "mean is off": point.mean_is_off,
+            "breaks": broken,
+        }
+        for label, mine in points.items()
+        for point, broken in zip(mine, breaks(mine))
     ]
 
 
 def choice_rows(sweep: Sweep, points: Points) -> list[Row]:
     """One row a range of values with the same best method."""
-    return [
-        {"parameter": sweep.what, "from": choice.low, "to": choice.high, "best": choice.best, "about as good": ", ".join(choice.close) or "-",
-         "breaks": ", ".join(choice.broken) or "-"}
-        for choice in choose(points)
-    ] if points else []
+    return (
+        [
+            {
+                "parameter": sweep.what,
+                "from": choice.low,
+                "to": choice.high,
+                "best": choice.best,
+                "about as good": ", ".join(choice.close) or "-",
+                "breaks": ", ".join(choice.broken) or "-",
+            }
+            for choice in choose(points)
+        ]
+        if points
+        else []
+    )
 
 
 def as_markdown(rows: list[Row]) -> str:
@@ -137,5 +168,13 @@ def as_markdown(rows: list[Row]) -> str:
     if not rows:
         return ""
     names = list(rows[0])
-    body = ["| " + " | ".join(f"{row[name]:.3g}" if isinstance(row[name], (int, float)) else f"{row[name]}" for name in names) + " |" for row in rows]
+    body = [
+        "| "
+        + " | ".join(
+            f"{row[name]:.3g}" if isinstance(row[name], (int, float)) else f"{row[name]}"
+            for name in names
+        )
+        + " |"
+        for row in rows
+    ]
     return "\n".join(["| " + " | ".join(names) + " |", "|" + "---|" * len(names), *body]) + "\n"

@@ -7,12 +7,12 @@ import time
 from pathlib import Path
 from statistics import median
 
+from mis_integrators.photons.gather import mean_photon_count
+
 import drjit as dr
 import mitsuba as mi
-
 from memory import PeakMemory
 from methods import Method, SessionMaker
-from mis_integrators.photons.gather import mean_photon_count
 from reports import Row, save, show, tell
 from scene_files import OpenScene, open_scene
 from turns import Contender, take_turns
@@ -21,11 +21,35 @@ WARM_UP = 3
 SIZE_OF_SWEEP = 256
 """Edge of the square film at which the number of light paths is varied."""
 COLUMNS = {
-    "cost": ("size", "light paths", "radius", "photons a gather", "iteration ms", "light ms", "grid ms",
-             "camera ms", "gather ms", "probes ms", "no kernel share", "path ms", "ratio",
-             "ratio with probes"),
-    "rates": ("size", "light paths", "light paths/s", "photons", "photons inserted/s", "gathers", "gathers/s",
-              "photons gathered/s", "path samples/s", "peak MiB", "arrays MiB"),
+    "cost": (
+        "size",
+        "light paths",
+        "radius",
+        "photons a gather",
+        "iteration ms",
+        "light ms",
+        "grid ms",
+        "camera ms",
+        "gather ms",
+        "probes ms",
+        "no kernel share",
+        "path ms",
+        "ratio",
+        "ratio with probes",
+    ),
+    "rates": (
+        "size",
+        "light paths",
+        "light paths/s",
+        "photons",
+        "photons inserted/s",
+        "gathers",
+        "gathers/s",
+        "photons gathered/s",
+        "path samples/s",
+        "peak MiB",
+        "arrays MiB",
+    ),
 }
 
 
@@ -47,8 +71,8 @@ def run(options: argparse.Namespace) -> None:
 
 
 def configurations(sizes: list[int], light_paths: list[int], full: bool) -> list[tuple[int, int]]:
-    """Pairs of film edge and light paths: as many light paths as pixels for each size, and each number of
-    light paths at one size; with ``full`` at every size."""
+    """Pairs of film edge and light paths: as many light paths as pixels for each size, and each
+    number of light paths at one size; with ``full`` at every size."""
     swept = sizes if full else [SIZE_OF_SWEEP]
     square = [(size, size * size) for size in sizes]
     return square + [(size, count) for size in swept for count in light_paths]
@@ -65,23 +89,27 @@ class Parts:
         self.rows: list[dict[str, float]] = []
 
     def __getitem__(self, part: str) -> float:
-        """The median over the iterations: of ``light``, ``grid``, ``camera``, ``gather`` (with the probes, if
-        any), or of ``idle``, the share of an iteration in which no kernel runs (Python, launches)."""
+        """The median over the iterations: of ``light``, ``grid``, ``camera``, ``gather`` (with the
+        probes, if any), or of ``idle``, the share of an iteration in which no kernel runs (Python,
+        launches)."""
         return median(row[part] for row in self.rows)
 
     def observe(self, kernels: list[dict], seconds: float) -> None:
-        """Sort one iteration's kernels: those of the light pass and of the maps are set aside when these are done; of the rest, those up to the
-        first one as wide as the film are the camera pass, the others gather."""
+        """Sort one iteration's kernels: those of the light pass and of the maps are set aside when
+        these are done; of the rest, those up to the first one as wide as the film are the camera
+        pass, the others gather."""
         compiled = [i for i, kernel in enumerate(kernels) if kernel["type"] == dr.KernelType.JIT]
         camera = next(i for i in compiled if kernels[i]["size"] == self._session.chunk) + 1
         parts = {**self._kernels, "camera": kernels[:camera], "gather": kernels[camera:]}
-        row = {part: sum(kernel["execution_time"] for kernel in mine) for part, mine in parts.items()}
+        row = {
+            part: sum(kernel["execution_time"] for kernel in mine) for part, mine in parts.items()
+        }
         self.rows.append({**row, "idle": 1 - sum(row.values()) / 1000 / seconds})
 
     def _photons(self, *args):
         photons = self._light_pass(*args)
         self._kernels["light"] = dr.kernel_history()
-        if self._session._map_pass != self._maps:              # recorded anew, with more room
+        if self._session._map_pass != self._maps:  # recorded anew, with more room
             self._map_pass, self._session._map_pass = self._session._map_pass, self._maps
         return photons
 
@@ -91,8 +119,11 @@ class Parts:
         return maps
 
 
-def measure(path: Path, size: int, light_paths: int, photons_a_gather: float, seconds: float) -> Row:
-    """One row: bdpm without and with coverage probes, and path, taking turns for ``seconds`` each."""
+def measure(
+    path: Path, size: int, light_paths: int, photons_a_gather: float, seconds: float
+) -> Row:
+    """One row: bdpm without and with coverage probes, and path, taking turns for ``seconds``
+    each."""
     tell(f"{path.stem} {size}x{size}, {light_paths} light paths: compiling")
     opened = open_scene(path, (size, size))
     start = time.perf_counter()
@@ -100,7 +131,7 @@ def measure(path: Path, size: int, light_paths: int, photons_a_gather: float, se
     plain = new_session(opened, light_paths, first_guess(opened))
     radius, photons, gathers, gathered = radius_for(plain, photons_a_gather)
     plain, probing = (new_session(opened, light_paths, radius) for _ in range(2))
-    probing.corrected = {kind: True for kind in probing.corrected}
+    probing.corrected = dict.fromkeys(probing.corrected, True)
     for session in (plain, probing):
         for _ in range(WARM_UP):
             session.iterate()
@@ -163,13 +194,22 @@ def first_guess(opened: OpenScene) -> float:
 def radius_for(session, photons_a_gather: float) -> tuple[float, int, int, float]:
     """The radius at which a gather finds so many photons, all photon maps together.
 
-    Returns it with an iteration's photons, the camera vertices that gather, and how many photons each finds.
+    Returns it with an iteration's photons, the camera vertices that gather, and how many photons
+    each finds.
     """
     spectral = session._spectral(0)
     photons = session._photons(0, spectral)
     seed, first, stride = session._seed(0, 1), mi.UInt32(0), 1
     *_, vertices, _ = session._trace_camera(
-        session.scene, session.sensor, seed, first, stride, session.chunk, session.samples_per_iteration, session.vertex_capacity, spectral
+        session.scene,
+        session.sensor,
+        seed,
+        first,
+        stride,
+        session.chunk,
+        session.samples_per_iteration,
+        session.vertex_capacity,
+        spectral,
     )
     radius = session.integrator.initial_radius
     for _ in range(3):

@@ -1,4 +1,5 @@
-"""Variance of one iteration at equal radius: numbers against the best single strategy, and maps side by side."""
+"""Variance of one iteration at equal radius: numbers against the best single strategy, and maps
+side by side."""
 
 from __future__ import annotations
 
@@ -6,18 +7,28 @@ import argparse
 import time
 from pathlib import Path
 
-import numpy as np
-
-from methods import Method
-from mis_integrators.app import loading
 from mis_integrators.analysis.metrics import trimmed_mean
 from mis_integrators.analysis.variance_maps import best_single, relative_variance, share_worse
+from mis_integrators.app import loading
 from mis_integrators.core.traits import scene_bounds
+
+import numpy as np
+from methods import Method
 from reports import Row, console, save, show, tell
 from scene_files import OpenScene, open_scene, scaled_size
 
-COLUMNS = ("scene", "N_B", "radius", "method", "relative variance", "ratio to best single", "untrimmed ratio",
-           "time ratio", "equal-time ratio", "blocks worse")
+COLUMNS = (
+    "scene",
+    "N_B",
+    "radius",
+    "method",
+    "relative variance",
+    "ratio to best single",
+    "untrimmed ratio",
+    "time ratio",
+    "equal-time ratio",
+    "blocks worse",
+)
 
 
 def run(options: argparse.Namespace) -> None:
@@ -46,9 +57,11 @@ def picture_of(opened: OpenScene, camera_paths: int, options: argparse.Namespace
 
 
 def compare(opened: OpenScene, camera_paths: int, options: argparse.Namespace) -> list[Row]:
-    """A row a method; pictures and maps go to a PNG. Ratios are to the best of the pure strategies (`bdpm`), or of all if there is none.
+    """A row a method; pictures and maps go to a PNG. Ratios are to the best of the pure strategies
+    (`bdpm`), or of all if there is none.
 
-    Methods whose plugin has no merge radius or no channel of variances, and those that cannot render the scene, are left out.
+    Methods whose plugin has no merge radius or no channel of variances, and those that cannot
+    render the scene, are left out.
     """
     diagonal = float(np.linalg.norm(np.array(scene_bounds(opened.scene).extents())))
     radius = options.radius or options.radius_share * diagonal
@@ -56,7 +69,9 @@ def compare(opened: OpenScene, camera_paths: int, options: argparse.Namespace) -
     methods, images, variances, seconds = [], [], [], []
     for method in options.integrators:
         try:
-            integrator = Method(method.label, method.plugin, {**common, **method.parameters}).integrator(opened)
+            integrator = Method(
+                method.label, method.plugin, {**common, **method.parameters}
+            ).integrator(opened)
             session = integrator.session(opened.scene, opened.sensor, seed=1)
             session.iterate()
         except loading.SCENE_ERRORS as error:
@@ -76,28 +91,35 @@ def compare(opened: OpenScene, camera_paths: int, options: argparse.Namespace) -
         raise SystemExit(f"{opened.name}: no method's variance can be measured")
     mean = np.mean(images, axis=0)
     maps = [relative_variance(variance, mean) for variance in variances]
-    singles = [number for number, method in enumerate(methods) if method.plugin == "bdpm"] or list(range(len(methods)))
+    singles = [number for number, method in enumerate(methods) if method.plugin == "bdpm"] or list(
+        range(len(methods))
+    )
     best = best_single([maps[number] for number in singles])
     number_of_best = next(number for number in singles if maps[number] is best)
     rows: list[Row] = []
     for method, mine, spent in zip(methods, maps, seconds):
         ratio = trimmed_mean(mine) / trimmed_mean(best)
-        rows.append({
-            "scene": opened.name,
-            "N_B": camera_paths,
-            "radius": radius,
-            "method": method.label,
-            "relative variance": trimmed_mean(mine),
-            "ratio to best single": ratio,
-            "untrimmed ratio": float(mine.mean() / best.mean()),
-            "time ratio": spent / seconds[number_of_best],
-            "equal-time ratio": ratio * spent / seconds[number_of_best],
-            "blocks worse": share_worse(mine, best),
-        })
+        rows.append(
+            {
+                "scene": opened.name,
+                "N_B": camera_paths,
+                "radius": radius,
+                "method": method.label,
+                "relative variance": trimmed_mean(mine),
+                "ratio to best single": ratio,
+                "untrimmed ratio": float(mine.mean() / best.mean()),
+                "time ratio": spent / seconds[number_of_best],
+                "equal-time ratio": ratio * spent / seconds[number_of_best],
+                "blocks worse": share_worse(mine, best),
+            }
+        )
     from mis_integrators.analysis import charts
 
     notes = [f"{row['ratio to best single']:.2f} x best single" for row in rows]
-    charts.save(charts.variance_maps([method.label for method in methods], images, maps, notes), picture_of(opened, camera_paths, options))
+    charts.save(
+        charts.variance_maps([method.label for method in methods], images, maps, notes),
+        picture_of(opened, camera_paths, options),
+    )
     return rows
 
 
@@ -106,8 +128,14 @@ def summarise(rows: list[Row], camera_paths: int) -> None:
     table = []
     for method in dict.fromkeys(row["method"] for row in rows):
         mine = [row for row in rows if row["method"] == method]
-        table.append({"method": method, **{
-            name: float(np.exp(np.mean([np.log(row[name]) for row in mine])))
-            for name in ("ratio to best single", "equal-time ratio")},
-            "worst scene": max(row["ratio to best single"] for row in mine)})
+        table.append(
+            {
+                "method": method,
+                **{
+                    name: float(np.exp(np.mean([np.log(row[name]) for row in mine])))
+                    for name in ("ratio to best single", "equal-time ratio")
+                },
+                "worst scene": max(row["ratio to best single"] for row in mine),
+            }
+        )
     show(f"Geometric means over the scenes, N_B = {camera_paths}", table)

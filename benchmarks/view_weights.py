@@ -1,19 +1,20 @@
-"""MIS and MWIS of ``volpath_multiview`` pixel by pixel: relative variance and bias against the share of the weights that other views bring."""
+"""MIS and MWIS of ``volpath_multiview`` pixel by pixel: relative variance and bias against the
+share of the weights that other views bring."""
 
 from __future__ import annotations
 
 import argparse
 
-import numpy as np
-
 from mis_integrators.analysis import charts
 from mis_integrators.analysis.metrics import RELATIVE_OFFSET
+
+import numpy as np
 from multiview import Together, load
 from reports import Row, console, save, show, tell
 
 ESTIMATORS = ("weighted sum", "mis", "mwis")
-"""The sum of weighted samples over their expected number; that with the fluctuation of the weights taken away (what `weights=mis` gives); the
-ratio of the sums."""
+"""The sum of weighted samples over their expected number; that with the fluctuation of the weights
+taken away (what `weights=mis` gives); the ratio of the sums."""
 
 
 def run(options: argparse.Namespace) -> None:
@@ -25,13 +26,20 @@ def run(options: argparse.Namespace) -> None:
     show("Relative variance by the share of other views", rows)
     for path in options.scenes:
         mine = [row for row in rows if row["scene"] == path.stem]
-        curves = {name: [(row["share of others"], row[f"{name} variance"] / row["weighted sum variance"]) for row in mine] for name in ESTIMATORS}
+        curves = {
+            name: [
+                (row["share of others"], row[f"{name} variance"] / row["weighted sum variance"])
+                for row in mine
+            ]
+            for name in ESTIMATORS
+        }
         charts.save(charts.by_share(curves), options.out / f"view_weights_{path.stem}.png")
         console.print(f"chart: {options.out / f'view_weights_{path.stem}.png'}")
 
 
 def measure(path, options: argparse.Namespace) -> list[Row]:
-    """A row for each group of pixels of like share: all three estimators made of the same samples."""
+    """A row for each group of pixels of like share: all three estimators made of the same
+    samples."""
     scene, parameters = load(path, options.scale)
     session = Together(scene, {**parameters, "camera_paths": 1}).session
     images: dict[str, list[np.ndarray]] = {name: [] for name in ESTIMATORS}
@@ -44,13 +52,17 @@ def measure(path, options: argparse.Namespace) -> list[Row]:
         tell(f"{path.stem}: {seed + 1} of {options.seeds} seeds")
     others = 1 - own_share(session, options.iterations * options.seeds)
     mean = np.mean(images["mis"], axis=0)
-    divisor = mean ** 2 + RELATIVE_OFFSET
+    divisor = mean**2 + RELATIVE_OFFSET
     found = {name: np.stack(stack) for name, stack in images.items()}
     edges = np.quantile(others, np.linspace(0, 1, options.groups + 1))
     rows = []
     for low, high in zip(edges, edges[1:]):
         group = (others >= low) & ((others < high) | (high == edges[-1]))
-        row: Row = {"scene": path.stem, "share of others": float(others[group].mean()), "pixels": int(group.sum())}
+        row: Row = {
+            "scene": path.stem,
+            "share of others": float(others[group].mean()),
+            "pixels": int(group.sum()),
+        }
         for name, stack in found.items():
             row[f"{name} variance"] = float((stack.var(axis=0, ddof=1) / divisor)[group].mean())
         bias = (found["mwis"].mean(axis=0) - mean) / np.sqrt(divisor)
@@ -60,7 +72,8 @@ def measure(path, options: argparse.Namespace) -> list[Row]:
 
 
 def estimates(session) -> dict[str, np.ndarray]:
-    """The parts of the pictures that all views share, by each estimator: (pixels of all views, 3)."""
+    """The parts of the pictures that all views share, by each estimator: (pixels of all views,
+    3)."""
     sums = session.accumulator
     total = (sums.shared[0] + sums.shared[1])[:, :, :3] / (sums.expected * sums.iterations)
     sums.ratio = False
@@ -72,11 +85,19 @@ def estimates(session) -> dict[str, np.ndarray]:
 
 
 def own_share(session, iterations: int) -> np.ndarray:
-    """The weight that each view's own paths bring to its pixels (pixels of all views,), smoothed over 5 x 5 pixels."""
+    """The weight that each view's own paths bring to its pixels (pixels of all views,), smoothed
+    over 5 x 5 pixels."""
     splat = session._splat
 
     def own_only(scene, tables, pivots, radiance, connections, *more):
-        return splat(scene, tables, pivots, radiance, {**connections, "ratio": 0 * connections["ratio"]}, *more)
+        return splat(
+            scene,
+            tables,
+            pivots,
+            radiance,
+            {**connections, "ratio": 0 * connections["ratio"]},
+            *more,
+        )
 
     session._splat = own_only
     session._freeze()
@@ -84,14 +105,27 @@ def own_share(session, iterations: int) -> np.ndarray:
     for _ in range(iterations):
         session.iterate()
     sums = session.accumulator
-    return np.clip(pixels(session, (sums.shared[0] + sums.shared[1])[:, :, 3:] / (sums.expected * sums.iterations), 5)[:, 0], 0, 1)
+    return np.clip(
+        pixels(
+            session,
+            (sums.shared[0] + sums.shared[1])[:, :, 3:] / (sums.expected * sums.iterations),
+            5,
+        )[:, 0],
+        0,
+        1,
+    )
 
 
 def pixels(session, image, smooth: int = 1) -> np.ndarray:
     """All views' pixels of the common image, each averaged with its neighbours of its own view."""
     image, views, found = np.array(image, dtype=np.float64), session.views, []
     for (width, height), top in zip(views.sizes, views.tops):
-        one = image[top:top + height, views.margin:views.margin + width]
+        one = image[top : top + height, views.margin : views.margin + width]
         wide = np.pad(one, ((smooth // 2,) * 2, (smooth // 2,) * 2, (0, 0)), mode="edge")
-        found.append(np.mean([wide[y:y + height, x:x + width] for y in range(smooth) for x in range(smooth)], axis=0).reshape(-1, image.shape[2]))
+        found.append(
+            np.mean(
+                [wide[y : y + height, x : x + width] for y in range(smooth) for x in range(smooth)],
+                axis=0,
+            ).reshape(-1, image.shape[2])
+        )
     return np.concatenate(found)

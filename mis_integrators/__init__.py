@@ -1,7 +1,8 @@
 """Integrators for Mitsuba 3 built on multiple importance sampling.
 
-Importing this package makes a usable LLVM known to Dr.Jit and registers every plugin for the active Mitsuba
-variant and for each variant set later; it warns if Mitsuba or Dr.Jit is newer than those tested, and does nothing else. `render_views` renders several views of a scene together.
+Importing this package makes a usable LLVM known to Dr.Jit and registers every plugin for the active
+Mitsuba variant and for each variant set later; it warns if Mitsuba or Dr.Jit is newer than those
+tested, and does nothing else. `render_views` renders several views of a scene together.
 """
 
 from typing import Any
@@ -22,7 +23,8 @@ _plugins.follow_variants()
 
 
 def render_views(scene: Any, integrator: Any = None, spp: int = 0, seed: int = 0) -> list[Any]:
-    """Renders all views of a scene together; see `mis_integrators.integrators.volpath_multiview.render_views`."""
+    """Renders all views of a scene together; see
+    `mis_integrators.integrators.volpath_multiview.render_views`."""
     from .integrators import volpath_multiview
 
     return volpath_multiview.render_views(scene, integrator, spp, seed)

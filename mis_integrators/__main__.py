@@ -1,4 +1,5 @@
-"""``python -m mis_integrators doctor`` says what is wrong with an installation; ``python -m mis_integrators render`` is ``mis-render``."""
+"""``python -m mis_integrators doctor`` says what is wrong with an installation; ``python -m
+mis_integrators render`` is ``mis-render``."""
 
 import sys
 

@@ -1,13 +1,14 @@
 """Which plugins there are, and their registration for a variant.
 
-A plugin class belongs to the variant in which it was defined, so the modules that define plugin classes are
-loaded anew each time a variant is set.
+A plugin class belongs to the variant in which it was defined, so the modules that define plugin
+classes are loaded anew each time a variant is set.
 """
 
 import importlib
 import sys
+from collections.abc import Callable
 from types import ModuleType
-from typing import Callable, NoReturn
+from typing import NoReturn
 
 import mitsuba as mi
 
@@ -16,8 +17,21 @@ from . import llvm
 _PACKAGE = "mis_integrators.integrators"
 
 # Modules to load anew for a variant, those that others import first.
-MODULES: tuple[str, ...] = ("common", "bdpm", "weighted", "bdpm_balance", "bdpm_opt", "bdpt", "vcm", "resampled", "bdpt_ris",
-                            "volpath_multiview", "unidirectional", "choice", "bdpm_auto")
+MODULES: tuple[str, ...] = (
+    "common",
+    "bdpm",
+    "weighted",
+    "bdpm_balance",
+    "bdpm_opt",
+    "bdpt",
+    "vcm",
+    "resampled",
+    "bdpt_ris",
+    "volpath_multiview",
+    "unidirectional",
+    "choice",
+    "bdpm_auto",
+)
 
 # Plugin name -> (module, class)
 PLUGINS: dict[str, tuple[str, str]] = {
@@ -36,7 +50,8 @@ PLUGINS: dict[str, tuple[str, str]] = {
 
 
 def follow_variants() -> None:
-    """Register the plugins for the active variant, if there is one, and for each variant set from now on."""
+    """Register the plugins for the active variant, if there is one, and for each variant set from
+    now on."""
     mi.detail.remove_variant_callback(_variant_changed)  # no second one if the package is reloaded
     mi.detail.add_variant_callback(_variant_changed)
     if mi.variant():
@@ -46,8 +61,8 @@ def follow_variants() -> None:
 def register() -> None:
     """Register every plugin for the active variant.
 
-    In a variant without Dr.Jit (``scalar_*``) a plugin of that name only says that it needs another variant.
-    Raises ``llvm.LLVMError`` if the active variant needs LLVM and there is no working one.
+    In a variant without Dr.Jit (``scalar_*``) a plugin of that name only says that it needs another
+    variant. Raises ``llvm.LLVMError`` if the active variant needs LLVM and there is no working one.
     """
     variant = mi.variant()
     if variant.startswith("scalar_"):

@@ -1,12 +1,12 @@
 """Find a libLLVM that works with Dr.Jit.
 
-LLVM 14, 15 and 16 abort the process while they generate code for Dr.Jit ("Cannot select: fminimum"), which no
-program can catch, so such a version is refused before it is used. A version newer than those that were tested is used
-where there is no other.
+LLVM 14, 15 and 16 abort the process while they generate code for Dr.Jit ("Cannot select:
+fminimum"), which no program can catch, so such a version is refused before it is used. A version
+newer than those that were tested is used where there is no other.
 
-This file uses the standard library alone and runs by itself: ``python llvm.py`` prints the library it would
-choose, or says on standard error what to install and exits with status 1. ``python llvm.py versions`` prints the oldest
-and the newest version that are tested.
+This file uses the standard library alone and runs by itself: ``python llvm.py`` prints the library
+it would choose, or says on standard error what to install and exits with status 1. ``python llvm.py
+versions`` prints the oldest and the newest version that are tested.
 """
 
 import os
@@ -14,20 +14,21 @@ import re
 import subprocess
 import sys
 import sysconfig
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Iterable, Mapping
 
 OLDEST_WORKING, NEWEST_TESTED = 17, 22
 VARIABLE = "DRJIT_LIBLLVM_PATH"
 
-# Versions are read from file names only. Loading a library to call LLVMGetVersion would leave it in the
-# process, and two libLLVM in one process clash (shared command line options). Once Dr.Jit has loaded its own,
-# Dr.Jit is asked.
+# Versions are read from file names only. Loading a library to call LLVMGetVersion would leave it in
+# the process, and two libLLVM in one process clash (shared command line options). Once Dr.Jit has
+# loaded its own, Dr.Jit is asked.
 _IN_NAME = re.compile(r"libLLVM(?:-|\.so\.|\.)(\d+(?:\.\d+)*)")
 _IN_PATH = re.compile(r"llvm(?:@|-|/)(\d+(?:\.\d+)*)/")
 
 chosen: Path | None = None
-"""The library that ``make_known`` has chosen in this process; ``None`` if it was not asked to, or found none."""
+"""The library that ``make_known`` has chosen in this process; ``None`` if it was not asked to, or
+found none."""
 
 _INSTALL = (
     f"install LLVM {OLDEST_WORKING} to {NEWEST_TESTED}: `apt-get install libllvm19` (Debian, Ubuntu), `dnf install llvm-libs` (Fedora), "
@@ -53,11 +54,16 @@ def is_tested(library: Path) -> bool:
 
 
 def best_working(libraries: Iterable[Path]) -> Path | None:
-    """The library of the highest version that is tested; where there is none, of the lowest that is newer. The first one among equals."""
+    """The library of the highest version that is tested; where there is none, of the lowest that is
+    newer. The first one among equals."""
     versions = {library: version_of(library) or (0,) for library in libraries}
     if tested := [library for library in versions if is_tested(library)]:
         return max(tested, key=versions.__getitem__)
-    return min((library for library in versions if versions[library][0] > NEWEST_TESTED), key=versions.__getitem__, default=None)
+    return min(
+        (library for library in versions if versions[library][0] > NEWEST_TESTED),
+        key=versions.__getitem__,
+        default=None,
+    )
 
 
 def library_directories(environment: Mapping[str, str], root: Path = Path("/")) -> list[Path]:
@@ -67,7 +73,13 @@ def library_directories(environment: Mapping[str, str], root: Path = Path("/")) 
     directories = [Path(p) for p in environment.get("LD_LIBRARY_PATH", "").split(":") if p]
     if environment.get("CONDA_PREFIX"):
         directories.append(Path(environment["CONDA_PREFIX"], "lib"))
-    directories += [usr / "lib" / multiarch, usr / "lib64", usr / "lib", local / "lib64", local / "lib"]
+    directories += [
+        usr / "lib" / multiarch,
+        usr / "lib64",
+        usr / "lib",
+        local / "lib64",
+        local / "lib",
+    ]
     for parent, pattern in (
         (usr / "lib", "llvm-*/lib"),
         (usr / "lib64", "llvm*/lib*"),
@@ -90,7 +102,8 @@ def libraries_in(directories: Iterable[Path]) -> list[Path]:
 
 
 def libraries_in_linker_cache(listing: str) -> list[Path]:
-    """The libLLVM of the listing that ``ldconfig -p`` prints, without those of a foreign word size."""
+    """The libLLVM of the listing that ``ldconfig -p`` prints, without those of a foreign word
+    size."""
     return [
         Path(line.split("=>")[1].strip())
         for line in listing.splitlines()
@@ -99,7 +112,8 @@ def libraries_in_linker_cache(listing: str) -> list[Path]:
 
 
 def choose(environment: Mapping[str, str], root: Path = Path("/")) -> Path | None:
-    """The best libLLVM of this system (see ``best_working``), or ``None``. ``DRJIT_LIBLLVM_PATH`` is not looked at."""
+    """The best libLLVM of this system (see ``best_working``), or ``None``. ``DRJIT_LIBLLVM_PATH``
+    is not looked at."""
     found = libraries_in(library_directories(environment, root))
     if root == Path("/"):
         found += libraries_in_linker_cache(_linker_cache())
@@ -121,10 +135,11 @@ def problem_with_variable(environment: Mapping[str, str]) -> str | None:
 
 
 def make_known() -> None:
-    """Set ``DRJIT_LIBLLVM_PATH`` to a library that works, unless it is set or Dr.Jit is already loaded.
+    """Set ``DRJIT_LIBLLVM_PATH`` to a library that works, unless it is set or Dr.Jit is already
+    loaded.
 
-    Dr.Jit looks for LLVM when it is imported, once. Nothing is raised here: a program that uses another
-    backend needs no LLVM (see ``require``).
+    Dr.Jit looks for LLVM when it is imported, once. Nothing is raised here: a program that uses
+    another backend needs no LLVM (see ``require``).
     """
     if os.environ.get(VARIABLE) or "drjit" in sys.modules:
         return
@@ -136,7 +151,8 @@ def make_known() -> None:
 
 
 def problem() -> str | None:
-    """Why the ``llvm_*`` variants cannot be used in this process, in one line, or ``None``. Loads Dr.Jit."""
+    """Why the ``llvm_*`` variants cannot be used in this process, in one line, or ``None``. Loads
+    Dr.Jit."""
     import drjit as dr
 
     version = dr.detail.llvm_version()  # (-1, -1, -1) if Dr.Jit loaded none
@@ -151,7 +167,9 @@ def problem() -> str | None:
     )
     usable = choose(os.environ)
     if usable and str(usable) != os.environ.get(VARIABLE):
-        return f"{loaded}; import mis_integrators before mitsuba and drjit, or set {VARIABLE}={usable}"
+        return (
+            f"{loaded}; import mis_integrators before mitsuba and drjit, or set {VARIABLE}={usable}"
+        )
     return f"{loaded}; {_INSTALL}"
 
 
@@ -164,7 +182,9 @@ def require() -> None:
 def _linker_cache() -> str:
     for program in ("ldconfig", "/sbin/ldconfig"):
         try:
-            return subprocess.run([program, "-p"], capture_output=True, text=True, timeout=10).stdout
+            return subprocess.run(
+                [program, "-p"], capture_output=True, text=True, timeout=10
+            ).stdout
         except (OSError, subprocess.SubprocessError):
             continue
     return ""

@@ -16,7 +16,8 @@ VARIANTS = ("llvm_ad_rgb", "llvm_ad_mono", "llvm_ad_spectral", "cuda_ad_rgb")
 
 @pytest.fixture(params=VARIANTS)
 def variant(request) -> str:
-    """Every variant in turn, active during the test; a variant that this machine cannot run is skipped."""
+    """Every variant in turn, active during the test; a variant that this machine cannot run is
+    skipped."""
     return _activate(request.param)
 
 
@@ -48,17 +49,38 @@ def _activate(variant: str) -> str:
 
 
 def pytest_addoption(parser):
-    parser.addoption("--vectors", metavar="DIR",
-                     help="folder with test vectors (optimal_weights.json, shifts.json, resampling.json), used instead of generated worlds")
-    parser.addoption("--maps", metavar="DIR", default="out/ci", help="where variance maps are left (default: out/ci)")
-    parser.addoption("--record-variances", action="store_true", help="take the variances found for those to be kept (variance_guard.json)")
+    parser.addoption(
+        "--vectors",
+        metavar="DIR",
+        help="folder with test vectors (optimal_weights.json, shifts.json, resampling.json), used instead of generated worlds",
+    )
+    parser.addoption(
+        "--maps",
+        metavar="DIR",
+        default="out/ci",
+        help="where variance maps are left (default: out/ci)",
+    )
+    parser.addoption(
+        "--record-variances",
+        action="store_true",
+        help="take the variances found for those to be kept (variance_guard.json)",
+    )
 
 
 def pytest_configure(config):
-    config.addinivalue_line("markers", "strategies(*K): the numbers of strategies of the discrete worlds that a test is for")
-    config.addinivalue_line("markers", "thinned(inner, n): of a product of parameters, the last of which has `inner` values, every n-th "
-                                       "case in diagonals; the rest is full")
-    config.addinivalue_line("markers", "full: the full product of cases, hours of it; left out unless asked for with -m full")
+    config.addinivalue_line(
+        "markers",
+        "strategies(*K): the numbers of strategies of the discrete worlds that a test is for",
+    )
+    config.addinivalue_line(
+        "markers",
+        "thinned(inner, n): of a product of parameters, the last of which has `inner` values, every n-th "
+        "case in diagonals; the rest is full",
+    )
+    config.addinivalue_line(
+        "markers",
+        "full: the full product of cases, hours of it; left out unless asked for with -m full",
+    )
 
 
 @pytest.hookimpl(tryfirst=True)

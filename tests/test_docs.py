@@ -1,5 +1,5 @@
-"""The documentation: its code runs, its commands are understood, its tables are those of the docstrings, and these say what plugins take; its links
-and pictures exist."""
+"""The documentation: its code runs, its commands are understood, its tables are those of the
+docstrings, and these say what plugins take; its links and pictures exist."""
 
 import json
 import os
@@ -8,15 +8,20 @@ import subprocess
 import sys
 from pathlib import Path
 
-import mitsuba as mi
-import pytest
-
 from mis_integrators import _plugins
 from mis_integrators.app import options
 
+import mitsuba as mi
+import pytest
+
 ROOT = Path(__file__).parent.parent
 PAGES = sorted((ROOT / "docs").glob("*.md"))
-OTHERS = [ROOT / "README.md", ROOT / "benchmarks" / "README.md", ROOT / "scenes" / "README.md", ROOT / "notebooks" / "tutorial.ipynb"]
+OTHERS = [
+    ROOT / "README.md",
+    ROOT / "benchmarks" / "README.md",
+    ROOT / "scenes" / "README.md",
+    ROOT / "notebooks" / "tutorial.ipynb",
+]
 OWN_PAGE = {"bdpm_opt2": "bdpm_opt", "bdpm_opt3": "bdpm_opt"}
 
 
@@ -27,26 +32,47 @@ def blocks(page: Path, language: str) -> list[str]:
 
 def run(arguments: list[str], folder: Path) -> subprocess.CompletedProcess:
     """Run a process in a folder, with this checkout's package and without a display."""
-    return subprocess.run(arguments, cwd=folder, capture_output=True, text=True, timeout=300,
-                          env={**os.environ, "PYTHONPATH": str(ROOT), "MPLBACKEND": "Agg"})
+    return subprocess.run(
+        arguments,
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        timeout=300,
+        env={**os.environ, "PYTHONPATH": str(ROOT), "MPLBACKEND": "Agg"},
+    )
 
 
 def test_notebook_runs(tmp_path):
-    """Its cells one after the other, as Jupyter would run them; the tutorial's page has the same blocks."""
-    pytest.importorskip("matplotlib", reason="the tutorial draws a figure: pip install 'mis-integrators[bench]'")
-    cells = [cell for cell in json.loads((ROOT / "notebooks" / "tutorial.ipynb").read_text())["cells"] if cell["cell_type"] == "code"]
+    """Its cells one after the other, as Jupyter would run them; the tutorial's page has the same
+    blocks."""
+    pytest.importorskip(
+        "matplotlib", reason="the tutorial draws a figure: pip install 'mis-integrators[bench]'"
+    )
+    cells = [
+        cell
+        for cell in json.loads((ROOT / "notebooks" / "tutorial.ipynb").read_text())["cells"]
+        if cell["cell_type"] == "code"
+    ]
     code = ["".join(cell["source"]) for cell in cells]
-    assert code == [block.strip("\n") for block in blocks(ROOT / "docs" / "tutorial.md", "python")] and len(code) > 4
+    assert (
+        code == [block.strip("\n") for block in blocks(ROOT / "docs" / "tutorial.md", "python")]
+        and len(code) > 4
+    )
     result = run([sys.executable, "-c", "\n\n".join(code)], tmp_path)
     assert result.returncode == 0, result.stderr[-2000:]
     assert "(64, 64, 3)" in result.stdout and result.stdout.count("relMSE without") == 3
     assert (tmp_path / "tutorial.png").stat().st_size > 10_000
-    assert run([sys.executable, str(ROOT / "tools" / "notebook.py"), "--check"], tmp_path).returncode == 0
+    assert (
+        run([sys.executable, str(ROOT / "tools" / "notebook.py"), "--check"], tmp_path).returncode
+        == 0
+    )
 
 
 def test_commands_of_the_tutorial_run(tmp_path):
     (tmp_path / "scenes").symlink_to(ROOT / "scenes")
-    commands = [line for block in blocks(ROOT / "docs" / "tutorial.md", "sh") for line in block.splitlines()]
+    commands = [
+        line for block in blocks(ROOT / "docs" / "tutorial.md", "sh") for line in block.splitlines()
+    ]
     assert len(commands) == 2
     for command in commands:
         program, *arguments = command.split()
@@ -57,10 +83,16 @@ def test_commands_of_the_tutorial_run(tmp_path):
 
 
 def commands(program: str) -> list[list[str]]:
-    """The arguments of all command lines of a program in the pages: in lines of their own, indented, or within a text."""
+    """The arguments of all command lines of a program in the pages: in lines of their own,
+    indented, or within a text."""
     inline, own_line = rf"`{program} ([^`]+)`", rf"^    {program} (.*?)(?: {{3,}}#.*)?$"
     texts = [page.read_text() for page in [*PAGES, *OTHERS]]
-    found = [match.split() for text in texts for pattern in (inline, own_line) for match in re.findall(pattern, text, re.MULTILINE)]
+    found = [
+        match.split()
+        for text in texts
+        for pattern in (inline, own_line)
+        for match in re.findall(pattern, text, re.MULTILINE)
+    ]
     return [arguments for arguments in found if not {"SUB-COMMAND", "--help"} & set(arguments)]
 
 
@@ -79,7 +111,11 @@ def test_commands_of_the_pages_are_understood(module):
     for arguments in benchmarks:
         parser.parse_args([named(argument) for argument in arguments])
     for arguments in renders:
-        options.parse(arguments if any(argument.endswith(".xml") for argument in arguments) else ["scene.xml", *arguments])
+        options.parse(
+            arguments
+            if any(argument.endswith(".xml") for argument in arguments)
+            else ["scene.xml", *arguments]
+        )
 
 
 def test_strategy_of_the_documentation_works(tmp_path):
@@ -91,14 +127,21 @@ def test_strategy_of_the_documentation_works(tmp_path):
 
 
 def test_every_plugin_has_a_page(rgb):
-    """With its name in the title, a picture, equations, every parameter that it knows, and a line in the index."""
+    """With its name in the title, a picture, equations, every parameter that it knows, and a line
+    in the index."""
     index = (ROOT / "docs" / "README.md").read_text()
     for plugin in _plugins.PLUGINS:
         page = ROOT / "docs" / f"{OWN_PAGE.get(plugin, plugin)}.md"
         text = page.read_text()
-        assert f"`{plugin}`" in text.splitlines()[0] and f"({page.name})" in index and f"`{plugin}`" in index
+        assert (
+            f"`{plugin}`" in text.splitlines()[0]
+            and f"({page.name})" in index
+            and f"`{plugin}`" in index
+        )
         assert re.search(r"^!\[.+\]\(images/", text, re.MULTILINE), page
-        assert len(re.findall(r"^    .*[=:] .*\S", text, re.MULTILINE)) >= 1 or re.search(r"\w_?i?\^?2? = ", text), page
+        assert len(re.findall(r"^    .*[=:] .*\S", text, re.MULTILINE)) >= 1 or re.search(
+            r"\w_?i?\^?2? = ", text
+        ), page
         for name in mi.load_dict({"type": plugin}).settings():
             assert name == "integrator" or f"`{name}`" in text, (plugin, name)
 
@@ -113,13 +156,22 @@ def test_docstrings_say_what_plugins_take(rgb, monkeypatch, plugin):
     rows = parameters(type(made).__doc__)
     with pytest.raises(RuntimeError) as error:
         mi.load_dict({"type": plugin, "nonsense": 1})
-    assert ", ".join(sorted(", ".join(name for name, *_ in rows).split(", "))) == str(error.value).strip().rpartition("allowed are: ")[2]
+    assert (
+        ", ".join(sorted(", ".join(name for name, *_ in rows).split(", ")))
+        == str(error.value).strip().rpartition("allowed are: ")[2]
+    )
     for name, kind, text in rows:
         default = re.search(r"\(Default: (?:yes, i\.e\. |no, i\.e\. )?(.*)\)$", text)
         assert default or not kind, name
-        if default and name != "mix_diffuse":                       # whose default depends on the scene
+        if default and name != "mix_diffuse":  # whose default depends on the scene
             value = made.settings()[name]
-            shown = str(value).lower() if isinstance(value, bool) else f"{value:g}" if isinstance(value, float) else str(value)
+            shown = (
+                str(value).lower()
+                if isinstance(value, bool)
+                else f"{value:g}"
+                if isinstance(value, float)
+                else str(value)
+            )
             assert default[1].strip("`") == shown, name
             assert kind == {bool: "bool", int: "int", float: "float", str: "string"}[type(value)]
 
@@ -140,11 +192,16 @@ def test_links_lead_somewhere(page):
         file = page.parent / name if name else page
         assert file.exists(), f"{page.name}: {target}"
         if heading:
-            slugs = {re.sub(r"[^\w -]", "", line.lstrip("# ").lower()).strip().replace(" ", "-")
-                     for line in file.read_text().splitlines() if line.startswith("#")}
+            slugs = {
+                re.sub(r"[^\w -]", "", line.lstrip("# ").lower()).strip().replace(" ", "-")
+                for line in file.read_text().splitlines()
+                if line.startswith("#")
+            }
             assert heading in slugs, f"{page.name}: {target}"
 
 
 def test_index_names_every_page():
     index = (ROOT / "docs" / "README.md").read_text()
-    assert [page.name for page in PAGES if page.name != "README.md" and f"({page.name})" not in index] == []
+    assert [
+        page.name for page in PAGES if page.name != "README.md" and f"({page.name})" not in index
+    ] == []

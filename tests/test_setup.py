@@ -10,11 +10,11 @@ import sysconfig
 import zipfile
 from pathlib import Path
 
-import mitsuba as mi
-import pytest
-
 from mis_integrators import _plugins, _tested, llvm
 from mis_integrators.llvm import library_directories
+
+import mitsuba as mi
+import pytest
 
 ROOT = Path(__file__).parent.parent
 MULTIARCH = sysconfig.get_config_var("MULTIARCH") or "lib"
@@ -34,7 +34,8 @@ def run_python(code: str, **environment: str) -> subprocess.CompletedProcess:
 
 
 def library(root: Path, name: str, *links: str) -> Path:
-    """An empty file named like a library, and symbolic links to it from elsewhere below ``root``."""
+    """An empty file named like a library, and symbolic links to it from elsewhere below
+    ``root``."""
     file = root / name
     file.parent.mkdir(parents=True, exist_ok=True)
     file.touch()
@@ -74,7 +75,9 @@ def test_version_of_a_link_is_that_of_its_target(tmp_path):
 def test_newest_working_library_is_chosen(tmp_path):
     library(tmp_path, f"usr/lib/{MULTIARCH}/libLLVM-15.so.1")
     library(tmp_path, f"usr/lib/{MULTIARCH}/libLLVM-17.so.1")
-    newest = library(tmp_path, f"usr/lib/{MULTIARCH}/libLLVM.so.20.1", "usr/lib/llvm-20/lib/libLLVM.so.1")
+    newest = library(
+        tmp_path, f"usr/lib/{MULTIARCH}/libLLVM.so.20.1", "usr/lib/llvm-20/lib/libLLVM.so.1"
+    )
     library(tmp_path, "usr/lib64/libLLVM.so.19.1")
     assert llvm.choose({}, tmp_path) == newest
 
@@ -123,7 +126,9 @@ def test_variable_is_checked(tmp_path):
     bad = library(tmp_path, "libLLVM-15.so.1")
     assert llvm.problem_with_variable({llvm.VARIABLE: str(good)}) is None
     assert "LLVM 15" in llvm.problem_with_variable({llvm.VARIABLE: str(bad)})
-    assert "does not exist" in llvm.problem_with_variable({llvm.VARIABLE: str(tmp_path / "none.so")})
+    assert "does not exist" in llvm.problem_with_variable(
+        {llvm.VARIABLE: str(tmp_path / "none.so")}
+    )
 
 
 def test_variable_that_is_set_is_left_alone(tmp_path):
@@ -165,18 +170,33 @@ def test_llvm_that_aborts_is_refused(order):
     assert "aborts the process" in result.stderr.splitlines()[-1]
 
 
-@pytest.mark.parametrize("python, environment, message", [
-    (sys.executable, {llvm.VARIABLE: "/none.so"}, "does not exist"), ("no-such-python", {}, "does not run; install Python 3.10 or newer"),
-    (None, {}, "is Python 3.9")])
+@pytest.mark.parametrize(
+    "python, environment, message",
+    [
+        (sys.executable, {llvm.VARIABLE: "/none.so"}, "does not exist"),
+        ("no-such-python", {}, "does not run; install Python 3.10 or newer"),
+        (None, {}, "is Python 3.9"),
+    ],
+)
 def test_set_up_stops_with_one_message(tmp_path, python, environment, message):
-    """What `make render` begins with says what to install, and makes nothing, where it cannot go on."""
+    """What `make render` begins with says what to install, and makes nothing, where it cannot go
+    on."""
     if python is None:
         python = tmp_path / "old-python"
-        python.write_text("#!/bin/sh\ncase $2 in *version_info\\ \\<*) exit 1;; *) echo 3.9;; esac\n")
+        python.write_text(
+            "#!/bin/sh\ncase $2 in *version_info\\ \\<*) exit 1;; *) echo 3.9;; esac\n"
+        )
         python.chmod(0o755)
-    result = subprocess.run([ROOT / "tools" / "setup.sh", python, tmp_path / "venv"], capture_output=True, text=True, timeout=60,
-                            env={**os.environ, **environment})
-    assert result.returncode == 1 and message in result.stderr and result.stderr.count("\n") == 1, result.stderr
+    result = subprocess.run(
+        [ROOT / "tools" / "setup.sh", python, tmp_path / "venv"],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        env={**os.environ, **environment},
+    )
+    assert result.returncode == 1 and message in result.stderr and result.stderr.count("\n") == 1, (
+        result.stderr
+    )
     assert result.stderr.startswith("setup: ") and not (tmp_path / "venv").exists()
 
 
@@ -191,24 +211,40 @@ def command(folder: Path, name: str, code: str) -> Path:
 
 @pytest.fixture
 def set_up(tmp_path):
-    """Runs `tools/setup.sh` where there is no LLVM until one is installed, as root, with commands that only take notes of what they are told."""
+    """Runs `tools/setup.sh` where there is no LLVM until one is installed, as root, with commands
+    that only take notes of what they are told."""
     tools, done, installed = tmp_path / "tools", tmp_path / "done", tmp_path / "installed"
     tools.mkdir()
     for name in ("awk", "bash", "cat", "dirname", "env", "sed", "sh", "sleep", "sort", "touch"):
         (tools / name).symlink_to(shutil.which(name))
     command(tools, "id", "echo 0")
-    command(tools, "apt-get", f'echo "$@" >> {done}; case "$*" in *install*) touch {installed};; esac')
-    command(tools, "apt-cache", "echo libllvm16; echo libllvm17t64; echo libllvm19; echo libllvm19-dev; echo libllvm22; echo libllvm23; echo libllvm100")
-    python = command(tools, "python", f"""case "$*" in
+    command(
+        tools, "apt-get", f'echo "$@" >> {done}; case "$*" in *install*) touch {installed};; esac'
+    )
+    command(
+        tools,
+        "apt-cache",
+        "echo libllvm16; echo libllvm17t64; echo libllvm19; echo libllvm19-dev; echo libllvm22; echo libllvm23; echo libllvm100",
+    )
+    python = command(
+        tools,
+        "python",
+        f"""case "$*" in
         */llvm.py) [ -e {installed} ] || {{ echo "no working LLVM" >&2; exit 1; }};;
         "-m venv"*) ;;
         *) exec {sys.executable} "$@";;
-    esac""")
+    esac""",
+    )
 
     def run(**environment):
         inherited = {name: value for name, value in os.environ.items() if name != llvm.VARIABLE}
-        result = subprocess.run([ROOT / "tools" / "setup.sh", python, tmp_path / "venv"], capture_output=True, text=True, timeout=60,
-                                env={**inherited, "PATH": str(tools), **environment})
+        result = subprocess.run(
+            [ROOT / "tools" / "setup.sh", python, tmp_path / "venv"],
+            capture_output=True,
+            text=True,
+            timeout=60,
+            env={**inherited, "PATH": str(tools), **environment},
+        )
         return result, done.read_text().splitlines() if done.exists() else []
 
     run.tools = tools
@@ -220,20 +256,37 @@ def test_set_up_says_what_it_installs_before(set_up):
     result, done = set_up()
     assert result.returncode == 0, result.stderr
     update, install = done
-    assert update == "update -qq" and install.endswith(" libllvm22") and "DPkg::Lock::Timeout=" in install
+    assert (
+        update == "update -qq"
+        and install.endswith(" libllvm22")
+        and "DPkg::Lock::Timeout=" in install
+    )
     first, second = result.stdout.splitlines()
-    assert "as root: apt-get update" in first and "as root: apt-get install libllvm22" in second and "NO_APT=1" in first
+    assert (
+        "as root: apt-get update" in first
+        and "as root: apt-get install libllvm22" in second
+        and "NO_APT=1" in first
+    )
 
 
 def test_set_up_says_each_thing_before_it_does_it(set_up):
     command(set_up.tools, "apt-get", 'echo "E: no network" >&2; exit 100')
     result, _ = set_up()
-    assert result.returncode == 1 and "apt-get update" in result.stdout and result.stderr == "setup: apt-get update failed: E: no network\n"
+    assert (
+        result.returncode == 1
+        and "apt-get update" in result.stdout
+        and result.stderr == "setup: apt-get update failed: E: no network\n"
+    )
 
 
 def test_set_up_installs_nothing_if_told_so(set_up):
     result, done = set_up(NO_APT="1")
-    assert result.returncode == 1 and done == [] and result.stdout == "" and result.stderr == "setup: no working LLVM\n"
+    assert (
+        result.returncode == 1
+        and done == []
+        and result.stdout == ""
+        and result.stderr == "setup: no working LLVM\n"
+    )
 
 
 def test_set_up_without_apt(set_up):
@@ -245,13 +298,21 @@ def test_set_up_without_apt(set_up):
 def test_set_up_does_not_install_what_was_not_tested(set_up):
     command(set_up.tools, "apt-cache", "echo libllvm16; echo libllvm23")
     result, done = set_up()
-    assert result.returncode == 1 and done == ["update -qq"] and result.stderr == "setup: no working LLVM (apt knows no such package here)\n"
+    assert (
+        result.returncode == 1
+        and done == ["update -qq"]
+        and result.stderr == "setup: no working LLVM (apt knows no such package here)\n"
+    )
 
 
 def test_set_up_waits_for_another_update(set_up, tmp_path):
     """Apt itself waits for the lock of the packages only, not for that of their lists."""
     command(set_up.tools, "sleep", f"touch {tmp_path}/waited")
-    command(set_up.tools, "apt-get", f'[ -e {tmp_path}/waited ] || {{ echo "E: Could not get lock x." >&2; echo "E: no" >&2; exit 100; }}; touch {tmp_path}/installed')
+    command(
+        set_up.tools,
+        "apt-get",
+        f'[ -e {tmp_path}/waited ] || {{ echo "E: Could not get lock x." >&2; echo "E: no" >&2; exit 100; }}; touch {tmp_path}/installed',
+    )
     result, _ = set_up()
     assert result.returncode == 0, result.stderr
 
@@ -309,11 +370,18 @@ def test_scalar_variant_says_what_the_plugins_need():
 # --- Newer versions -------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name, version", [("mitsuba", "3.10.0"), ("mitsuba", "4.0.0.dev1"), ("drjit", "1.6.0")])
+@pytest.mark.parametrize(
+    "name, version", [("mitsuba", "3.10.0"), ("mitsuba", "4.0.0.dev1"), ("drjit", "1.6.0")]
+)
 def test_newer_version_is_one_line(name, version):
-    result = run_python(f"import drjit, mitsuba; {name}.__version__ = '{version}'\nimport mis_integrators, mis_integrators.app.loading")
+    result = run_python(
+        f"import drjit, mitsuba; {name}.__version__ = '{version}'\nimport mis_integrators, mis_integrators.app.loading"
+    )
     assert result.returncode == 0 and result.stderr.count("\n") == 1
-    assert f"{name} {version} may not work: the newest tested are mitsuba 3.9 and drjit 1.5" in result.stderr
+    assert (
+        f"{name} {version} may not work: the newest tested are mitsuba 3.9 and drjit 1.5"
+        in result.stderr
+    )
 
 
 def test_warning_of_a_newer_version_can_be_filtered():
@@ -322,7 +390,14 @@ def test_warning_of_a_newer_version_can_be_filtered():
     assert (result.returncode, result.stdout, result.stderr) == (0, "", "")
 
 
-@pytest.mark.parametrize("versions", [{"mitsuba": "3.9.1", "drjit": "1.5.0"}, {"mitsuba": "3.9.12", "drjit": "1.5.3.dev2"}, {"mitsuba": "3.8.0", "drjit": "1.4"}])
+@pytest.mark.parametrize(
+    "versions",
+    [
+        {"mitsuba": "3.9.1", "drjit": "1.5.0"},
+        {"mitsuba": "3.9.12", "drjit": "1.5.3.dev2"},
+        {"mitsuba": "3.8.0", "drjit": "1.4"},
+    ],
+)
 def test_tested_and_older_versions_are_not_warned_of(recwarn, versions):
     _tested.warn_of_newer(versions)
     assert not recwarn.list
@@ -358,14 +433,25 @@ def test_modules_that_define_plugin_classes_are_loaded_anew(rgb):
 
 def package_files() -> list[Path]:
     """All files of the package but what Python leaves there."""
-    return [file for file in (ROOT / "mis_integrators").rglob("*") if file.is_file() and "__pycache__" not in file.parts]
+    return [
+        file
+        for file in (ROOT / "mis_integrators").rglob("*")
+        if file.is_file() and "__pycache__" not in file.parts
+    ]
 
 
 def test_files_that_are_no_modules_are_declared():
     """Setuptools leaves out of a wheel what pyproject.toml does not name."""
     tomllib = pytest.importorskip("tomllib", reason="Python 3.11 or newer reads TOML")
-    declared = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]
-    named = {file for package, patterns in declared.items() for pattern in patterns for file in ROOT.joinpath(*package.split(".")).glob(pattern)}
+    declared = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"][
+        "package-data"
+    ]
+    named = {
+        file
+        for package, patterns in declared.items()
+        for pattern in patterns
+        for file in ROOT.joinpath(*package.split(".")).glob(pattern)
+    }
     data = {file for file in package_files() if file.suffix != ".py"}
     assert data and data <= named
 
@@ -373,12 +459,19 @@ def test_files_that_are_no_modules_are_declared():
 def test_type_hints_are_right(tmp_path):
     """Those of the modules that pyproject.toml lists."""
     pytest.importorskip("mypy", reason="mypy is not installed: pip install 'mis-integrators[lint]'")
-    result = subprocess.run([sys.executable, "-m", "mypy", "--cache-dir", tmp_path], cwd=ROOT, capture_output=True, text=True, timeout=300)
+    result = subprocess.run(
+        [sys.executable, "-m", "mypy", "--cache-dir", tmp_path],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
     assert result.returncode == 0, result.stdout
 
 
 def test_wheel_holds_every_file(tmp_path):
-    """Built without isolation: it needs no network, but a recent setuptools, which extra `test` brings."""
+    """Built without isolation: it needs no network, but a recent setuptools, which extra `test`
+    brings."""
     setuptools = pytest.importorskip("setuptools")
     if int(setuptools.__version__.split(".")[0]) < 77:
         pytest.skip("setuptools is older than pyproject.toml asks for")
@@ -404,7 +497,9 @@ def test_wheel_holds_every_file(tmp_path):
     )
     (wheel,) = tmp_path.glob("*.whl")
     names = set(zipfile.ZipFile(wheel).namelist())
-    assert {file.relative_to(ROOT).as_posix() for file in package_files()} | {"mis_render.py"} <= names
+    assert {file.relative_to(ROOT).as_posix() for file in package_files()} | {
+        "mis_render.py"
+    } <= names
     (entry_points,) = [name for name in names if name.endswith("entry_points.txt")]
     assert "mis-render = mis_render:main" in zipfile.ZipFile(wheel).read(entry_points).decode()
     assert any(name.endswith("licenses/LICENSE") for name in names)

@@ -1,7 +1,9 @@
 #!/usr/bin/env python3
-"""Write the parameter tables of docs/*.md from the plugins' docstrings: between ``<!-- parameters: PLUGIN -->`` and ``<!-- end -->``.
+"""Write the parameter tables of docs/*.md from the plugins' docstrings: between ``<!-- parameters:
+PLUGIN -->`` and ``<!-- end -->``.
 
-``parameter_tables.py --check`` changes nothing, and exits with status 1 where a table is not what the docstring says.
+``parameter_tables.py --check`` changes nothing, and exits with status 1 where a table is not what
+the docstring says.
 """
 
 from __future__ import annotations
@@ -11,6 +13,7 @@ import sys
 from pathlib import Path
 
 import mis_integrators  # noqa: F401  (makes LLVM known, registers the plugins)
+
 import mitsuba as mi
 
 DOCS = Path(__file__).parent.parent / "docs"
@@ -22,7 +25,9 @@ def parameters(docstring: str) -> list[tuple[str, str, str]]:
     block = re.split(r"\n    (?=\S)", docstring.partition(".. pluginparameters::")[2])[0]
     rows = []
     for row in re.split(r"^\s*\* - ", block, flags=re.MULTILINE)[1:]:
-        cells = [" ".join(cell.split()) for cell in re.split(r"^\s+-(?: |$)", row, flags=re.MULTILINE)]
+        cells = [
+            " ".join(cell.split()) for cell in re.split(r"^\s+-(?: |$)", row, flags=re.MULTILINE)
+        ]
         rows.append((cells[0], cells[1].strip("|"), _markdown(cells[2])))
     return rows
 
@@ -30,7 +35,10 @@ def parameters(docstring: str) -> list[tuple[str, str, str]]:
 def table(docstring: str) -> str:
     """The rows as a Markdown table."""
     lines = ["| parameter | type | |", "|---|---|---|"]
-    lines += [f"| {', '.join(f'`{one}`' for one in name.split(', '))} | {kind} | {text} |" for name, kind, text in parameters(docstring)]
+    lines += [
+        f"| {', '.join(f'`{one}`' for one in name.split(', '))} | {kind} | {text} |"
+        for name, kind, text in parameters(docstring)
+    ]
     return "\n".join(lines) + "\n"
 
 
@@ -43,6 +51,7 @@ def _markdown(text: str) -> str:
 
 def updated(page: str) -> str:
     """A page with its tables as the docstrings have them."""
+
     def fresh(match: re.Match) -> str:
         return match[1] + table(type(mi.load_dict({"type": match[2]})).__doc__) + match[3]
 

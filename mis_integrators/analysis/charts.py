@@ -1,12 +1,14 @@
-"""Charts of errors, with matplotlib (extra `bench`): a method has the same colour, marker and dashes in each of them."""
+"""Charts of errors, with matplotlib (extra `bench`): a method has the same colour, marker and
+dashes in each of them."""
 
 from __future__ import annotations
 
 import base64
 import io
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib import colormaps, rc_context
@@ -17,15 +19,33 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullForma
 from .stability import Point, breaks
 
 FAMILIES = {
-    "path": "#222222", "ptracer": "#8c6d3f", "volpath": "#7f7f7f", "bdpm": "#1f77d0", "bdpm_balance": "#12a5a0", "bdpm_opt": "#8e44ad",
-    "bdpm_opt2": "#f08c00", "bdpm_opt3": "#d62728", "bdpm_auto": "#a3195b", "bdpt": "#2e8b3d", "vcm": "#d63fb0", "pcbpt": "#9aa61c",
-    "bdpt_ris": "#66c05a", "volpath_multiview": "#5b6fb5",
+    "path": "#222222",
+    "ptracer": "#8c6d3f",
+    "volpath": "#7f7f7f",
+    "bdpm": "#1f77d0",
+    "bdpm_balance": "#12a5a0",
+    "bdpm_opt": "#8e44ad",
+    "bdpm_opt2": "#f08c00",
+    "bdpm_opt3": "#d62728",
+    "bdpm_auto": "#a3195b",
+    "bdpt": "#2e8b3d",
+    "vcm": "#d63fb0",
+    "pcbpt": "#9aa61c",
+    "bdpt_ris": "#66c05a",
+    "volpath_multiview": "#5b6fb5",
 }
 """Colours of plugins."""
 OTHERS = ("#b5651d", "#006d77", "#7b2cbf", "#588157", "#bc4749")
 """Colours of plugins that are not among `FAMILIES`."""
 MARKERS, DASHES = "osD^vPX", ("-", "--", ":", "-.")
-SETTINGS = {"font.size": 9, "axes.grid": True, "grid.alpha": 0.3, "axes.spines.top": False, "axes.spines.right": False, "svg.fonttype": "path"}
+SETTINGS = {
+    "font.size": 9,
+    "axes.grid": True,
+    "grid.alpha": 0.3,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "svg.fonttype": "path",
+}
 
 
 @dataclass(frozen=True)
@@ -38,7 +58,8 @@ class Style:
 
 
 def styles(labels: Sequence[str]) -> dict[str, Style]:
-    """A style for each method: the plugin decides the colour, its settings the lightness, marker and dashes."""
+    """A style for each method: the plugin decides the colour, its settings the lightness, marker
+    and dashes."""
     found: dict[str, Style] = {}
     plugins: list[str] = []
     for label in labels:
@@ -48,7 +69,11 @@ def styles(labels: Sequence[str]) -> dict[str, Style]:
         colour = FAMILIES.get(plugin) or OTHERS[unknown.index(plugin) % len(OTHERS)]
         plugins.append(plugin)
         light = min(0.3 * number, 0.6)
-        found[label] = Style(tuple((1 - light) * c + light for c in to_rgb(colour)), MARKERS[number % len(MARKERS)], DASHES[number % len(DASHES)])
+        found[label] = Style(
+            tuple((1 - light) * c + light for c in to_rgb(colour)),
+            MARKERS[number % len(MARKERS)],
+            DASHES[number % len(DASHES)],
+        )
     return found
 
 
@@ -59,7 +84,8 @@ def colour_name(style: Style) -> str:
 
 @dataclass(frozen=True)
 class Curve:
-    """A method's error over time: seconds, errors, the ends of their intervals (NaN: none), and the fitted slope in words."""
+    """A method's error over time: seconds, errors, the ends of their intervals (NaN: none), and the
+    fitted slope in words."""
 
     seconds: Sequence[float]
     errors: Sequence[float]
@@ -72,32 +98,69 @@ def error_against_time(curves: Mapping[str, Curve], style: Mapping[str, Style]) 
     """relMSE against seconds on logarithmic axes; points that are not positive are left out."""
     figure, axis = _axes(5.6, 4.0)
     for label, curve in curves.items():
-        x, y, low, high = (np.asarray(values, dtype=float) for values in (curve.seconds, curve.errors, curve.low, curve.high))
+        x, y, low, high = (
+            np.asarray(values, dtype=float)
+            for values in (curve.seconds, curve.errors, curve.low, curve.high)
+        )
         good = y > 0
         if good.any():
             look = style[label]
-            axis.plot(x[good], y[good], look.dashes, color=look.colour, marker=look.marker, ms=4, lw=1.6, label=f"{label}  {curve.slope}")
+            axis.plot(
+                x[good],
+                y[good],
+                look.dashes,
+                color=look.colour,
+                marker=look.marker,
+                ms=4,
+                lw=1.6,
+                label=f"{label}  {curve.slope}",
+            )
             if np.isfinite(low).any():
-                low, high = np.maximum(low, y / 3), np.minimum(high, 3 * y)        # wider ones would hide the rest
-                axis.fill_between(x[good], low[good], high[good], color=look.colour, alpha=0.1, lw=0)
+                low, high = (
+                    np.maximum(low, y / 3),
+                    np.minimum(high, 3 * y),
+                )  # wider ones would hide the rest
+                axis.fill_between(
+                    x[good], low[good], high[good], color=look.colour, alpha=0.1, lw=0
+                )
     _logarithmic(axis, "seconds", "relMSE, mean of the seeds")
     _legend(axis, "method, slope")
     return figure
 
 
-def front(points: Mapping[str, Sequence[tuple[float, float, bool]]], style: Mapping[str, Style]) -> Figure:
-    """Speed and accuracy: each method's (seconds, error, on the front); those on the front are filled and joined by a staircase."""
+def front(
+    points: Mapping[str, Sequence[tuple[float, float, bool]]], style: Mapping[str, Style]
+) -> Figure:
+    """Speed and accuracy: each method's (seconds, error, on the front); those on the front are
+    filled and joined by a staircase."""
     figure, axis = _axes(5.6, 4.0)
-    best = sorted((t, e) for mine in points.values() for t, e, on_front in mine if on_front and e > 0)
+    best = sorted(
+        (t, e) for mine in points.values() for t, e, on_front in mine if on_front and e > 0
+    )
     if best:
-        axis.step(*zip(*best), where="post", color="#999999", lw=5, alpha=0.35, solid_joinstyle="round", zorder=0)
+        axis.step(
+            *zip(*best),
+            where="post",
+            color="#999999",
+            lw=5,
+            alpha=0.35,
+            solid_joinstyle="round",
+            zorder=0,
+        )
     for label, mine in points.items():
         look, labelled = style[label], False
         for filled in (True, False):
             some = [(t, e) for t, e, on_front in mine if on_front == filled and e > 0]
             if some:
-                axis.plot(*zip(*some), look.marker, color=look.colour, ms=8 if filled else 4, mfc=look.colour if filled else "none",
-                          label=None if labelled else label, alpha=1 if filled else 0.7)
+                axis.plot(
+                    *zip(*some),
+                    look.marker,
+                    color=look.colour,
+                    ms=8 if filled else 4,
+                    mfc=look.colour if filled else "none",
+                    label=None if labelled else label,
+                    alpha=1 if filled else 0.7,
+                )
                 labelled = True
     _logarithmic(axis, "seconds", "relMSE without the worst 0.1 %")
     _legend(axis, "large: on the front")
@@ -110,8 +173,14 @@ def sweep(title: str, sweeps: Mapping[str, Sequence[Point]], style: Mapping[str,
     for label, points in sweeps.items():
         look = style[label]
         x, y = [point.value for point in points], [point.error for point in points]
-        axis.plot(x, y, look.dashes, color=look.colour, marker=look.marker, ms=4, lw=1.6, label=label)
-        broken = [(point.value, point.error) for point, breaks_here in zip(points, breaks(points)) if breaks_here and np.isfinite(point.error)]
+        axis.plot(
+            x, y, look.dashes, color=look.colour, marker=look.marker, ms=4, lw=1.6, label=label
+        )
+        broken = [
+            (point.value, point.error)
+            for point, breaks_here in zip(points, breaks(points))
+            if breaks_here and np.isfinite(point.error)
+        ]
         if broken:
             axis.plot(*zip(*broken), "o", ms=12, mfc="none", mec=look.colour, mew=1.8)
             axis.plot(*zip(*broken), "x", ms=7, color=look.colour, mew=2)
@@ -120,13 +189,24 @@ def sweep(title: str, sweeps: Mapping[str, Sequence[Point]], style: Mapping[str,
     return figure
 
 
-def cost_by_count(curves: Mapping[str, Sequence[tuple[int, float]]], style: Mapping[str, Style], base: str) -> Figure:
-    """Each method's (number of views, variance x time over that of `base`); the base itself is the line at one."""
+def cost_by_count(
+    curves: Mapping[str, Sequence[tuple[int, float]]], style: Mapping[str, Style], base: str
+) -> Figure:
+    """Each method's (number of views, variance x time over that of `base`); the base itself is the
+    line at one."""
     figure, axis = _axes(4.6, 3.4)
     axis.axhline(1, color=style[base].colour, lw=2, alpha=0.6, label=base)
     for label, points in curves.items():
         look = style[label]
-        axis.plot(*zip(*points), look.dashes, color=look.colour, marker=look.marker, ms=5, lw=1.6, label=label)
+        axis.plot(
+            *zip(*points),
+            look.dashes,
+            color=look.colour,
+            marker=look.marker,
+            ms=5,
+            lw=1.6,
+            label=label,
+        )
     _logarithmic(axis, "views", f"variance x time, {base} = 1")
     counts = sorted({count for points in curves.values() for count, _ in points})
     axis.xaxis.set_major_locator(FixedLocator(counts))
@@ -136,12 +216,17 @@ def cost_by_count(curves: Mapping[str, Sequence[tuple[int, float]]], style: Mapp
 
 
 def by_share(curves: Mapping[str, Sequence[tuple[float, float]]]) -> Figure:
-    """Variances of estimators, relative to that of the first, against the share of the weights that other views bring."""
+    """Variances of estimators, relative to that of the first, against the share of the weights that
+    other views bring."""
     figure, axis = _axes(5.0, 3.4)
     for number, (label, points) in enumerate(curves.items()):
         colour, marker, dashes = (kind[number % len(kind)] for kind in (OTHERS, MARKERS, DASHES))
         axis.plot(*zip(*points), dashes, marker=marker, ms=5, lw=1.6, color=colour, label=label)
-    axis.set(xlabel="share of other views in the pixel's weights", ylabel=f"variance, {next(iter(curves))} = 1", ylim=(0, None))
+    axis.set(
+        xlabel="share of other views in the pixel's weights",
+        ylabel=f"variance, {next(iter(curves))} = 1",
+        ylim=(0, None),
+    )
     _legend(axis, "estimator")
     return figure
 
@@ -156,34 +241,69 @@ class Line:
     high: Sequence[float]
 
 
-def ratios(rows: Sequence[str], columns: Sequence[str], panels: Sequence[Sequence[Mapping[str, Line]]], style: Mapping[str, Style], base: str) -> Figure:
-    """A panel for each measure (`rows`, titles) and parameter (`columns`), lines by method, on logarithmic axes; grey: 1, what ratios are to (`base`)."""
+def ratios(
+    rows: Sequence[str],
+    columns: Sequence[str],
+    panels: Sequence[Sequence[Mapping[str, Line]]],
+    style: Mapping[str, Style],
+    base: str,
+) -> Figure:
+    """A panel for each measure (`rows`, titles) and parameter (`columns`), lines by method, on
+    logarithmic axes; grey: 1, what ratios are to (`base`)."""
     with rc_context(SETTINGS):
-        figure = Figure(figsize=(2.7 * len(columns) + 1.9, 1.9 * len(rows) + 0.4), layout="constrained")
+        figure = Figure(
+            figsize=(2.7 * len(columns) + 1.9, 1.9 * len(rows) + 0.4), layout="constrained"
+        )
         axes = figure.subplots(len(rows), len(columns), squeeze=False, sharex="col", sharey="row")
         for title, of_measure, across in zip(rows, panels, axes):
             for name, drawn, axis in zip(columns, of_measure, across):
                 axis.axhline(1, color="#999999", lw=4, alpha=0.4, zorder=0)
                 for label, line in drawn.items():
                     look = style[label]
-                    axis.plot(line.values, line.ratios, look.dashes, color=look.colour, marker=look.marker, ms=4, lw=1.6, label=label)
+                    axis.plot(
+                        line.values,
+                        line.ratios,
+                        look.dashes,
+                        color=look.colour,
+                        marker=look.marker,
+                        ms=4,
+                        lw=1.6,
+                        label=label,
+                    )
                     if np.isfinite(line.low).any():
                         y = np.asarray(line.ratios)
-                        axis.fill_between(line.values, np.maximum(line.low, y / 2), np.minimum(line.high, 2 * y), color=look.colour, alpha=0.1, lw=0)
+                        axis.fill_between(
+                            line.values,
+                            np.maximum(line.low, y / 2),
+                            np.minimum(line.high, 2 * y),
+                            color=look.colour,
+                            alpha=0.1,
+                            lw=0,
+                        )
                 _logarithmic(axis, name, title)
                 axis.label_outer()
         _legend(axes[0, -1], f"grey: {base}")
     return figure
 
 
-def variance_maps(labels: Sequence[str], images: Sequence[np.ndarray], maps: Sequence[np.ndarray], notes: Sequence[str]) -> Figure:
-    """Pictures, (H, W, 3), above; maps of relative variance, (H, W), on one logarithmic scale below; a note under each label."""
+def variance_maps(
+    labels: Sequence[str],
+    images: Sequence[np.ndarray],
+    maps: Sequence[np.ndarray],
+    notes: Sequence[str],
+) -> Figure:
+    """Pictures, (H, W, 3), above; maps of relative variance, (H, W), on one logarithmic scale
+    below; a note under each label."""
     height, width = maps[0].shape
     with rc_context({"font.size": 9}):
-        figure = Figure(figsize=(2.0 * len(maps) + 0.7, 4.0 * height / width + 1.0), layout="constrained")
+        figure = Figure(
+            figsize=(2.0 * len(maps) + 0.7, 4.0 * height / width + 1.0), layout="constrained"
+        )
         axes = figure.subplots(2, len(maps), squeeze=False)
         logs = [np.log10(np.maximum(m, 1e-9)) for m in maps]
-        seen = np.concatenate([log[m > 0] for log, m in zip(logs, maps)])      # where nothing varies, a lamp perhaps, is off the scale
+        seen = np.concatenate(
+            [log[m > 0] for log, m in zip(logs, maps)]
+        )  # where nothing varies, a lamp perhaps, is off the scale
         low, high = np.percentile(seen, [1, 99.5]) if seen.size else (-9, 0)
         white = np.quantile(images[0], 0.98)
         for column, (label, image, log, note) in enumerate(zip(labels, images, logs, notes)):
@@ -193,7 +313,9 @@ def variance_maps(labels: Sequence[str], images: Sequence[np.ndarray], maps: Seq
             axes[1, column].set_title(note)
         for axis in axes.flat:
             axis.set_axis_off()
-        figure.colorbar(shown, ax=axes.ravel().tolist(), label="log10 relative variance", shrink=0.6, pad=0.01)
+        figure.colorbar(
+            shown, ax=axes.ravel().tolist(), label="log10 relative variance", shrink=0.6, pad=0.01
+        )
     return figure
 
 
@@ -228,7 +350,8 @@ def _axes(width: float, height: float) -> tuple[Figure, Any]:
 
 
 def _logarithmic(axis: Any, x: str, y: str) -> None:
-    """Logarithmic axes with plain numbers at 1, 2 and 5 times powers of ten, at powers alone where these are many."""
+    """Logarithmic axes with plain numbers at 1, 2 and 5 times powers of ten, at powers alone where
+    these are many."""
     axis.set(xscale="log", yscale="log", xlabel=f"{x} (log)", ylabel=f"{y} (log)")
     for one, (low, high) in ((axis.xaxis, axis.get_xlim()), (axis.yaxis, axis.get_ylim())):
         decades = np.log10(high / low)
@@ -239,4 +362,12 @@ def _logarithmic(axis: Any, x: str, y: str) -> None:
 
 
 def _legend(axis: Any, title: str) -> None:
-    axis.legend(title=title, loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False, fontsize=8, title_fontsize=8, alignment="left")
+    axis.legend(
+        title=title,
+        loc="center left",
+        bbox_to_anchor=(1.01, 0.5),
+        frameon=False,
+        fontsize=8,
+        title_fontsize=8,
+        alignment="left",
+    )

@@ -1,10 +1,12 @@
-"""Confidence intervals of figures that come from a few independent renders: means, ratios, slopes. No SciPy."""
+"""Confidence intervals of figures that come from a few independent renders: means, ratios, slopes.
+No SciPy."""
 
 from __future__ import annotations
 
 import math
-from functools import lru_cache
-from typing import NamedTuple, Sequence
+from collections.abc import Sequence
+from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,14 +15,19 @@ LEVEL = 0.95
 
 
 class Interval(NamedTuple):
-    """An estimate, and the ends of its confidence interval: NaN where there are too few renders to tell."""
+    """An estimate, and the ends of its confidence interval: NaN where there are too few renders to
+    tell."""
 
     value: float
     low: float
     high: float
 
     def __str__(self) -> str:
-        return f"{self.value:.3g}" if math.isnan(self.low) else f"{self.value:.3g} ({self.low:.3g} to {self.high:.3g})"
+        return (
+            f"{self.value:.3g}"
+            if math.isnan(self.low)
+            else f"{self.value:.3g} ({self.low:.3g} to {self.high:.3g})"
+        )
 
 
 def mean_interval(values: Sequence[float], level: float = LEVEL) -> Interval:
@@ -29,13 +36,16 @@ def mean_interval(values: Sequence[float], level: float = LEVEL) -> Interval:
     mean = float(values.mean())
     if len(values) < 2:
         return Interval(mean, math.nan, math.nan)
-    half = t_quantile(1 - level, len(values) - 1) * float(values.std(ddof=1)) / math.sqrt(len(values))
+    half = (
+        t_quantile(1 - level, len(values) - 1) * float(values.std(ddof=1)) / math.sqrt(len(values))
+    )
     return Interval(mean, mean - half, mean + half)
 
 
 def log_ratio_error(values: Sequence[float], base: Sequence[float]) -> float:
-    """Standard error of log(mean of `values` / mean of `base`) by the delta method; pairs (values[i], base[i]) may be correlated, as
-    those of one run are. NaN for a single pair or where the ratio is not positive."""
+    """Standard error of log(mean of `values` / mean of `base`) by the delta method; pairs
+    (values[i], base[i]) may be correlated, as those of one run are. NaN for a single pair or where
+    the ratio is not positive."""
     values, base = np.asarray(values, dtype=np.float64), np.asarray(base, dtype=np.float64)
     if len(values) < 2 or not values.mean() / base.mean() > 0:
         return math.nan
@@ -43,8 +53,11 @@ def log_ratio_error(values: Sequence[float], base: Sequence[float]) -> float:
     return float(residuals.std(ddof=1)) / math.sqrt(len(values))
 
 
-def ratio_interval(values: Sequence[float], base: Sequence[float], level: float = LEVEL) -> Interval:
-    """Ratio of the means of paired values, with an interval that is symmetric on a logarithmic scale."""
+def ratio_interval(
+    values: Sequence[float], base: Sequence[float], level: float = LEVEL
+) -> Interval:
+    """Ratio of the means of paired values, with an interval that is symmetric on a logarithmic
+    scale."""
     ratio = float(np.mean(values) / np.mean(base))
     error = log_ratio_error(values, base)
     if math.isnan(error):
@@ -54,7 +67,8 @@ def ratio_interval(values: Sequence[float], base: Sequence[float], level: float 
 
 
 def log_slope(x: Sequence[float], y: Sequence[float]) -> float:
-    """Slope of the least-squares line through (log x, log y), over the points with y > 0; NaN if they are fewer than three."""
+    """Slope of the least-squares line through (log x, log y), over the points with y > 0; NaN if
+    they are fewer than three."""
     x, y = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
     good = (x > 0) & (y > 0)
     if good.sum() < 3:
@@ -64,10 +78,13 @@ def log_slope(x: Sequence[float], y: Sequence[float]) -> float:
     return float((x * y).sum() / (x * x).sum())
 
 
-def slope_interval(runs: Sequence[tuple[Sequence[float], Sequence[float]]], level: float = LEVEL) -> Interval:
+def slope_interval(
+    runs: Sequence[tuple[Sequence[float], Sequence[float]]], level: float = LEVEL
+) -> Interval:
     """Mean of the slopes of several independent runs, each (x, y), with Student's interval.
 
-    The points of one run share their samples, so a single fit's residuals say nothing about its slope's error: runs do.
+    The points of one run share their samples, so a single fit's residuals say nothing about its
+    slope's error: runs do.
     """
     slopes = [slope for slope in (log_slope(x, y) for x, y in runs) if not math.isnan(slope)]
     return mean_interval(slopes, level) if slopes else Interval(math.nan, math.nan, math.nan)
@@ -79,7 +96,17 @@ def slope_interval(runs: Sequence[tuple[Sequence[float], Sequence[float]]], leve
 def t_two_sided(t: float, freedom: float) -> float:
     """Probability that Student's t exceeds `t` in absolute value."""
     a, b, x = freedom / 2, 0.5, freedom / (freedom + t * t)
-    front = math.exp(a * math.log(x) + b * math.log1p(-x) - math.lgamma(a) - math.lgamma(b) + math.lgamma(a + b)) if x < 1 else 0
+    front = (
+        math.exp(
+            a * math.log(x)
+            + b * math.log1p(-x)
+            - math.lgamma(a)
+            - math.lgamma(b)
+            + math.lgamma(a + b)
+        )
+        if x < 1
+        else 0
+    )
     if x >= 1:
         return 1.0
     if x < (a + 1) / (a + b + 2):
@@ -87,7 +114,7 @@ def t_two_sided(t: float, freedom: float) -> float:
     return 1 - front * _beta_fraction(b, a, 1 - x) / b
 
 
-@lru_cache(maxsize=None)
+@cache
 def t_quantile(tail: float, freedom: float) -> float:
     """The t > 0 with `t_two_sided(t) = tail`."""
     low, high = 0.0, 1e3
@@ -103,8 +130,10 @@ def _beta_fraction(a: float, b: float, x: float) -> float:
     d = 1 / (d or 1e-300)
     result = d
     for m in range(1, 500):
-        for step in (m * (b - m) * x / ((a + 2 * m - 1) * (a + 2 * m)),
-                     -(a + m) * (a + b + m) * x / ((a + 2 * m) * (a + 2 * m + 1))):
+        for step in (
+            m * (b - m) * x / ((a + 2 * m - 1) * (a + 2 * m)),
+            -(a + m) * (a + b + m) * x / ((a + 2 * m) * (a + 2 * m + 1)),
+        ):
             d = 1 / ((1 + step * d) or 1e-300)
             c = (1 + step / c) or 1e-300
             result *= d * c

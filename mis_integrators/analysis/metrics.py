@@ -1,17 +1,20 @@
-"""Errors of images against two independent references, free of the references' own noise where the measure allows it.
+"""Errors of images against two independent references, free of the references' own noise where the
+measure allows it.
 
-With references r1 and r2 of independent noise, the mean of (x - r1)(x - r2) is the squared error of x alone: the noise of r1 and that of
-r2 are uncorrelated with each other and with x. It can come out negative where the error is small. Absolute errors (MAPE) and FLIP are no
-such products: they see the noise of the references' mean as well.
+With references r1 and r2 of independent noise, the mean of (x - r1)(x - r2) is the squared error of
+x alone: the noise of r1 and that of r2 are uncorrelated with each other and with x. It can come out
+negative where the error is small. Absolute errors (MAPE) and FLIP are no such products: they see
+the noise of the references' mean as well.
 
-Relative errors divide by (r1 + r2)/2, squared, plus `RELATIVE_OFFSET`; where the references are noisy, that mean is smoothed over 3 x 3
-pixels, so that the noise in the divisor and that in the products hardly correlate.
+Relative errors divide by (r1 + r2)/2, squared, plus `RELATIVE_OFFSET`; where the references are
+noisy, that mean is smoothed over 3 x 3 pixels, so that the noise in the divisor and that in the
+products hardly correlate.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Sequence
 
 import numpy as np
 
@@ -51,7 +54,8 @@ class References:
 
 @dataclass(frozen=True)
 class Errors:
-    """Errors of an image. Squared ones are products of noisy differences and can be negative where small."""
+    """Errors of an image. Squared ones are products of noisy differences and can be negative where
+    small."""
 
     mse: float
     relmse: float
@@ -65,7 +69,8 @@ class Errors:
 
 
 def squared_errors(image: np.ndarray, references: References) -> np.ndarray:
-    """Squared error of each pixel and channel, (H, W, 3), with expectation (x - r)^2 for the noise-free r."""
+    """Squared error of each pixel and channel, (H, W, 3), with expectation (x - r)^2 for the
+    noise-free r."""
     image = image.astype(np.float64)
     return (image - references.first) * (image - references.second)
 
@@ -86,14 +91,18 @@ def errors(image: np.ndarray, references: References) -> Errors:
         relmse_trimmed=trimmed_mean(relative),
         relmse_median=median_of_means(relative),
         mape=mape(image, references),
-        mean_ratio=float(image.astype(np.float64).mean() / max(float(references.mean.mean()), 1e-30)),
+        mean_ratio=float(
+            image.astype(np.float64).mean() / max(float(references.mean.mean()), 1e-30)
+        ),
     )
 
 
 def relative_differences(image: np.ndarray, references: References) -> np.ndarray:
-    """(x - r) / (r + 0.1) of each pixel and channel, (H, W, 3), r the references' mean and 0.1 the root of `RELATIVE_OFFSET`; includes the
-    noise of r."""
-    return (image.astype(np.float64) - references.mean) / (np.abs(references.level()) + RELATIVE_OFFSET ** 0.5)
+    """(x - r) / (r + 0.1) of each pixel and channel, (H, W, 3), r the references' mean and 0.1 the
+    root of `RELATIVE_OFFSET`; includes the noise of r."""
+    return (image.astype(np.float64) - references.mean) / (
+        np.abs(references.level()) + RELATIVE_OFFSET**0.5
+    )
 
 
 def mape(image: np.ndarray, references: References) -> float:
@@ -106,7 +115,8 @@ def mape(image: np.ndarray, references: References) -> float:
 
 @dataclass(frozen=True)
 class Decomposition:
-    """relMSE apart into squared bias and variance of one render, both relative to `References.divisor`; `total` is their sum."""
+    """relMSE apart into squared bias and variance of one render, both relative to
+    `References.divisor`; `total` is their sum."""
 
     bias2: float
     variance: float
@@ -117,28 +127,35 @@ class Decomposition:
 
     @property
     def bias_share(self) -> float:
-        """Share of the error that more samples do not remove; below 0 where noise hides a bias that is next to none."""
+        """Share of the error that more samples do not remove; below 0 where noise hides a bias that
+        is next to none."""
         return self.bias2 / self.total if self.total else 0.0
 
 
 def decompose(images: Sequence[np.ndarray], references: References) -> Decomposition | None:
-    """Squared bias and variance from renders under different seeds, each without bias; ``None`` for a single render.
+    """Squared bias and variance from renders under different seeds, each without bias; ``None`` for
+    a single render.
 
-    The variance is that of the renders among themselves. Squared bias is the mean of (x_s - r1)(x_t - r2) over pairs of different
-    renders: noise of neither renders nor references is left in it.
+    The variance is that of the renders among themselves. Squared bias is the mean of (x_s - r1)(x_t
+    - r2) over pairs of different renders: noise of neither renders nor references is left in it.
     """
     count = len(images)
     if count < 2:
         return None
     stack = np.stack(images).astype(np.float64)
     first, second = stack - references.first, stack - references.second
-    crossed = (first.sum(axis=0) * second.sum(axis=0) - (first * second).sum(axis=0)) / (count * (count - 1))
+    crossed = (first.sum(axis=0) * second.sum(axis=0) - (first * second).sum(axis=0)) / (
+        count * (count - 1)
+    )
     divisor = references.divisor()
-    return Decomposition(float((crossed / divisor).mean()), float((stack.var(axis=0, ddof=1) / divisor).mean()))
+    return Decomposition(
+        float((crossed / divisor).mean()), float((stack.var(axis=0, ddof=1) / divisor).mean())
+    )
 
 
 def efficiency(variance: float, seconds: float) -> float:
-    """1 / (variance x time), in 1/s: the same after any time for a method without memory; ``inf`` without variance."""
+    """1 / (variance x time), in 1/s: the same after any time for a method without memory; ``inf``
+    without variance."""
     return 1 / (variance * seconds) if variance * seconds > 0 else float("inf")
 
 
@@ -148,7 +165,8 @@ def efficiency(variance: float, seconds: float) -> float:
 def trimmed_mean(values: np.ndarray, share: float = TRIMMED_SHARE) -> float:
     """Mean without the given share of values, those of largest magnitude.
 
-    By magnitude, because products with noisy references are large with either sign: leaving out positive ones alone would bias the rest.
+    By magnitude, because products with noisy references are large with either sign: leaving out
+    positive ones alone would bias the rest.
     """
     values = np.ravel(values)
     kept = len(values) - int(np.ceil(share * len(values)))
@@ -156,19 +174,24 @@ def trimmed_mean(values: np.ndarray, share: float = TRIMMED_SHARE) -> float:
 
 
 def median_of_means(values: np.ndarray, groups: int = GROUPS) -> float:
-    """Median of the means of `groups` random groups of the values (always the same groups): a few outliers spoil a few groups only.
-    Below the mean where values are skewed."""
+    """Median of the means of `groups` random groups of the values (always the same groups): a few
+    outliers spoil a few groups only. Below the mean where values are skewed."""
     values = np.asarray(values, dtype=np.float64).ravel()
     order = np.random.default_rng(0).permutation(len(values))
-    return float(np.median([group.mean() for group in np.array_split(values[order], min(groups, len(values)))]))
+    return float(
+        np.median(
+            [group.mean() for group in np.array_split(values[order], min(groups, len(values)))]
+        )
+    )
 
 
 # --- FLIP -----------------------------------------------------------------------------------------------
 
 
 def flip(image: np.ndarray, references: References) -> tuple[float, np.ndarray] | None:
-    """NVIDIA's HDR-FLIP against the references' mean: its mean and its map, (H, W), in [0, 1]; ``None`` without the package
-    ``flip-evaluator``. What an eye would see when flipping between both, over a range of exposures that the reference needs."""
+    """NVIDIA's HDR-FLIP against the references' mean: its mean and its map, (H, W), in [0, 1];
+    ``None`` without the package ``flip-evaluator``. What an eye would see when flipping between
+    both, over a range of exposures that the reference needs."""
     try:
         import flip_evaluator
     except ImportError:
@@ -176,17 +199,26 @@ def flip(image: np.ndarray, references: References) -> tuple[float, np.ndarray] 
     reference = np.maximum(references.mean, 0).astype(np.float32)
     test = np.nan_to_num(np.maximum(image, 0), posinf=1e6).astype(np.float32)
     error_map, mean, _ = flip_evaluator.evaluate(reference, test, "HDR", applyMagma=False)
-    return float(mean), np.asarray(error_map)[..., 0] if np.ndim(error_map) == 3 else np.asarray(error_map)
+    return float(mean), np.asarray(error_map)[..., 0] if np.ndim(error_map) == 3 else np.asarray(
+        error_map
+    )
 
 
 def block_means(values: np.ndarray) -> np.ndarray:
-    """Means over the blocks of an image (H, W) that is cut into `BLOCKS` times `BLOCKS`; left over rows and columns are left out."""
+    """Means over the blocks of an image (H, W) that is cut into `BLOCKS` times `BLOCKS`; left over
+    rows and columns are left out."""
     height, width = (n // BLOCKS * BLOCKS for n in values.shape)
-    return values[:height, :width].reshape(BLOCKS, height // BLOCKS, BLOCKS, width // BLOCKS).mean(axis=(1, 3))
+    return (
+        values[:height, :width]
+        .reshape(BLOCKS, height // BLOCKS, BLOCKS, width // BLOCKS)
+        .mean(axis=(1, 3))
+    )
 
 
 def _smooth(image: np.ndarray) -> np.ndarray:
     """Mean over 3 x 3 pixels."""
     height, width = image.shape[:2]
     padded = np.pad(image, ((1, 1), (1, 1), (0, 0)), mode="edge")
-    return np.mean([padded[y : y + height, x : x + width] for y in range(3) for x in range(3)], axis=0)
+    return np.mean(
+        [padded[y : y + height, x : x + width] for y in range(3) for x in range(3)], axis=0
+    )

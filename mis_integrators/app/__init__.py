@@ -1,1 +1,2 @@
-"""The command ``mis-render``: options, the loop of a render, checkpoints, clusters, what is written."""
+"""The command ``mis-render``: options, the loop of a render, checkpoints, clusters, what is
+written."""

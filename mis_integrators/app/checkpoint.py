@@ -1,7 +1,9 @@
-"""The checkpoint of a render: its sums, the iterations in them, and of what they are, in one file that is whole or not there at all.
+"""The checkpoint of a render: its sums, the iterations in them, and of what they are, in one file
+that is whole or not there at all.
 
-The file is the line ``MAGIC``, the SHA-256 of all that follows, the length of the header (8 bytes, little-endian), the header (JSON, UTF-8) and
-the arrays' bytes one after the other, as the header lists them.
+The file is the line ``MAGIC``, the SHA-256 of all that follows, the length of the header (8 bytes,
+little-endian), the header (JSON, UTF-8) and the arrays' bytes one after the other, as the header
+lists them.
 """
 
 from __future__ import annotations
@@ -11,20 +13,22 @@ import json
 import math
 import os
 import stat
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Mapping
+from typing import Any
 
 import numpy as np
 
-from . import fingerprint, output
 from ..core.sums import Iterations
 from ..core.untrusted import Fields, Malformed, is_text, parse, shown
+from . import fingerprint, output
 
 MAGIC = b"mis-render checkpoint 1\n"
 _DIGEST_BYTES, _LENGTH_BYTES = 32, 8
 FASTEST = 1e-6
-"""Seconds that an iteration takes at least, however many machines there are: a checkpoint that claims more iterations is none."""
+"""Seconds that an iteration takes at least, however many machines there are: a checkpoint that
+claims more iterations is none."""
 
 
 class CheckpointError(Exception):
@@ -35,8 +39,9 @@ class CheckpointError(Exception):
 class Checkpoint:
     """What goes on when a render does.
 
-    ``identity`` is what the sums are of (see ``difference``), ``learned`` what the session had found out before its first iteration; both in
-    JSON's types. ``arrays`` (float64) are the sums over the iterations ``done``, which took so many ``seconds`` and so many of ``compiling``.
+    ``identity`` is what the sums are of (see ``difference``), ``learned`` what the session had
+    found out before its first iteration; both in JSON's types. ``arrays`` (float64) are the sums
+    over the iterations ``done``, which took so many ``seconds`` and so many of ``compiling``.
     """
 
     identity: Mapping[str, Any]
@@ -53,7 +58,8 @@ def beside(image: Path) -> Path:
 
 
 def write(path: Path, checkpoint: Checkpoint) -> None:
-    """Replace the checkpoint in one step. Raises ``OSError`` if it cannot be written; the one before is then still there."""
+    """Replace the checkpoint in one step. Raises ``OSError`` if it cannot be written; the one
+    before is then still there."""
     arrays = {name: np.ascontiguousarray(array, "<f8") for name, array in checkpoint.arrays.items()}
     header = json.dumps(
         {
@@ -65,7 +71,11 @@ def write(path: Path, checkpoint: Checkpoint) -> None:
             "arrays": {name: array.shape for name, array in arrays.items()},
         }
     ).encode()
-    body: list[Any] = [len(header).to_bytes(_LENGTH_BYTES, "little"), header, *(array.data for array in arrays.values() if array.size)]
+    body: list[Any] = [
+        len(header).to_bytes(_LENGTH_BYTES, "little"),
+        header,
+        *(array.data for array in arrays.values() if array.size),
+    ]
     digest = hashlib.sha256()
     for part in body:
         digest.update(part)
@@ -76,13 +86,16 @@ def write(path: Path, checkpoint: Checkpoint) -> None:
 
 
 def read(path: Path) -> Checkpoint:
-    """Read a checkpoint. Raises ``CheckpointError`` if it is damaged or none, ``OSError`` if it cannot be read."""
+    """Read a checkpoint. Raises ``CheckpointError`` if it is damaged or none, ``OSError`` if it
+    cannot be read."""
     # Opening a FIFO would wait for its writer.
     with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb") as file:
         if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
             raise CheckpointError(f"{path} is no checkpoint: it is not a regular file")
         if file.read(len(MAGIC)) != MAGIC:
-            raise CheckpointError(f"{path} is damaged, or no checkpoint of this version: it does not start as one")
+            raise CheckpointError(
+                f"{path} is damaged, or no checkpoint of this version: it does not start as one"
+            )
         digest, body = file.read(_DIGEST_BYTES), memoryview(file.read())
     if hashlib.sha256(body).digest() != digest:
         raise CheckpointError(f"{path} is damaged: its content does not have its checksum")
@@ -93,11 +106,14 @@ def read(path: Path) -> Checkpoint:
 
 
 def _of_body(body: memoryview) -> Checkpoint:
-    """The checkpoint of a file that has its checksum; whoever wrote it may have had other things in mind. Raises ``Malformed``."""
+    """The checkpoint of a file that has its checksum; whoever wrote it may have had other things in
+    mind. Raises ``Malformed``."""
     end = _LENGTH_BYTES + int.from_bytes(body[:_LENGTH_BYTES], "little")
     if end > len(body):
         raise Malformed("its header is longer than the file")
-    fields = Fields(parse(bytes(body[_LENGTH_BYTES:end]).decode(errors="replace"), "its header"), "its header")
+    fields = Fields(
+        parse(bytes(body[_LENGTH_BYTES:end]).decode(errors="replace"), "its header"), "its header"
+    )
     arrays = {}
     for name, shape in _shapes(fields).items():
         start, end = end, end + 8 * math.prod(shape)
@@ -114,7 +130,9 @@ def _of_body(body: memoryview) -> Checkpoint:
     for name, value in (("identity", identity), ("learned", learned)):
         if not isinstance(value, dict):
             raise fields.refuse(name, "an object")
-    checkpoint = Checkpoint(identity, learned, done, seconds, fields.number("compiling", positive=False), arrays)
+    checkpoint = Checkpoint(
+        identity, learned, done, seconds, fields.number("compiling", positive=False), arrays
+    )
     fields.finish()
     return checkpoint
 
@@ -122,7 +140,10 @@ def _of_body(body: memoryview) -> Checkpoint:
 def _shapes(fields: Fields) -> dict[str, tuple[int, ...]]:
     given = fields.any("arrays")
     if not isinstance(given, dict) or not all(
-        is_text(name) and isinstance(shape, list) and len(shape) <= 3 and all(type(n) is int and 0 <= n < 2**32 for n in shape)
+        is_text(name)
+        and isinstance(shape, list)
+        and len(shape) <= 3
+        and all(type(n) is int and 0 <= n < 2**32 for n in shape)
         for name, shape in given.items()
     ):
         raise fields.refuse("arrays", "the shapes of sums")
@@ -135,7 +156,10 @@ def _iterations(fields: Fields, seconds: float) -> Iterations:
     if not (isinstance(value, list) and len(value) == 2 and isinstance(value[1], list)):
         raise fields.refuse("done", allowed)
     below, beyond = value
-    if not all(type(n) is int and 0 <= n < 2**53 for n in (below, *beyond)) or below + len(beyond) > seconds / FASTEST:
+    if (
+        not all(type(n) is int and 0 <= n < 2**53 for n in (below, *beyond))
+        or below + len(beyond) > seconds / FASTEST
+    ):
         raise fields.refuse("done", allowed)
     try:
         return Iterations(below, tuple(beyond))
@@ -146,11 +170,15 @@ def _iterations(fields: Fields, seconds: float) -> Iterations:
 def difference(then: Mapping[str, Any], now: Mapping[str, Any]) -> str | None:
     """What differs between the render that a checkpoint is of and this one, or ``None``.
 
-    An identity has the names ``variant``, ``plugin``, ``files`` (of ``fingerprint.scene_digests``), ``variables``, ``settings`` (dictionaries),
-    and others that are compared as they are.
+    An identity has the names ``variant``, ``plugin``, ``files`` (of ``fingerprint.scene_digests``),
+    ``variables``, ``settings`` (dictionaries), and others that are compared as they are.
     """
     now = json.loads(json.dumps(now))
-    if missing := [group for group in ("files", "variables", "settings") if not isinstance(then.get(group), dict)]:
+    if missing := [
+        group
+        for group in ("files", "variables", "settings")
+        if not isinstance(then.get(group), dict)
+    ]:
         return f"it does not tell the {missing[0]}"
     if changed := fingerprint.changes(then["files"], now["files"]):
         return f"the scene has changed: {', '.join(map(shown, changed))}"

@@ -14,18 +14,26 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..core.session import Session
+from ..core.traits import unfinite_data
+from ..core.untrusted import Malformed
 from . import checkpoint, cluster, loading, output, reproduce
 from .checkpoint import Checkpoint, CheckpointError
-from .request import Request
 from .options import parse, versions
 from .progress import Progress
 from .render_loop import Chore, Clock, Interrupt, fewest_iterations, iterate
-from ..core.session import Session
+from .request import Request
 from .target_error import TargetError
-from ..core.traits import unfinite_data
-from ..core.untrusted import Malformed
 
-EXIT_OK, EXIT_SCENE, EXIT_USAGE, EXIT_OUTPUT, EXIT_CHECKPOINT, EXIT_CLUSTER, EXIT_INTERRUPTED = 0, 1, 2, 3, 4, 5, 130
+EXIT_OK, EXIT_SCENE, EXIT_USAGE, EXIT_OUTPUT, EXIT_CHECKPOINT, EXIT_CLUSTER, EXIT_INTERRUPTED = (
+    0,
+    1,
+    2,
+    3,
+    4,
+    5,
+    130,
+)
 
 
 class Failure(Exception):
@@ -37,11 +45,15 @@ class Failure(Exception):
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run ``mis-render`` with the arguments (default: those of the process) and return its exit code."""
+    """Run ``mis-render`` with the arguments (default: those of the process) and return its exit
+    code."""
     options = parse(arguments)
     interrupt = Interrupt()
     try:
-        with interrupt, np.errstate(all="ignore"):       # values that are not finite are left out, and said once
+        with (
+            interrupt,
+            np.errstate(all="ignore"),
+        ):  # values that are not finite are left out, and said once
             return _run(options, interrupt)
     except BaseException as error:
         # Libraries turn an interrupt that reaches them into errors of any kind.
@@ -60,21 +72,30 @@ def _run(options: argparse.Namespace, interrupt: Interrupt) -> int:
         try:
             stack.enter_context(output.alone(options.output))
         except OSError as error:
-            raise Failure(EXIT_OUTPUT, f"cannot write {options.output}: {error.strerror or error}") from error
+            raise Failure(
+                EXIT_OUTPUT, f"cannot write {options.output}: {error.strerror or error}"
+            ) from error
         try:
             return _render_alone(options, interrupt)
         except MemoryError as error:
-            raise Failure(EXIT_SCENE, f"{OUT_OF_MEMORY}; render a smaller film, or fewer light paths an iteration") from error
+            raise Failure(
+                EXIT_SCENE,
+                f"{OUT_OF_MEMORY}; render a smaller film, or fewer light paths an iteration",
+            ) from error
 
 
 def _render_alone(options: argparse.Namespace, interrupt: Interrupt) -> int:
     with contextlib.ExitStack() as stack:
         try:
             learned = _follow(options) if options.like else {}
-            needs_views = "--all-views" if options.all_views else "--frames" if options.frames else None
+            needs_views = (
+                "--all-views" if options.all_views else "--frames" if options.frames else None
+            )
             opened = _request(options).open(needs_views)
             for description in unfinite_data(opened.loaded.scene):
-                _warn(f"{description} (NaN or infinite): what they light or colour is left out of the image")
+                _warn(
+                    f"{description} (NaN or infinite): what they light or colour is left out of the image"
+                )
             session: Any = opened.session
             if learned:
                 _recall_image(session, learned, options)
@@ -88,20 +109,28 @@ def _render_alone(options: argparse.Namespace, interrupt: Interrupt) -> int:
                 client = stack.enter_context(cluster.connected(options.workers, options.scheduler))
                 threads = max(1, dr.thread_count() // options.workers) if options.workers else None
                 session = cluster.DistributedSession(client, opened, keep_variance, threads)
-            kept, broken = _render(session, opened.sensor, options, identity, clock, target, interrupt)
+            kept, broken = _render(
+                session, opened.sensor, options, identity, clock, target, interrupt
+            )
         except (*loading.SCENE_ERRORS, cluster.ClusterError) as error:
             raise _failure(error) from error
 
         metadata = _metadata(options, opened.loaded, session, clock)
-        metadata[reproduce.ATTRIBUTE] = reproduce.attribute(options, session, opened.session.learned)
+        metadata[reproduce.ATTRIBUTE] = reproduce.attribute(
+            options, session, opened.session.learned
+        )
         if pixels := session.unfinite_pixels():
             metadata["unfinitePixels"] = pixels
-            _warn(f"{pixels} pixels had values that are not finite (NaN or infinite) in some iterations; those values are left out")
+            _warn(
+                f"{pixels} pixels had values that are not finite (NaN or infinite) in some iterations; those values are left out"
+            )
         if target:
             target.update(session)
             metadata["relativeError"] = target.error
             if target.black:
-                _warn("the image is black, so that its relative error says nothing: is there light, and does the camera look at it?")
+                _warn(
+                    "the image is black, so that its relative error says nothing: is there light, and does the camera look at it?"
+                )
         # Before the workers are left, which may take long.
         written = _write(options, session, metadata, options.output, kept)
         for suffix in (".preview.exr", ".preview.png"):
@@ -112,7 +141,9 @@ def _render_alone(options: argparse.Namespace, interrupt: Interrupt) -> int:
     )
     if broken:
         failure = _failure(broken)
-        raise Failure(failure.code, f"{failure}; what was rendered before is written, {report}") from broken
+        raise Failure(
+            failure.code, f"{failure}; what was rendered before is written, {report}"
+        ) from broken
     if interrupt.requested:
         print(f"mis-render: interrupted after {report}", file=sys.stderr)
         return EXIT_INTERRUPTED
@@ -131,7 +162,10 @@ def _failure(error: BaseException) -> Failure:
     if isinstance(error, MemoryError):
         return Failure(EXIT_SCENE, OUT_OF_MEMORY)
     known = isinstance(error, loading.SCENE_ERRORS)
-    return Failure(EXIT_SCENE, loading.one_line(error) if known else f"{type(error).__name__}: {loading.one_line(error)}")
+    return Failure(
+        EXIT_SCENE,
+        loading.one_line(error) if known else f"{type(error).__name__}: {loading.one_line(error)}",
+    )
 
 
 def _warn(text: str) -> None:
@@ -206,15 +240,17 @@ def _render(
     target: TargetError | None,
     interrupt: Interrupt,
 ) -> tuple[Path | None, Exception | None]:
-    """Iterate as long as the options say; returns the checkpoint that holds all of it, if there is one, and the error that ended it after there was
-    enough for an image, if one did."""
+    """Iterate as long as the options say; returns the checkpoint that holds all of it, if there is
+    one, and the error that ended it after there was enough for an image, if one did."""
     width, height = sensor.film().crop_size()
     pixels = getattr(session, "pixels", width * height)
     if options.time and hasattr(session, "plan_time"):
         session.plan_time(options.time)
     planned = None if options.time else session.iterations_planned
     with (
-        Progress(lambda: pixels * session.samples_per_iteration, planned, options.time, options.quiet) as progress,
+        Progress(
+            lambda: pixels * session.samples_per_iteration, planned, options.time, options.quiet
+        ) as progress,
         dr.scoped_set_flag(dr.JitFlag.KernelHistory),
     ):
         asked = options.spp or sensor.sampler().sample_count()
@@ -224,12 +260,24 @@ def _render(
                 f"{planned} iterations of {session.samples_per_iteration}"
             )
         path = checkpoint.beside(options.output)
-        keep = Chore(str(path), options.checkpoint or math.inf, lambda: _keep(path, identity, session, clock), progress.warn)
+        keep = Chore(
+            str(path),
+            options.checkpoint or math.inf,
+            lambda: _keep(path, identity, session, clock),
+            progress.warn,
+        )
         preview = options.output.with_suffix(".preview.exr")
-        show = Chore(str(preview), options.preview or math.inf, lambda: _preview(session, options, preview), progress.warn)
+        show = Chore(
+            str(preview),
+            options.preview or math.inf,
+            lambda: _preview(session, options, preview),
+            progress.warn,
+        )
         broken = None
         try:
-            iterate(session, planned, options.time, target, clock, [keep, show], progress, interrupt)
+            iterate(
+                session, planned, options.time, target, clock, [keep, show], progress, interrupt
+            )
         except Exception as error:
             if session.iterations < fewest_iterations(session):
                 raise
@@ -243,7 +291,10 @@ def _render(
 def _keep(path: Path, identity: dict[str, Any], session: Session, clock: Clock) -> None:
     sums = session.sums
     checkpoint.write(
-        path, Checkpoint(identity, session.learned, sums.done, clock.rendering, clock.compiling, sums.arrays())
+        path,
+        Checkpoint(
+            identity, session.learned, sums.done, clock.rendering, clock.compiling, sums.arrays()
+        ),
     )
 
 
@@ -253,7 +304,10 @@ def _resume(options: argparse.Namespace, identity: dict[str, Any], session: Sess
     if not os.path.lexists(path):
         return Clock()
     if not options.resume:
-        raise Failure(EXIT_CHECKPOINT, f"{path} holds an earlier render: --resume goes on from it; remove it to start anew")
+        raise Failure(
+            EXIT_CHECKPOINT,
+            f"{path} holds an earlier render: --resume goes on from it; remove it to start anew",
+        )
     try:
         found = checkpoint.read(path)
         if what := checkpoint.difference(found.identity, identity):
@@ -261,10 +315,14 @@ def _resume(options: argparse.Namespace, identity: dict[str, Any], session: Sess
         session.recall(dict(found.learned))
         shapes = {name: array.shape for name, array in found.arrays.items()}
         if len(found.done) and shapes != session.sum_shapes():
-            raise CheckpointError(f"{path} is no checkpoint of this render: its sums have other names or shapes")
+            raise CheckpointError(
+                f"{path} is no checkpoint of this render: its sums have other names or shapes"
+            )
         session.sums.merge(found.arrays, found.done)
     except Malformed as error:
-        raise Failure(EXIT_CHECKPOINT, f"cannot resume: {path} is no checkpoint of this render: {error}") from error
+        raise Failure(
+            EXIT_CHECKPOINT, f"cannot resume: {path} is no checkpoint of this render: {error}"
+        ) from error
     except (CheckpointError, OSError, MemoryError) as error:
         raise Failure(EXIT_CHECKPOINT, f"cannot resume: {error or OUT_OF_MEMORY}") from error
     for written in (path, options.output, options.output.with_suffix(".png")):
@@ -282,7 +340,11 @@ def _preview(session: Any, options: argparse.Namespace, path: Path) -> None:
 
 
 def _write(
-    options: argparse.Namespace, session: Any, metadata: dict[str, str | int | float], path: Path, kept: Path | None
+    options: argparse.Namespace,
+    session: Any,
+    metadata: dict[str, str | int | float],
+    path: Path,
+    kept: Path | None,
 ) -> str:
     png, channels = path.with_suffix(".png"), session.channels
     views = session.view_images() if options.all_views or options.frames else []
@@ -300,8 +362,16 @@ def _write(
             written += f", {len(views)} frames from {output.frame_path(path, 0)}"
         return written
     except OSError as error:
-        rest = f"; {written} is written" if written else f"; {kept} holds what was rendered, for --resume" if kept else ""
-        raise Failure(EXIT_OUTPUT, f"cannot write {writing}: {error.strerror or error}{rest}") from error
+        rest = (
+            f"; {written} is written"
+            if written
+            else f"; {kept} holds what was rendered, for --resume"
+            if kept
+            else ""
+        )
+        raise Failure(
+            EXIT_OUTPUT, f"cannot write {writing}: {error.strerror or error}{rest}"
+        ) from error
 
 
 def _check_outputs(options: argparse.Namespace) -> None:

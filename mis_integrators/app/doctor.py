@@ -1,4 +1,5 @@
-"""What an installation consists of, and what is wrong with it: ``python -m mis_integrators doctor``.
+"""What an installation consists of, and what is wrong with it: ``python -m mis_integrators
+doctor``.
 
 Whatever may abort a process (an LLVM that is too old, a driver) is tried in a process of its own.
 """
@@ -13,9 +14,9 @@ import shutil
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Callable
 
 from .. import llvm
 
@@ -26,7 +27,8 @@ LEAST_MEMORY = 2.0
 LEAST_CACHE = 0.5
 """Gibibytes that the cache of compiled kernels wants."""
 
-# A closed box of reflectance 1/2 whose walls glow with radiance 1: with all bounces every pixel is 1 / (1 - 1/2) = 2.
+# A closed box of reflectance 1/2 whose walls glow with radiance 1: with all bounces every pixel is
+# 1 / (1 - 1/2) = 2.
 _PROBE = """
 import sys
 import mis_integrators, mitsuba as mi, numpy as np
@@ -45,7 +47,8 @@ _TOLERANCE = 0.05
 
 @dataclass(frozen=True)
 class Finding:
-    """A line of the report; ``advice`` (what to do) if there is something wrong, and whether that keeps the package from working."""
+    """A line of the report; ``advice`` (what to do) if there is something wrong, and whether that
+    keeps the package from working."""
 
     name: str
     text: str
@@ -69,7 +72,11 @@ def main() -> int:
 
 def versions() -> list[Finding]:
     """Python, the package, and what it depends on, against the versions that it asks for."""
-    findings = [Finding("python", f"{platform.python_version()} ({sys.executable}) on {platform.platform()}")]
+    findings = [
+        Finding(
+            "python", f"{platform.python_version()} ({sys.executable}) on {platform.platform()}"
+        )
+    ]
     for requirement in _requirements():
         name, ranges = re.findall(r"^([\w.-]+)\s*(.*)$", requirement.split(";")[0].strip())[0]
         try:
@@ -78,12 +85,23 @@ def versions() -> list[Finding]:
             findings.append(Finding(name, "is not installed", f"pip install '{name}{ranges}'"))
             continue
         advice = None if _satisfies(version, ranges) else f"pip install '{name}{ranges}'"
-        findings.append(Finding(name, f"{version}{'' if advice is None else f', but {ranges} is needed'}", advice))
+        findings.append(
+            Finding(
+                name, f"{version}{'' if advice is None else f', but {ranges} is needed'}", advice
+            )
+        )
     for name, extra in (("distributed", "cluster"), ("matplotlib", "bench")):
         try:
             findings.append(Finding(name, importlib.metadata.version(name)))
         except importlib.metadata.PackageNotFoundError:
-            findings.append(Finding(name, "is not installed", f"pip install 'mis-integrators[{extra}]' where it is wanted", fatal=False))
+            findings.append(
+                Finding(
+                    name,
+                    "is not installed",
+                    f"pip install 'mis-integrators[{extra}]' where it is wanted",
+                    fatal=False,
+                )
+            )
     return findings
 
 
@@ -95,7 +113,11 @@ def compiler() -> list[Finding]:
     tested = f"{llvm.OLDEST_WORKING} to {llvm.NEWEST_TESTED}"
     why = f"named by {llvm.VARIABLE}"
     if llvm.chosen:
-        why = f"the newest on this system of those tested ({tested})" if llvm.is_tested(llvm.chosen) else f"as there is none of those tested ({tested})"
+        why = (
+            f"the newest on this system of those tested ({tested})"
+            if llvm.is_tested(llvm.chosen)
+            else f"as there is none of those tested ({tested})"
+        )
     version = ".".join(map(str, dr.detail.llvm_version()))
     text = f"{version} from {named}, {why}" if named else f"{version}, which Dr.Jit found by itself"
     problem = llvm.problem()
@@ -106,19 +128,40 @@ def machine() -> list[Finding]:
     """Threads, memory, room for compiled kernels."""
     import drjit as dr
 
-    processors = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    findings = [Finding("threads", f"{dr.thread_count()} of Dr.Jit, {processors} processors that this process may use")]
+    processors = (
+        len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    )
+    findings = [
+        Finding(
+            "threads",
+            f"{dr.thread_count()} of Dr.Jit, {processors} processors that this process may use",
+        )
+    ]
     memory = _memory()
     if memory is not None:
         small = memory < LEAST_MEMORY
-        findings.append(Finding("memory", f"{memory:.1f} GiB free", "close other programs, or render smaller films" if small else None, fatal=False))
+        findings.append(
+            Finding(
+                "memory",
+                f"{memory:.1f} GiB free",
+                "close other programs, or render smaller films" if small else None,
+                fatal=False,
+            )
+        )
     cache = Path.home() / ".drjit"
     room = shutil.disk_usage(cache if cache.exists() else Path.home()).free / 2**30
     writable = os.access(cache if cache.exists() else Path.home(), os.W_OK)
     advice = None
     if not writable or room < LEAST_CACHE:
         advice = f"make {cache} writable, with {LEAST_CACHE} GiB of room; else all kernels are compiled anew"
-    findings.append(Finding("cache", f"{cache}, {room:.1f} GiB free{'' if writable else ', not writable'}", advice, fatal=False))
+    findings.append(
+        Finding(
+            "cache",
+            f"{cache}, {room:.1f} GiB free{'' if writable else ', not writable'}",
+            advice,
+            fatal=False,
+        )
+    )
     return findings
 
 
@@ -129,7 +172,11 @@ def variants() -> list[Finding]:
     findings = []
     for variant in TESTED:
         if variant not in mi.variants():
-            findings.append(Finding(variant, "is not in this build of Mitsuba", "use another variant", fatal=False))
+            findings.append(
+                Finding(
+                    variant, "is not in this build of Mitsuba", "use another variant", fatal=False
+                )
+            )
             continue
         if variant.startswith("llvm_") and llvm.problem():
             findings.append(Finding(variant, "is not tried without LLVM", "see LLVM above"))
@@ -145,18 +192,32 @@ def variants() -> list[Finding]:
 def probe(variant: str, plugin: str) -> tuple[str, str | None]:
     """What became of the tiny render, and what to do if it is wrong."""
     try:
-        done = subprocess.run([sys.executable, "-c", _PROBE, variant, plugin], capture_output=True, text=True, timeout=300)
+        done = subprocess.run(
+            [sys.executable, "-c", _PROBE, variant, plugin],
+            capture_output=True,
+            text=True,
+            timeout=300,
+        )
     except subprocess.TimeoutExpired:
-        return "rendering a tiny picture took more than 300 s", "look for other programs that keep the machine busy"
+        return (
+            "rendering a tiny picture took more than 300 s",
+            "look for other programs that keep the machine busy",
+        )
     if done.returncode < 0:
         name = signal.Signals(-done.returncode).name
-        return f"rendering a tiny picture ended by {name}", f"name another LLVM with {llvm.VARIABLE}; its last words: {_last_line(done.stderr)}"
+        return (
+            f"rendering a tiny picture ended by {name}",
+            f"name another LLVM with {llvm.VARIABLE}; its last words: {_last_line(done.stderr)}",
+        )
     if done.returncode:
         return "a tiny picture cannot be rendered", _last_line(done.stderr)
     brightness = float(done.stdout.split("brightness")[1])
     text = f"renders: a tiny picture with {plugin} has the brightness {brightness:.3f}"
     if abs(brightness - _EXPECTED) > _TOLERANCE * _EXPECTED:
-        return f"{text}, but {_EXPECTED:.3f} is right", f"name another LLVM with {llvm.VARIABLE}, and report this"
+        return (
+            f"{text}, but {_EXPECTED:.3f} is right",
+            f"name another LLVM with {llvm.VARIABLE}, and report this",
+        )
     return text, None
 
 
@@ -164,33 +225,50 @@ CHECKS: tuple[Callable[[], list[Finding]], ...] = (versions, compiler, machine, 
 
 
 def _requirements() -> list[str]:
-    """What the installed package asks for; of a checkout that is not installed, what its ``pyproject.toml`` does."""
+    """What the installed package asks for; of a checkout that is not installed, what its
+    ``pyproject.toml`` does."""
     try:
         return [r for r in importlib.metadata.requires("mis-integrators") or [] if "extra" not in r]
     except importlib.metadata.PackageNotFoundError:
         text = (Path(__file__).parents[2] / "pyproject.toml").read_text()
-        return re.findall(r'"([^"]+)"', re.findall(r"^dependencies = \[(.*?)\]", text, re.MULTILINE | re.DOTALL)[0])
+        return re.findall(
+            r'"([^"]+)"',
+            re.findall(r"^dependencies = \[(.*?)\]", text, re.MULTILINE | re.DOTALL)[0],
+        )
 
 
 def _satisfies(version: str, ranges: str) -> bool:
     """Whether a version is in ranges such as ``>=1.5.0,<1.6``."""
+
     def key(text: str) -> tuple[int, ...]:
         numbers = [int(part) for part in re.findall(r"^[\d.]*\d", text)[0].split(".")]
         return tuple(numbers + [0] * (4 - len(numbers)))
 
-    tests = {">=": lambda a, b: a >= b, "<": lambda a, b: a < b, "<=": lambda a, b: a <= b, ">": lambda a, b: a > b, "==": lambda a, b: a == b}
-    return all(tests[sign](key(version), key(bound)) for sign, bound in re.findall(r"(>=|<=|==|<|>)\s*([\d.]+)", ranges))
+    tests = {
+        ">=": lambda a, b: a >= b,
+        "<": lambda a, b: a < b,
+        "<=": lambda a, b: a <= b,
+        ">": lambda a, b: a > b,
+        "==": lambda a, b: a == b,
+    }
+    return all(
+        tests[sign](key(version), key(bound))
+        for sign, bound in re.findall(r"(>=|<=|==|<|>)\s*([\d.]+)", ranges)
+    )
 
 
 def _memory() -> float | None:
-    """Gibibytes that are free, under the limit of a container if there is one; ``None`` where the system does not tell."""
+    """Gibibytes that are free, under the limit of a container if there is one; ``None`` where the
+    system does not tell."""
     try:
         lines = Path("/proc/meminfo").read_text().splitlines()
     except OSError:
         return None
     free = next(float(line.split()[1]) / 2**20 for line in lines if line.startswith("MemAvailable"))
     try:
-        limit, used = (Path("/sys/fs/cgroup", name).read_text() for name in ("memory.max", "memory.current"))
+        limit, used = (
+            Path("/sys/fs/cgroup", name).read_text() for name in ("memory.max", "memory.current")
+        )
         return min(free, (int(limit) - int(used)) / 2**30)
     except (OSError, ValueError):
         return free

@@ -1,4 +1,5 @@
-"""What an image is made of, by content: the scene's file, those it includes, every file that any of them names, and this package's own sources."""
+"""What an image is made of, by content: the scene's file, those it includes, every file that any of
+them names, and this package's own sources."""
 
 from __future__ import annotations
 
@@ -8,20 +9,23 @@ import html
 import os
 import re
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Mapping
 
 import mitsuba as mi
 
 
 def scene_digests(path: Path, variables: Mapping[str, str]) -> dict[str, str]:
-    """SHA-256 of the scene file and of all files that it refers to, by the name under which it does; ``variables`` are the values of its
-    ``$variables``. Call it after the scene was loaded: the folders in which Mitsuba looks for files are those that it then knows.
+    """SHA-256 of the scene file and of all files that it refers to, by the name under which it
+    does; ``variables`` are the values of its ``$variables``. Call it after the scene was loaded:
+    the folders in which Mitsuba looks for files are those that it then knows.
     """
     state = mi.parser.parse_file(mi.parser.ParserConfig(mi.variant()), str(path), **variables)
     sources = [Path(str(file)) for file in state.files]
     elements = [element for file in sources for element in _elements(file)]
-    values = {given.get("name", ""): given.get("value", "") for tag, given in elements if tag == "default"}
+    values = {
+        given.get("name", ""): given.get("value", "") for tag, given in elements if tag == "default"
+    }
     values.update(variables)
     resolver = mi.file_resolver()
     named = {}
@@ -29,7 +33,9 @@ def scene_digests(path: Path, variables: Mapping[str, str]) -> dict[str, str]:
         for attribute in (given.get("value"), given.get("filename")):
             name = _substituted(attribute or "", values)
             file = str(resolver.resolve(name)) if name else ""
-            if os.path.isfile(file):                     # false, too, for spectra and matrices that are no possible names
+            if os.path.isfile(
+                file
+            ):  # false, too, for spectra and matrices that are no possible names
                 named[name] = Path(file)
     named.update({_name(file, path): file for file in sources})
     return {name: _digest(file) for name, file in sorted(named.items())}
@@ -37,7 +43,8 @@ def scene_digests(path: Path, variables: Mapping[str, str]) -> dict[str, str]:
 
 @functools.cache
 def of_package() -> str:
-    """The first 12 digits of the SHA-256 of all source files of this package: two states of it may make two images."""
+    """The first 12 digits of the SHA-256 of all source files of this package: two states of it may
+    make two images."""
     root = Path(__file__).parents[1]
     digest = hashlib.sha256()
     for file in sorted(file for pattern in ("*.py", "*.json") for file in root.rglob(pattern)):
@@ -55,14 +62,23 @@ def changes(then: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
 
 
 def _elements(file: Path) -> list[tuple[str, Mapping[str, str]]]:
-    """Tags and attributes of an XML file; as in Mitsuba's parser, it need not be well-formed (``--`` in comments)."""
+    """Tags and attributes of an XML file; as in Mitsuba's parser, it need not be well-formed
+    (``--`` in comments)."""
     try:
         return [(element.tag, element.attrib) for element in ElementTree.parse(file).iter()]
     except ElementTree.ParseError:
-        text = re.sub(r"<!--.*?-->", "", file.read_text(encoding="utf-8", errors="replace"), flags=re.DOTALL)
+        text = re.sub(
+            r"<!--.*?-->", "", file.read_text(encoding="utf-8", errors="replace"), flags=re.DOTALL
+        )
         elements = re.findall(rf"<(\w+)((?:\s+{_ATTRIBUTE})*)", text)
-        assignments = [(tag, [given.partition("=") for given in re.findall(_ATTRIBUTE, rest)]) for tag, rest in elements]
-        return [(tag, {name.strip(): html.unescape(value.strip()[1:-1]) for name, _, value in given}) for tag, given in assignments]
+        assignments = [
+            (tag, [given.partition("=") for given in re.findall(_ATTRIBUTE, rest)])
+            for tag, rest in elements
+        ]
+        return [
+            (tag, {name.strip(): html.unescape(value.strip()[1:-1]) for name, _, value in given})
+            for tag, given in assignments
+        ]
 
 
 _ATTRIBUTE = r"""[\w:.-]+\s*=\s*(?:"[^"]*"|'[^']*')"""
@@ -70,7 +86,11 @@ _ATTRIBUTE = r"""[\w:.-]+\s*=\s*(?:"[^"]*"|'[^']*')"""
 
 def _name(file: Path, scene: Path) -> str:
     folder = scene.resolve().parent
-    return str(file.resolve().relative_to(folder)) if file.resolve().is_relative_to(folder) else str(file)
+    return (
+        str(file.resolve().relative_to(folder))
+        if file.resolve().is_relative_to(folder)
+        else str(file)
+    )
 
 
 def _substituted(text: str, values: Mapping[str, str]) -> str:

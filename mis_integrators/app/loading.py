@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Iterable, Mapping
+from typing import Any
 
 import mitsuba as mi
 
@@ -46,16 +47,18 @@ def load(
 ) -> LoadedScene:
     """Load the scene of an XML file under the active variant.
 
-    ``variables`` are the values of the scene's ``$variables``. ``plugin`` replaces its integrator, which
-    hands on the parameters ``INHERITED``; ``parameters`` are then set on the integrator, replaced or not.
-    Raises one of ``SCENE_ERRORS`` (see ``one_line``).
+    ``variables`` are the values of the scene's ``$variables``. ``plugin`` replaces its integrator,
+    which hands on the parameters ``INHERITED``; ``parameters`` are then set on the integrator,
+    replaced or not. Raises one of ``SCENE_ERRORS`` (see ``one_line``).
     """
     config = mi.parser.ParserConfig(mi.variant())
     state = mi.parser.parse_file(config, str(path), **variables)
     if state.root.type != mi.ObjectType.Scene:
         raise RuntimeError(f'"{path}" is not a scene')
     mi.file_resolver().prepend(str(path.parent))
-    _keep_out_foreign_libraries([node.props.plugin_name() for node in state.nodes] + ([plugin] if plugin else []))
+    _keep_out_foreign_libraries(
+        [node.props.plugin_name() for node in state.nodes] + ([plugin] if plugin else [])
+    )
     mi.parser.transform_all(config, state)
     node = _integrator_node(state) or _add_integrator(state)
     if plugin:
@@ -77,7 +80,8 @@ def load(
 
 
 def parse_value(text: str) -> Value:
-    """The value that a text means: an integer (up to ``LARGEST_INTEGER``), a float, a boolean (``true``, ``false``), else the text."""
+    """The value that a text means: an integer (up to ``LARGEST_INTEGER``), a float, a boolean
+    (``true``, ``false``), else the text."""
     if text.lower() in ("true", "false"):
         return text.lower() == "true"
     for kind in (int, float):
@@ -91,7 +95,8 @@ def parse_value(text: str) -> Value:
 
 
 def one_line(error: BaseException) -> str:
-    """The message of an error in one line, without the Python traceback that Mitsuba includes in its own."""
+    """The message of an error in one line, without the Python traceback that Mitsuba includes in
+    its own."""
     while error.__cause__:
         error = error.__cause__
     text = re.sub(r"^\[[\w.]+:\d+\] ", "", str(error))
@@ -106,28 +111,39 @@ def one_line(error: BaseException) -> str:
 
 
 def _keep_out_foreign_libraries(names: list[str]) -> None:
-    """See to it that plugins come from Mitsuba's own folder, whatever lies beside the scene or in the current folder.
+    """See to it that plugins come from Mitsuba's own folder, whatever lies beside the scene or in
+    the current folder.
 
-    Mitsuba loads a plugin from the first folder of its file resolver that has ``plugins`` with a library of that name. Where it would not find its own
-    one, that is loaded now, and stays. Raises ``RuntimeError`` where one of the ``names`` is more than a name, or where there is a library for a
-    plugin that is none of Mitsuba's.
+    Mitsuba loads a plugin from the first folder of its file resolver that has ``plugins`` with a
+    library of that name. Where it would not find its own one, that is loaded now, and stays. Raises
+    ``RuntimeError`` where one of the ``names`` is more than a name, or where there is a library for
+    a plugin that is none of Mitsuba's.
     """
     for name in names:
         if not re.fullmatch(r"[A-Za-z0-9_]+", name):
-            raise RuntimeError(f'{name!r} is not the name of a plugin: only letters, digits and "_" are allowed')
+            raise RuntimeError(
+                f'{name!r} is not the name of a plugin: only letters, digits and "_" are allowed'
+            )
     own = {library.stem: library for library in (MITSUBA / "plugins").iterdir()}
     suffix = next(iter(own.values())).suffix
     for name in sorted({*names, *PLUGINS} - set(own)):
         if library := _foreign_library(f"{name}{suffix}"):
-            raise RuntimeError(f'{library} is not loaded for the plugin "{name}": only plugins in Mitsuba\'s own folder are; remove this file')
+            raise RuntimeError(
+                f'{library} is not loaded for the plugin "{name}": only plugins in Mitsuba\'s own folder are; remove this file'
+            )
     _load_own([name for name, library in own.items() if _foreign_library(library.name)])
 
 
 def _foreign_library(file_name: str) -> str | None:
-    """The library of that name that Mitsuba would load from another folder than its own, if there is one."""
+    """The library of that name that Mitsuba would load from another folder than its own, if there
+    is one."""
     found = str(mi.file_resolver().resolve(f"plugins/{file_name}"))
     own = MITSUBA / "plugins" / file_name
-    return found if os.path.exists(found) and not (own.exists() and os.path.samefile(found, own)) else None
+    return (
+        found
+        if os.path.exists(found) and not (own.exists() and os.path.samefile(found, own))
+        else None
+    )
 
 
 def _load_own(names: Iterable[str]) -> None:
@@ -146,7 +162,8 @@ def _load_own(names: Iterable[str]) -> None:
 
 
 def _integrator_node(state: Any) -> Any:
-    """The node of the scene's integrator, which is no part of another integrator; ``None`` if it has none."""
+    """The node of the scene's integrator, which is no part of another integrator; ``None`` if it
+    has none."""
     nodes = [node for node in state.nodes if node.type == mi.ObjectType.Integrator]
     inner = {index for node in nodes for index in _children(node)}
     outer = [
@@ -180,13 +197,17 @@ def _nested_integrators(state: Any, node: Any) -> list[Any]:
 def _children(node: Any) -> list[int]:
     """Indices of the nodes that a node contains."""
     return [
-        value.index() for _, value in _items(node.props) if isinstance(value, mi.Properties.ResolvedReference)
+        value.index()
+        for _, value in _items(node.props)
+        if isinstance(value, mi.Properties.ResolvedReference)
     ]
 
 
 def _plain(props: Any) -> dict[str, Value]:
     """The properties that are numbers or texts, by name."""
-    return {name: value for name, value in _items(props) if isinstance(value, (bool, int, float, str))}
+    return {
+        name: value for name, value in _items(props) if isinstance(value, (bool, int, float, str))
+    }
 
 
 def _items(props: Any) -> list[tuple[str, Any]]:
@@ -201,8 +222,11 @@ def _properties(plugin: str, values: Mapping[str, Value]) -> mi.Properties:
     return props
 
 
-def _known_to(plugin: str, values: Mapping[str, Value], parameters: Mapping[str, Value]) -> dict[str, Value]:
-    """Those of the values that the integrator asks for when it is built with these parameters, without which it may not be built at all."""
+def _known_to(
+    plugin: str, values: Mapping[str, Value], parameters: Mapping[str, Value]
+) -> dict[str, Value]:
+    """Those of the values that the integrator asks for when it is built with these parameters,
+    without which it may not be built at all."""
     props = _properties(plugin, {**values, **parameters})
     try:
         mi.PluginManager.instance().create_object(props)

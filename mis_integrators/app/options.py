@@ -9,8 +9,8 @@ import drjit as dr
 import mitsuba as mi
 
 from .. import __version__
-from . import fingerprint, loading
 from ..core.untrusted import shown
+from . import fingerprint, loading
 
 LARGEST_SEED = 2**32 - 1
 MOST_SAMPLES = 2**31 - 1
@@ -31,7 +31,8 @@ _EXIT_CODES = """exit codes:
 
 
 def parse(arguments: list[str] | None) -> argparse.Namespace:
-    """The options that the arguments give (default: those of the process); exits with status 2 where they are wrong."""
+    """The options that the arguments give (default: those of the process); exits with status 2
+    where they are wrong."""
     parser = argparse.ArgumentParser(
         prog="mis-render",
         description="Render a Mitsuba scene to an EXR file, and a tone-mapped PNG beside it.",
@@ -40,40 +41,110 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     )
     add = parser.add_argument
     add("scene", type=Path, metavar="SCENE.xml")
-    add("-o", dest="output", type=Path, metavar="FILE.exr", help="the image (default: beside the scene, with the scene's name)")
-    add("-i", dest="plugin", metavar="PLUGIN", help=f"replace the scene's integrator, keeping its {', '.join(loading.INHERITED)}")
-    for flag, name, what in (("-D", "var", "one of the scene's $variables"), ("-P", "param", "a parameter of the integrator")):
-        add(flag, dest="variables" if flag == "-D" else "parameters", action="append", default=[], type=_assignment,
-            metavar=f"{name}=value", help=f"set {what}")
+    add(
+        "-o",
+        dest="output",
+        type=Path,
+        metavar="FILE.exr",
+        help="the image (default: beside the scene, with the scene's name)",
+    )
+    add(
+        "-i",
+        dest="plugin",
+        metavar="PLUGIN",
+        help=f"replace the scene's integrator, keeping its {', '.join(loading.INHERITED)}",
+    )
+    for flag, name, what in (
+        ("-D", "var", "one of the scene's $variables"),
+        ("-P", "param", "a parameter of the integrator"),
+    ):
+        add(
+            flag,
+            dest="variables" if flag == "-D" else "parameters",
+            action="append",
+            default=[],
+            type=_assignment,
+            metavar=f"{name}=value",
+            help=f"set {what}",
+        )
     length = parser.add_mutually_exclusive_group()
-    length.add_argument("--spp", type=_samples, metavar="N", help="samples per pixel (default: the scene's sample_count)")
-    length.add_argument("--time", type=_positive_number, metavar="SECONDS",
-                        help="render for so long, at least one iteration; compiling kernels does not count")
-    add("--target-error", type=_positive_number, metavar="E",
+    length.add_argument(
+        "--spp",
+        type=_samples,
+        metavar="N",
+        help="samples per pixel (default: the scene's sample_count)",
+    )
+    length.add_argument(
+        "--time",
+        type=_positive_number,
+        metavar="SECONDS",
+        help="render for so long, at least one iteration; compiling kernels does not count",
+    )
+    add(
+        "--target-error",
+        type=_positive_number,
+        metavar="E",
         help="stop when the estimated relative error of the image is E or less, such as 0.05: the root mean square over the pixels of standard "
-        "deviation over brightness, without the worst 0.1 %% of the pixels; --spp or --time are then upper bounds, and there is none without them")
-    add("--like", type=Path, metavar="FILE.exr",
+        "deviation over brightness, without the worst 0.1 %% of the pixels; --spp or --time are then upper bounds, and there is none without them",
+    )
+    add(
+        "--like",
+        type=Path,
+        metavar="FILE.exr",
         help="render again what this image of mis-render shows: with its integrator, parameters, seed and samples, and what was found out for it, such "
-        "as merge radii; the scene must be the same")
+        "as merge radii; the scene must be the same",
+    )
     add("--seed", type=_seed, metavar="S", help="seed of the random numbers (default: 0)")
-    add("--sensor", type=_sensor, default=None, metavar="N", help="index of the sensor (default: 0)")
-    add("--all-views", action="store_true",
-        help="render all views of the scene together (all sensors, and the children of a batch) into a contact sheet")
-    add("--frames", action="store_true", help="also write each view, FILE.000.png and so on: frames of an animation")
-    add("--variant", choices=mi.variants(), metavar="V", help="Mitsuba's variant (default: llvm_ad_rgb)")
-    add("--checkpoint", type=_positive_number, metavar="SECONDS",
-        help="keep what has been rendered in FILE.checkpoint, every so many seconds and at the end")
-    add("--resume", action="store_true",
+    add(
+        "--sensor", type=_sensor, default=None, metavar="N", help="index of the sensor (default: 0)"
+    )
+    add(
+        "--all-views",
+        action="store_true",
+        help="render all views of the scene together (all sensors, and the children of a batch) into a contact sheet",
+    )
+    add(
+        "--frames",
+        action="store_true",
+        help="also write each view, FILE.000.png and so on: frames of an animation",
+    )
+    add(
+        "--variant",
+        choices=mi.variants(),
+        metavar="V",
+        help="Mitsuba's variant (default: llvm_ad_rgb)",
+    )
+    add(
+        "--checkpoint",
+        type=_positive_number,
+        metavar="SECONDS",
+        help="keep what has been rendered in FILE.checkpoint, every so many seconds and at the end",
+    )
+    add(
+        "--resume",
+        action="store_true",
         help="go on from FILE.checkpoint if there is one, with the same scene and settings; --spp, --time and --target-error may differ, and "
-        "--time counts what was rendered before. Implies --checkpoint 60")
-    add("--preview", type=_positive_number, metavar="SECONDS",
-        help="write the image so far to FILE.preview.exr and .png every so many seconds, until the image is there")
+        "--time counts what was rendered before. Implies --checkpoint 60",
+    )
+    add(
+        "--preview",
+        type=_positive_number,
+        metavar="SECONDS",
+        help="write the image so far to FILE.preview.exr and .png every so many seconds, until the image is there",
+    )
     where = parser.add_mutually_exclusive_group()
-    where.add_argument("--workers", type=_workers, metavar="N",
-                       help="spread the iterations over so many processes of this machine; --time then includes their compiling")
-    where.add_argument("--scheduler", metavar="ADDRESS",
-                       help="spread the iterations over the workers of a Dask cluster, such as tcp://host:8786, which must find the scene under "
-                       "the same path")
+    where.add_argument(
+        "--workers",
+        type=_workers,
+        metavar="N",
+        help="spread the iterations over so many processes of this machine; --time then includes their compiling",
+    )
+    where.add_argument(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="spread the iterations over the workers of a Dask cluster, such as tcp://host:8786, which must find the scene under "
+        "the same path",
+    )
     add("--quiet", action="store_true", help="print errors only")
     add("--version", action="version", version=versions())
     options = parser.parse_args(arguments)
@@ -85,9 +156,18 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     if options.all_views and options.sensor is not None:
         parser.error("argument --sensor: not allowed with argument --all-views")
     if options.like:
-        told = {"-i": options.plugin, "-D": options.variables or None, "-P": options.parameters or None, "--spp": options.spp, "--time": options.time,
-                "--target-error": options.target_error, "--seed": options.seed, "--sensor": options.sensor, "--all-views": options.all_views or None,
-                "--variant": options.variant}
+        told = {
+            "-i": options.plugin,
+            "-D": options.variables or None,
+            "-P": options.parameters or None,
+            "--spp": options.spp,
+            "--time": options.time,
+            "--target-error": options.target_error,
+            "--seed": options.seed,
+            "--sensor": options.sensor,
+            "--all-views": options.all_views or None,
+            "--variant": options.variant,
+        }
         for flag, value in told.items():
             if value is not None:
                 parser.error(f"argument {flag}: not allowed with argument --like")
@@ -116,7 +196,7 @@ def _assignment(text: str) -> tuple[str, str]:
 def _integer_between(text: str, low: int, high: int) -> int:
     try:
         value = int(text)
-    except ValueError:           # of thousands of digits, too
+    except ValueError:  # of thousands of digits, too
         value = low - 1
     if not low <= value <= high:
         raise argparse.ArgumentTypeError(f"{shown(text)} is not an integer from {low} to {high}")

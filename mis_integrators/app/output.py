@@ -10,8 +10,8 @@ import socket
 import stat
 import tempfile
 import time
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Iterator, Mapping, Sequence
 
 import mitsuba as mi
 import numpy as np
@@ -26,16 +26,18 @@ LEFT_OVER = 86400.0
 
 
 def make_writable(path: Path) -> None:
-    """Create the folder of a file if needed, and raise ``OSError`` if the file cannot be written there."""
+    """Create the folder of a file if needed, and raise ``OSError`` if the file cannot be written
+    there."""
     path.parent.mkdir(parents=True, exist_ok=True)
     _temporary(target_of(path)).unlink()
 
 
 def target_of(path: Path) -> Path:
-    """The file that writing ``path`` replaces: what it links to, if it is a link. Raises ``OSError`` for what is there and is not a regular file."""
+    """The file that writing ``path`` replaces: what it links to, if it is a link. Raises
+    ``OSError`` for what is there and is not a regular file."""
     try:
         target = path.resolve()
-    except RuntimeError as error:                # links in a circle, before Python 3.13
+    except RuntimeError as error:  # links in a circle, before Python 3.13
         raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), str(path)) from error
     try:
         mode = target.stat().st_mode
@@ -50,29 +52,36 @@ def target_of(path: Path) -> Path:
 
 @contextlib.contextmanager
 def alone(path: Path) -> Iterator[None]:
-    """No other process writes ``path`` in this way during the block: a lock file beside it names the one that does.
+    """No other process writes ``path`` in this way during the block: a lock file beside it names
+    the one that does.
 
-    Raises ``BlockingIOError``, which says who it is, if another process does. The system gives the lock up with the process; file systems that know no
-    locks have none.
+    Raises ``BlockingIOError``, which says who it is, if another process does. The system gives the
+    lock up with the process; file systems that know no locks have none.
     """
     lock = target_of(path)
     lock = lock.with_name(f".{lock.name}.lock")
     while True:
         # Not through a link, and without waiting for the writer of a FIFO.
-        descriptor = os.open(lock, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, 0o666)
+        descriptor = os.open(
+            lock, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, 0o666
+        )
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             owner = os.read(descriptor, 200).decode(errors="replace").strip()
             os.close(descriptor)
             owner = owner if owner.isprintable() and owner else "another process"
-            raise BlockingIOError(errno.EWOULDBLOCK, f"{owner} is rendering it; choose another file, or wait", str(path)) from None
+            raise BlockingIOError(
+                errno.EWOULDBLOCK,
+                f"{owner} is rendering it; choose another file, or wait",
+                str(path),
+            ) from None
         except OSError:
-            break                                # no locks here
+            break  # no locks here
         with contextlib.suppress(FileNotFoundError):
             if os.path.samestat(os.fstat(descriptor), os.stat(lock)):
                 break
-        os.close(descriptor)                     # its owner has removed it meanwhile
+        os.close(descriptor)  # its owner has removed it meanwhile
     try:
         os.ftruncate(descriptor, 0)
         os.write(descriptor, f"process {os.getpid()} on {socket.gethostname()}\n".encode())
@@ -83,16 +92,25 @@ def alone(path: Path) -> Iterator[None]:
 
 
 def write_exr(
-    path: Path, image: np.ndarray, channels: Sequence[str], metadata: Mapping[str, str | int | float]
+    path: Path,
+    image: np.ndarray,
+    channels: Sequence[str],
+    metadata: Mapping[str, str | int | float],
 ) -> None:
-    """Write an image of shape (H, W, C) with named channels as float32, and the metadata as attributes; integers beyond the 32 bits of
-    OpenEXR's become text.
+    """Write an image of shape (H, W, C) with named channels as float32, and the metadata as
+    attributes; integers beyond the 32 bits of OpenEXR's become text.
 
     Raises ``OSError`` if it cannot be written; a file that was there before is then still whole.
     """
-    attributes = {name: str(value) if isinstance(value, int) and not -(2**31) <= value < 2**31 else value for name, value in metadata.items()}
+    attributes = {
+        name: str(value) if isinstance(value, int) and not -(2**31) <= value < 2**31 else value
+        for name, value in metadata.items()
+    }
     header = {**attributes, "compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    planes = {name: np.ascontiguousarray(image[..., i], dtype=np.float32) for i, name in enumerate(channels)}
+    planes = {
+        name: np.ascontiguousarray(image[..., i], dtype=np.float32)
+        for i, name in enumerate(channels)
+    }
     with replacing(path) as temporary:
         try:
             OpenEXR.File(header, planes).write(str(temporary))
@@ -101,17 +119,20 @@ def write_exr(
 
 
 def write_png(path: Path, image: np.ndarray, channels: Sequence[str]) -> bool:
-    """Write the colour channels of an image of shape (H, W, C) as sRGB, clipped to [0, 1], without alpha.
+    """Write the colour channels of an image of shape (H, W, C) as sRGB, clipped to [0, 1], without
+    alpha.
 
-    Values that are no numbers become black. Returns ``False``, and writes nothing, if the image has no colour
-    channels (a film of spectral bands). Raises ``OSError`` as ``write_exr`` does.
+    Values that are no numbers become black. Returns ``False``, and writes nothing, if the image has
+    no colour channels (a film of spectral bands). Raises ``OSError`` as ``write_exr`` does.
     """
     for names, pixel_format in _PICTURES:
         if set(names) <= set(channels):
             break
     else:
         return False
-    picture = np.nan_to_num(image[..., [channels.index(name) for name in names]], posinf=1).astype(np.float32)
+    picture = np.nan_to_num(image[..., [channels.index(name) for name in names]], posinf=1).astype(
+        np.float32
+    )
     formats = mi.Bitmap.PixelFormat
     bitmap = mi.Bitmap(picture, getattr(formats, pixel_format)).convert(
         formats.Y if pixel_format == "Y" else formats.RGB, mi.Struct.Type.UInt8, srgb_gamma=True
@@ -125,7 +146,8 @@ def write_png(path: Path, image: np.ndarray, channels: Sequence[str]) -> bool:
 
 
 def contact_sheet(images: Sequence[np.ndarray]) -> np.ndarray:
-    """Images of shape (H, W, C) row by row on one that is about square, black between images that are smaller than the largest."""
+    """Images of shape (H, W, C) row by row on one that is about square, black between images that
+    are smaller than the largest."""
     height, width = (max(image.shape[axis] for image in images) for axis in (0, 1))
     columns = max(1, round((len(images) * height / width) ** 0.5))
     rows = -(-len(images) // columns)
@@ -143,10 +165,11 @@ def frame_path(path: Path, number: int) -> Path:
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A temporary path beside ``path`` that replaces it at once when the block ends without an error, and is on the disk by then. Where ``path`` is a
-    link, what it links to is replaced.
+    """A temporary path beside ``path`` that replaces it at once when the block ends without an
+    error, and is on the disk by then. Where ``path`` is a link, what it links to is replaced.
 
-    Raises ``OSError`` if it cannot be written, or is not a regular file; what was there before is then still there.
+    Raises ``OSError`` if it cannot be written, or is not a regular file; what was there before is
+    then still there.
     """
     target = target_of(path)
     temporary = _temporary(target)
@@ -162,15 +185,17 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def remove_leftovers(path: Path) -> None:
-    """Remove what writers of ``path`` have left that were killed while they wrote: on this machine those whose process is gone, and of other machines
-    what is old. Call it while ``alone``."""
+    """Remove what writers of ``path`` have left that were killed while they wrote: on this machine
+    those whose process is gone, and of other machines what is old. Call it while ``alone``."""
     target = target_of(path)
     for temporary in target.parent.glob(f".{glob.escape(target.name)}.*.part"):
-        writer = re.fullmatch(r"(?:(\w+)-(\d{1,9})-\w+|\d+)\.part", temporary.name[len(target.name) + 2 :])
+        writer = re.fullmatch(
+            r"(?:(\w+)-(\d{1,9})-\w+|\d+)\.part", temporary.name[len(target.name) + 2 :]
+        )
         with contextlib.suppress(FileNotFoundError):
             if writer is None:
-                continue                         # none of ours
-            if writer[1] in (None, _host()):     # None: of an earlier version
+                continue  # none of ours
+            if writer[1] in (None, _host()):  # None: of an earlier version
                 gone = writer[1] is None or _is_gone(int(writer[2]))
             else:
                 gone = time.time() - temporary.stat().st_mtime > LEFT_OVER
@@ -214,6 +239,8 @@ def _host() -> str:
 
 def _temporary(path: Path) -> Path:
     """A new file beside ``path``, whose name tells whose it is."""
-    descriptor, name = tempfile.mkstemp(".part", f".{path.name}.{_host()}-{os.getpid()}-", path.parent)
+    descriptor, name = tempfile.mkstemp(
+        ".part", f".{path.name}.{_host()}-{os.getpid()}-", path.parent
+    )
     os.close(descriptor)
     return Path(name)

@@ -13,11 +13,14 @@ SECONDS_BETWEEN_LINES = 5.0
 class Progress:
     """Progress on standard error as a context: iterations, camera paths a second, time left.
 
-    ``paths`` tells the camera paths of one iteration, which the first one may decide. ``planned`` iterations or ``seconds`` of rendering,
-    whichever is given, are the whole; with neither, only what ``update`` is told. Nothing is shown if ``quiet``.
+    ``paths`` tells the camera paths of one iteration, which the first one may decide. ``planned``
+    iterations or ``seconds`` of rendering, whichever is given, are the whole; with neither, only
+    what ``update`` is told. Nothing is shown if ``quiet``.
     """
 
-    def __init__(self, paths: Callable[[], int], planned: int | None, seconds: float | None, quiet: bool):
+    def __init__(
+        self, paths: Callable[[], int], planned: int | None, seconds: float | None, quiet: bool
+    ):
         self._paths, self._planned, self._seconds, self._quiet = paths, planned, seconds, quiet
         self._last_line = time.monotonic()
         self._console = rich.console.Console(file=sys.stderr, quiet=quiet, highlight=False)
@@ -42,15 +45,23 @@ class Progress:
 
     def warn(self, text: str) -> None:
         """Print one line, even if all else is to be quiet."""
-        rich.console.Console(file=sys.stderr, highlight=False).print(f"mis-render: {text}", soft_wrap=True, markup=False)
+        rich.console.Console(file=sys.stderr, highlight=False).print(
+            f"mis-render: {text}", soft_wrap=True, markup=False
+        )
 
     def update(self, iterations: int, rendering: float, share: float | None = None) -> None:
-        """Show that so many iterations are done, after so many seconds of rendering; ``share`` of the work, if that is known better than by
-        those, is done."""
+        """Show that so many iterations are done, after so many seconds of rendering; ``share`` of
+        the work, if that is known better than by those, is done."""
         done = max(
-            rendering / self._seconds if self._seconds else 0.0, iterations / self._planned if self._planned else 0.0, share or 0.0
+            rendering / self._seconds if self._seconds else 0.0,
+            iterations / self._planned if self._planned else 0.0,
+            share or 0.0,
         )
-        left = f"{_duration(max(0.0, rendering / done - rendering))} left" if done else "time left unknown"
+        left = (
+            f"{_duration(max(0.0, rendering / done - rendering))} left"
+            if done
+            else "time left unknown"
+        )
         speed = iterations * self._paths() / max(rendering, 1e-9) / 1e6
         of = "" if self._seconds or not self._planned else f"/{self._planned}"
         text = f"iteration {iterations}{of}, {speed:.2f} M samples/s, {left}"

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import signal
 import time
-from typing import Callable, Sequence
+from collections.abc import Callable, Sequence
 
 import drjit as dr
 
-from .progress import Progress
 from ..core.session import Session
+from .progress import Progress
 from .target_error import TargetError
 
 
 class Interrupt:
-    """Ctrl-C, or SIGTERM: the first asks to stop after the current iteration; a second one, or one before any result,
-    stops at once.
+    """Ctrl-C, or SIGTERM: the first asks to stop after the current iteration; a second one, or one
+    before any result, stops at once.
     """
 
     def __init__(self) -> None:
@@ -25,8 +25,11 @@ class Interrupt:
         self.stopped = False
         """Whether an interrupt has stopped what was being done."""
 
-    def __enter__(self) -> "Interrupt":
-        self._previous = {number: signal.signal(number, self._handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    def __enter__(self) -> Interrupt:
+        self._previous = {
+            number: signal.signal(number, self._handle)
+            for number in (signal.SIGINT, signal.SIGTERM)
+        }
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -68,11 +71,13 @@ class Clock:
 
 
 class Chore:
-    """Something to do every so many seconds between iterations. Where it fails with ``OSError``, the render goes on: the failure is said once, and
-    it is tried again when its time comes.
+    """Something to do every so many seconds between iterations. Where it fails with ``OSError``,
+    the render goes on: the failure is said once, and it is tried again when its time comes.
     """
 
-    def __init__(self, name: str, seconds: float, action: Callable[[], None], complain: Callable[[str], None]):
+    def __init__(
+        self, name: str, seconds: float, action: Callable[[], None], complain: Callable[[str], None]
+    ):
         self._name, self._seconds, self._action, self._complain = name, seconds, action, complain
         self._last = time.monotonic()
         self.failure: str | None = None
@@ -111,9 +116,11 @@ def iterate(
     progress: Progress,
     interrupt: Interrupt,
 ) -> None:
-    """Iterate until there are as many iterations as ``planned``, ``seconds`` of rendering have passed, or the error reaches its target,
-    whichever is first of those that are given, or the user interrupts; but at least as many as an image needs. A session that has enough already is
-    left as it is. Its remarks, if it has some, are said once. A session that only waits for others may return from ``iterate`` with nothing new.
+    """Iterate until there are as many iterations as ``planned``, ``seconds`` of rendering have
+    passed, or the error reaches its target, whichever is first of those that are given, or the user
+    interrupts; but at least as many as an image needs. A session that has enough already is left as
+    it is. Its remarks, if it has some, are said once. A session that only waits for others may
+    return from ``iterate`` with nothing new.
     """
 
     def enough() -> bool:
@@ -128,15 +135,19 @@ def iterate(
     while session.iterations < fewest_iterations(session) or not (enough() or interrupt.requested):
         with clock:
             session.iterate()
-        interrupt.have_result = session.iterations > 0       # before a chore shows that there is something
+        interrupt.have_result = (
+            session.iterations > 0
+        )  # before a chore shows that there is something
         if interrupt.stopped:
-            raise KeyboardInterrupt              # a library has dropped it
+            raise KeyboardInterrupt  # a library has dropped it
         if not session.iterations:
             continue
         if not remarked:
             remarked = True
             for remark in getattr(session, "remarks", []):
                 progress.say(remark)
-        progress.update(session.iterations, clock.rendering, target.share_done() if target else None)
+        progress.update(
+            session.iterations, clock.rendering, target.share_done() if target else None
+        )
         for chore in chores:
             chore.when_due()

@@ -1,4 +1,5 @@
-"""What an image must tell to be rendered again: the options that it was rendered with, and what was found out meanwhile."""
+"""What an image must tell to be rendered again: the options that it was rendered with, and what was
+found out meanwhile."""
 
 from __future__ import annotations
 
@@ -14,22 +15,38 @@ import mitsuba as mi
 import OpenEXR
 
 from .. import _plugins
-from .options import LARGEST_SEED, MOST_SAMPLES, MOST_SENSORS, versions
 from ..core.session import Session
 from ..core.untrusted import Fields, Malformed, parse, shown
+from .options import LARGEST_SEED, MOST_SAMPLES, MOST_SENSORS, versions
 
 ATTRIBUTE = "again"
 """Name of the header's attribute."""
-MITSUBA_INTEGRATORS = ("aov", "depth", "direct", "direct_projective", "moment", "path", "prb", "prb_basic", "prb_projective", "prbvolpath", "ptracer",
-                       "stokes", "volpath", "volpathmis", "volprim_rf_basic")
+MITSUBA_INTEGRATORS = (
+    "aov",
+    "depth",
+    "direct",
+    "direct_projective",
+    "moment",
+    "path",
+    "prb",
+    "prb_basic",
+    "prb_projective",
+    "prbvolpath",
+    "ptracer",
+    "stokes",
+    "volpath",
+    "volpathmis",
+    "volprim_rf_basic",
+)
 """Mitsuba's own integrators: no other names, nor names of files, are taken from a header."""
 _MAGIC = b"\x76\x2f\x31\x01"
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """What the header of an image tells: the options of the command that are set by it, each of the type and in the range of the command's own, what
-    the session had ``learned`` (which the session checks when it recalls it), and the versions that rendered it."""
+    """What the header of an image tells: the options of the command that are set by it, each of the
+    type and in the range of the command's own, what the session had ``learned`` (which the session
+    checks when it recalls it), and the versions that rendered it."""
 
     options: dict[str, Any]
     learned: dict[str, Any]
@@ -38,24 +55,38 @@ class Recipe:
     @property
     def remark(self) -> str | None:
         """What may be different now, in words."""
-        return None if self.versions == versions() else f"was rendered by {self.versions}, this is {versions()}; the image may differ"
+        return (
+            None
+            if self.versions == versions()
+            else f"was rendered by {self.versions}, this is {versions()}; the image may differ"
+        )
 
 
 def attribute(options: argparse.Namespace, session: Session, learned: dict[str, Any]) -> str:
-    """The attribute of an image that ``read`` reads, in JSON. What depended on the clock is in it as what it came to: samples, camera paths of an
-    iteration, and what the session had ``learned``."""
+    """The attribute of an image that ``read`` reads, in JSON. What depended on the clock is in it
+    as what it came to: samples, camera paths of an iteration, and what the session had
+    ``learned``."""
     given = {name: getattr(options, name) for name in _OPTIONS}
     if "camera_paths" in session.settings:
-        given["parameters"] = [*(pair for pair in given["parameters"] if pair[0] != "camera_paths"),
-                               ("camera_paths", str(session.samples_per_iteration))]
-    return json.dumps({"options": {**given, "spp": session.iterations * session.samples_per_iteration}, "learned": learned, "versions": versions()})
+        given["parameters"] = [
+            *(pair for pair in given["parameters"] if pair[0] != "camera_paths"),
+            ("camera_paths", str(session.samples_per_iteration)),
+        ]
+    return json.dumps(
+        {
+            "options": {**given, "spp": session.iterations * session.samples_per_iteration},
+            "learned": learned,
+            "versions": versions(),
+        }
+    )
 
 
 _OPTIONS = ("plugin", "variables", "parameters", "variant", "sensor", "all_views", "seed")
 
 
 def read(image: Path) -> Recipe:
-    """What ``image`` tells. Raises ``Malformed`` if it is not an image of this command, or tells anything but that."""
+    """What ``image`` tells. Raises ``Malformed`` if it is not an image of this command, or tells
+    anything but that."""
     what = f"--like {image}"
     told = Fields(parse(_attribute_of(image, what), f"{what}: its header"), f"{what}: its header")
     options = told.object("options")
@@ -86,8 +117,10 @@ def _attribute_of(image: Path, what: str) -> str:
             regular = stat.S_ISREG(os.fstat(descriptor).st_mode)
             is_exr = regular and file.read(len(_MAGIC)) == _MAGIC
         header = OpenEXR.File(str(image), header_only=True).header() if is_exr else {}
-    except Exception as error:               # OpenEXR raises errors of many kinds for files that are damaged
-        raise Malformed(f"{what}: cannot be read: {shown(getattr(error, 'strerror', None) or ' '.join(str(error).split()))}") from None
+    except Exception as error:  # OpenEXR raises errors of many kinds for files that are damaged
+        raise Malformed(
+            f"{what}: cannot be read: {shown(getattr(error, 'strerror', None) or ' '.join(str(error).split()))}"
+        ) from None
     if ATTRIBUTE not in header:
         raise Malformed(f"{what}: not an image of mis-render, or of an earlier version")
     return header[ATTRIBUTE]

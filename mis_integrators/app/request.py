@@ -9,16 +9,17 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from . import fingerprint, loading
 from .. import llvm
-from .options import versions
 from ..core.session import Session, make_session
+from . import fingerprint, loading
+from .options import versions
 
 
 @dataclass(frozen=True)
 class Request:
-    """What to render: the scene's file and ``$variables``, the integrator that replaces the scene's (or ``None``) and its parameters, the
-    sensor's index, or all views; ``spp`` (0: no planned end, ``None``: what the sensor asks for), ``fine`` as for ``make_session``.
+    """What to render: the scene's file and ``$variables``, the integrator that replaces the scene's
+    (or ``None``) and its parameters, the sensor's index, or all views; ``spp`` (0: no planned end,
+    ``None``: what the sensor asks for), ``fine`` as for ``make_session``.
     """
 
     scene: str
@@ -32,8 +33,9 @@ class Request:
     spp: int | None
     fine: bool
 
-    def open(self, needs_views: str | None = None) -> "Opened":
-        """Load the scene and make the session. ``needs_views`` is an option that only integrators of several views have.
+    def open(self, needs_views: str | None = None) -> Opened:
+        """Load the scene and make the session. ``needs_views`` is an option that only integrators
+        of several views have.
 
         Sets the variant. Raises one of ``loading.SCENE_ERRORS``.
         """
@@ -44,22 +46,29 @@ class Request:
         except (ImportError, RuntimeError):
             if not self.variant.startswith("cuda_") or dr.has_backend(dr.JitBackend.CUDA):
                 raise
-            raise RuntimeError(f"{self.variant} needs an NVIDIA GPU and its driver, and Dr.Jit finds none; use --variant llvm_ad_rgb") from None
+            raise RuntimeError(
+                f"{self.variant} needs an NVIDIA GPU and its driver, and Dr.Jit finds none; use --variant llvm_ad_rgb"
+            ) from None
         loaded = loading.load(Path(self.scene), self.variables, self.plugin, self.parameters)
         sensor = _sensor(loaded.scene, self.sensor)
         spp = sensor.sampler().sample_count() if self.spp is None else self.spp
         if needs_views and not hasattr(loaded.integrator, "views_session"):
-            raise ValueError(f'{needs_views}: "{loaded.plugin}" renders one view at a time; use -i volpath_multiview')
+            raise ValueError(
+                f'{needs_views}: "{loaded.plugin}" renders one view at a time; use -i volpath_multiview'
+            )
         if self.all_views:
             session = loaded.integrator.views_session(loaded.scene, seed=self.seed, spp=spp)
         else:
-            session = make_session(loaded.integrator, loaded.scene, sensor, self.seed, spp, self.fine)
+            session = make_session(
+                loaded.integrator, loaded.scene, sensor, self.seed, spp, self.fine
+            )
         return Opened(self, loaded, sensor, session, {**loaded.parameters, **session.settings})
 
 
 @dataclass(frozen=True)
 class Opened:
-    """A request, what was loaded for it, the session, and its settings before it learns any more."""
+    """A request, what was loaded for it, the session, and its settings before it learns any
+    more."""
 
     request: Request
     loaded: loading.LoadedScene

@@ -1,4 +1,5 @@
-"""From samples to the film: reconstruction, accumulation over iterations, and the variance of the pixel means."""
+"""From samples to the film: reconstruction, accumulation over iterations, and the variance of the
+pixel means."""
 
 from __future__ import annotations
 
@@ -6,13 +7,14 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .sums import Sums
 from .packing import from_numpy
+from .sums import Sums
 
 
 def colour_matrix(wavelengths):
-    """Linear sRGB of unit radiance at each of `wavelengths`: the conversion is linear, so an iteration that shares its wavelengths
-    shares this matrix (a list of `Color3f`, empty in rgb and mono variants)."""
+    """Linear sRGB of unit radiance at each of `wavelengths`: the conversion is linear, so an
+    iteration that shares its wavelengths shares this matrix (a list of `Color3f`, empty in rgb and
+    mono variants)."""
     if not mi.is_spectral:
         return []
     count = dr.size_v(mi.Spectrum)
@@ -21,9 +23,10 @@ def colour_matrix(wavelengths):
 
 
 def shared_wavelengths(sensor, number):
-    """The wavelengths that all sub-paths of an iteration share, the sample that makes them (from `number`, 32 random bits), and their conversion
-    to colour: a dictionary of opaque arrays `sample`, `wavelengths`, `matrix`."""
-    sample = dr.opaque(mi.Float, number / 2 ** 32)
+    """The wavelengths that all sub-paths of an iteration share, the sample that makes them (from
+    `number`, 32 random bits), and their conversion to colour: a dictionary of opaque arrays
+    `sample`, `wavelengths`, `matrix`."""
+    sample = dr.opaque(mi.Float, number / 2**32)
     wavelengths, _ = sensor.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), sample)
     spectral = {"sample": sample, "wavelengths": wavelengths, "matrix": colour_matrix(wavelengths)}
     dr.make_opaque(spectral)
@@ -31,7 +34,8 @@ def shared_wavelengths(sensor, number):
 
 
 def colour_channels(radiance, matrix):
-    """Three display channels of a `Spectrum`, with the `colour_matrix` of its wavelengths (mono: grey)."""
+    """Three display channels of a `Spectrum`, with the `colour_matrix` of its wavelengths (mono:
+    grey)."""
     if mi.is_spectral:
         return sum((column * radiance[i] for i, column in enumerate(matrix)), mi.Color3f(0))
     if mi.is_monochromatic:
@@ -40,8 +44,8 @@ def colour_channels(radiance, matrix):
 
 
 def splat_samples(film, position, radiance, alpha, matrix, active):
-    """Reconstructs one pass: an image tensor (height, width, channels), border included, that holds sums of filter weight
-    times (R, G, B, [alpha,] 1); `matrix` as for `colour_channels`."""
+    """Reconstructs one pass: an image tensor (height, width, channels), border included, that holds
+    sums of filter weight times (R, G, B, [alpha,] 1); `matrix` as for `colour_channels`."""
     values = list(colour_channels(radiance, matrix))
     if mi.has_flag(film.flags(), mi.FilmFlags.Alpha):
         values.append(alpha)
@@ -49,29 +53,44 @@ def splat_samples(film, position, radiance, alpha, matrix, active):
 
 
 def splat_channels(film, position, channels, active):
-    """Image tensor (height, width, channels), border included, of sums of filter weight times the values `channels`."""
-    block = mi.ImageBlock(film.crop_size(), film.crop_offset(), len(channels), film.rfilter(), border=True, coalesce=False)
+    """Image tensor (height, width, channels), border included, of sums of filter weight times the
+    values `channels`."""
+    block = mi.ImageBlock(
+        film.crop_size(),
+        film.crop_offset(),
+        len(channels),
+        film.rfilter(),
+        border=True,
+        coalesce=False,
+    )
     block.put(position, channels, active)
     return block.tensor()
 
 
 def expected_weight(film, camera_paths):
-    """Expected sum of filter weights that `camera_paths` samples a pixel leave in each pixel of a block, border included:
-    a tensor (height, width, 1).
+    """Expected sum of filter weights that `camera_paths` samples a pixel leave in each pixel of a
+    block, border included: a tensor (height, width, 1).
 
-    What light sub-paths bring to the sensor is divided by this, not by the weights that the camera's samples happen to have."""
+    What light sub-paths bring to the sensor is divided by this, not by the weights that the
+    camera's samples happen to have."""
     rfilter = film.rfilter()
     radius, border = float(rfilter.radius()), rfilter.border_size()
     steps = 4096
     x = (np.arange(steps) + 0.5) * (2 * radius / steps) - radius
-    cumulative = np.concatenate([[0], np.cumsum(np.array(rfilter.eval(mi.Float(x)), dtype=np.float64)) * (2 * radius / steps)])
+    cumulative = np.concatenate(
+        [
+            [0],
+            np.cumsum(np.array(rfilter.eval(mi.Float(x)), dtype=np.float64)) * (2 * radius / steps),
+        ]
+    )
     spread = border if film.sample_border() else 0
 
     def along(size):
         middle = np.arange(-border, size + border) + 0.5
         low, high = (np.clip(edge - middle, -radius, radius) for edge in (-spread, size + spread))
-        return np.interp(high, np.linspace(-radius, radius, steps + 1), cumulative) - \
-            np.interp(low, np.linspace(-radius, radius, steps + 1), cumulative)
+        return np.interp(high, np.linspace(-radius, radius, steps + 1), cumulative) - np.interp(
+            low, np.linspace(-radius, radius, steps + 1), cumulative
+        )
 
     width, height = film.crop_size()
     weight = camera_paths * np.outer(along(height), along(width))
@@ -79,8 +98,9 @@ def expected_weight(film, camera_paths):
 
 
 def as_camera_weights(light, block, expected):
-    """Sums of filter weight times light that meets the sensor (`splat_channels`), times the camera samples' own weights in `block` (`splat_samples`)
-    over the `expected_weight`: then both are divided by the same, and the mean over iterations stays unbiased."""
+    """Sums of filter weight times light that meets the sensor (`splat_channels`), times the camera
+    samples' own weights in `block` (`splat_samples`) over the `expected_weight`: then both are
+    divided by the same, and the mean over iterations stays unbiased."""
     return light * dr.select(expected > 1e-6, block[:, :, -1:] / dr.maximum(expected, 1e-6), 0)
 
 
@@ -90,7 +110,8 @@ def with_colour(block, colour):
 
 
 def add_squares(sums, colour, weight):
-    """Adds to the sums what `spread` needs, from the summed colours A_i and weights W_i of an iteration."""
+    """Adds to the sums what `spread` needs, from the summed colours A_i and weights W_i of an
+    iteration."""
     colour, weight = mi.TensorXd(colour), mi.TensorXd(weight)
     sums.add("square", colour * colour)
     sums.add("cross", colour * weight)
@@ -103,22 +124,29 @@ def spread(sums, mean):
 
 
 def finite_pixels(block):
-    """Which pixels of a block tensor have values that are all finite: a mask of shape (height, width, 1)."""
+    """Which pixels of a block tensor have values that are all finite: a mask of shape (height,
+    width, 1)."""
     finite = dr.isfinite(block[:, :, :1])
     for channel in range(1, block.shape[2]):
-        finite &= dr.isfinite(block[:, :, channel:channel + 1])
+        finite &= dr.isfinite(block[:, :, channel : channel + 1])
     return finite
 
 
 class Accumulator:
-    """Sums of the iterations' blocks and, for the variance, of their squares. Its size does not grow with iterations.
+    """Sums of the iterations' blocks and, for the variance, of their squares. Its size does not
+    grow with iterations.
 
-    The sums are `total`; `left_out`, how many iterations had a value at the pixel that is not finite and are left out there, weight and all; with the variance
-    `square` (colour squared), `cross` (colour times weight), `weight_square`; `techniques` if there are such images.
+    The sums are `total`; `left_out`, how many iterations had a value at the pixel that is not
+    finite and are left out there, weight and all; with the variance `square` (colour squared),
+    `cross` (colour times weight), `weight_square`; `techniques` if there are such images.
     """
 
     def __init__(self, film, with_variance, technique_channels=0):
-        self.film, self.with_variance, self.technique_channels = film, with_variance, technique_channels
+        self.film, self.with_variance, self.technique_channels = (
+            film,
+            with_variance,
+            technique_channels,
+        )
         self.sums = Sums(mi.TensorXd)
 
     @property
@@ -131,7 +159,10 @@ class Accumulator:
         border = 2 * self.film.rfilter().border_size()
         width, height = self.film.crop_size()
         size = height + border, width + border
-        channels = {"total": 5 if mi.has_flag(self.film.flags(), mi.FilmFlags.Alpha) else 4, "left_out": 1}
+        channels = {
+            "total": 5 if mi.has_flag(self.film.flags(), mi.FilmFlags.Alpha) else 4,
+            "left_out": 1,
+        }
         if self.with_variance:
             channels |= {"square": 3, "cross": 3, "weight_square": 1}
         if self.technique_channels:
@@ -153,21 +184,24 @@ class Accumulator:
         dr.schedule(self.sums.tensors)
 
     def mean(self):
-        """Mean colour (height, width, 3), and the sums of weights (height, width, 1) by which it was divided."""
+        """Mean colour (height, width, 3), and the sums of weights (height, width, 1) by which it
+        was divided."""
         total = self.sums["total"]
         weight = total[:, :, -1:]
         weight = dr.select(weight == 0, 1, weight)
         return total[:, :, :3] / weight, weight
 
     def variance_of_mean(self):
-        """Estimated variance of each pixel's mean (height, width, 3) from the iterations, by the ratio estimator's
-        delta method: sum (A_i - m W_i)^2 / (n (n - 1) mean(W)^2), A_i and W_i the weighted colour and weight of iteration i."""
+        """Estimated variance of each pixel's mean (height, width, 3) from the iterations, by the
+        ratio estimator's delta method: sum (A_i - m W_i)^2 / (n (n - 1) mean(W)^2), A_i and W_i the
+        weighted colour and weight of iteration i."""
         n = self.iterations
         mean, weight = self.mean()
         return dr.maximum(spread(self.sums, mean), 0) * (n / ((n - 1) * weight * weight))
 
     def estimate(self):
-        """Mean colour and its estimated variance, float64 (height, width, 3) each, without the block's border."""
+        """Mean colour and its estimated variance, float64 (height, width, 3) each, without the
+        block's border."""
         return tuple(self._inside(tensor) for tensor in (self.mean()[0], self.variance_of_mean()))
 
     def unfinite_pixels(self):
@@ -181,14 +215,19 @@ class Accumulator:
         return np.array(tensor)[inside, inside]
 
     def put(self, film, variance):
-        """Writes the accumulated image into a film prepared with matching AOVs: with channels of the `variance` or not, then those of the techniques."""
+        """Writes the accumulated image into a film prepared with matching AOVs: with channels of
+        the `variance` or not, then those of the techniques."""
         tensor = self.sums["total"]
         if variance:
             channels = self.variance_of_mean() * tensor[:, :, -1:]
-            tensor = dr.concat([tensor, channels[:, :, :1] if mi.is_monochromatic else channels], axis=2)
+            tensor = dr.concat(
+                [tensor, channels[:, :, :1] if mi.is_monochromatic else channels], axis=2
+            )
         if self.technique_channels:
             tensor = dr.concat([tensor, self.sums["techniques"]], axis=2)
-        film.put_block(mi.ImageBlock(mi.TensorXf(tensor), film.crop_offset(), film.rfilter(), border=True))
+        film.put_block(
+            mi.ImageBlock(mi.TensorXf(tensor), film.crop_offset(), film.rfilter(), border=True)
+        )
 
 
 def variance_channels():

@@ -1,5 +1,6 @@
-"""Unit vectors and small integers in 32 bits, so that a photon's position and what its distance test needs next to it
-share one 16-byte record; sizes and targets of buffers; and arrays that come from NumPy or go there."""
+"""Unit vectors and small integers in 32 bits, so that a photon's position and what its distance
+test needs next to it share one 16-byte record; sizes and targets of buffers; and arrays that come
+from NumPy or go there."""
 
 import drjit as dr
 import mitsuba as mi
@@ -25,8 +26,10 @@ def _octahedral(v):
     scale = dr.rcp(dr.abs(v.x) + dr.abs(v.y) + dr.abs(v.z))
     x, y = v.x * scale, v.y * scale
     lower = v.z < 0
-    return (dr.select(lower, dr.mulsign(1 - dr.abs(y), x), x),
-            dr.select(lower, dr.mulsign(1 - dr.abs(x), y), y))
+    return (
+        dr.select(lower, dr.mulsign(1 - dr.abs(y), x), x),
+        dr.select(lower, dr.mulsign(1 - dr.abs(x), y), y),
+    )
 
 
 def _inverse_octahedral(x, y):
@@ -53,12 +56,12 @@ def pack_direction(v):
 
 def unpack_direction(u):
     """Inverse of `pack_direction`, not normalised (length between 0.57 and 1)."""
-    return _inverse_octahedral(_dequantise(u & 0xffff, 16), _dequantise(u >> 16, 16))
+    return _inverse_octahedral(_dequantise(u & 0xFFFF, 16), _dequantise(u >> 16, 16))
 
 
 def pack_surface(normal, depth, caustic):
-    """A surface normal (11 bits an axis, error below 0.0025 radians), a path depth (9 bits, saturated at `MAX_DEPTH`) and the
-    photon's kind (1 bit: caustic or not) in one uint32."""
+    """A surface normal (11 bits an axis, error below 0.0025 radians), a path depth (9 bits,
+    saturated at `MAX_DEPTH`) and the photon's kind (1 bit: caustic or not) in one uint32."""
     bits = _SURFACE_NORMAL_BITS
     x, y = _octahedral(normal)
     word = _quantise(x, bits) | (_quantise(y, bits) << bits)
@@ -70,7 +73,9 @@ def unpack_normal(word):
     """The normal stored by `pack_surface`, not normalised (length between 0.57 and 1)."""
     bits = _SURFACE_NORMAL_BITS
     mask = (1 << bits) - 1
-    return _inverse_octahedral(_dequantise(word & mask, bits), _dequantise((word >> bits) & mask, bits))
+    return _inverse_octahedral(
+        _dequantise(word & mask, bits), _dequantise((word >> bits) & mask, bits)
+    )
 
 
 def unpack_depth(word):
@@ -84,32 +89,41 @@ def unpack_caustic(word):
 
 
 def gather_words(table, count, index, active):
-    """Row `index` of a table of floats with `count` of them a row, a multiple of four: a list of arrays."""
-    return [word for part in range(count // 4) for word in dr.gather(mi.Vector4f, table, count // 4 * index + part, active)]
+    """Row `index` of a table of floats with `count` of them a row, a multiple of four: a list of
+    arrays."""
+    return [
+        word
+        for part in range(count // 4)
+        for word in dr.gather(mi.Vector4f, table, count // 4 * index + part, active)
+    ]
 
 
 def rounded_up(count):
-    """The next of 4, 5, 6, 7, 8, 10, 12, ...: few different buffer sizes, for they are literals of cached kernels."""
+    """The next of 4, 5, 6, 7, 8, 10, 12, ...: few different buffer sizes, for they are literals of
+    cached kernels."""
     step = 1 << max(count.bit_length() - 3, 0)
     return -(-count // step) * step
 
 
 def from_numpy(dtype, values):
-    """The numbers `values` (NumPy, flat) as a Dr.Jit array of type `dtype` in memory of its own. Without the copy Dr.Jit goes on using NumPy's
-    memory, and kernels that read it are compiled anew whenever that happens to be aligned in another way."""
+    """The numbers `values` (NumPy, flat) as a Dr.Jit array of type `dtype` in memory of its own.
+    Without the copy Dr.Jit goes on using NumPy's memory, and kernels that read it are compiled anew
+    whenever that happens to be aligned in another way."""
     array = dtype(np.asarray(values, np.float32 if dr.is_float_v(dtype) else np.uint32))
-    array = array + dr.opaque(dtype, 0)              # (a gather of all would be the array itself)
+    array = array + dr.opaque(dtype, 0)  # (a gather of all would be the array itself)
     dr.eval(array)
     return array
 
 
 def to_numpy(vectors):
-    """Dr.Jit vectors as a NumPy array, one row a component. (`np.array` would write their number into a kernel, to be compiled anew for each.)"""
+    """Dr.Jit vectors as a NumPy array, one row a component. (`np.array` would write their number
+    into a kernel, to be compiled anew for each.)"""
     return np.stack([np.array(component) for component in vectors])
 
 
 class Store:
-    """Arrays that a symbolic loop scatters into. A plain object, so that Dr.Jit does not take them for the loop's state."""
+    """Arrays that a symbolic loop scatters into. A plain object, so that Dr.Jit does not take them
+    for the loop's state."""
 
     def __init__(self, **arrays):
         self.__dict__.update(arrays)

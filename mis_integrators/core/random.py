@@ -4,26 +4,29 @@ import mitsuba as mi
 
 
 def mix(*words):
-    """Hashes non-negative integers to one of 32 bits (splitmix64 finaliser applied word by word)."""
-    state = 0x9e3779b97f4a7c15
+    """Hashes non-negative integers to one of 32 bits (splitmix64 finaliser applied word by
+    word)."""
+    state = 0x9E3779B97F4A7C15
     for word in words:
-        state = (state ^ (int(word) & 0xffffffffffffffff)) & 0xffffffffffffffff
-        state = (state * 0xbf58476d1ce4e5b9) & 0xffffffffffffffff
+        state = (state ^ (int(word) & 0xFFFFFFFFFFFFFFFF)) & 0xFFFFFFFFFFFFFFFF
+        state = (state * 0xBF58476D1CE4E5B9) & 0xFFFFFFFFFFFFFFFF
         state ^= state >> 27
-        state = (state * 0x94d049bb133111eb) & 0xffffffffffffffff
+        state = (state * 0x94D049BB133111EB) & 0xFFFFFFFFFFFFFFFF
         state ^= state >> 31
-    return state & 0xffffffff
+    return state & 0xFFFFFFFF
 
 
 def streams(index, seed):
-    """A PCG32 generator for every path `index` (uint32 array) under `seed` (uint32, opaque to keep kernels cached)."""
+    """A PCG32 generator for every path `index` (uint32 array) under `seed` (uint32, opaque to keep
+    kernels cached)."""
     low, high = mi.sample_tea_32(index, seed)
     return mi.PCG32(initstate=mi.UInt64(low) | (mi.UInt64(high) << 32), initseq=mi.UInt64(index))
 
 
 def vertex_streams(path, number, seed):
-    """A generator for every kept vertex `number` of sub-path `path`: not for its place in a buffer, which chance decides."""
-    return streams(path, seed + number * mi.UInt32(0x9e3779b9))
+    """A generator for every kept vertex `number` of sub-path `path`: not for its place in a buffer,
+    which chance decides."""
+    return streams(path, seed + number * mi.UInt32(0x9E3779B9))
 
 
 def next_2d(rng, active=True):

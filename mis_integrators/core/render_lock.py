@@ -1,12 +1,14 @@
-"""Renders in several Python threads take turns, iteration by iteration: an iteration keeps all processors busy by itself, and films, recordings
-and Python's garbage collector are shared by all threads.
+"""Renders in several Python threads take turns, iteration by iteration: an iteration keeps all
+processors busy by itself, and films, recordings and Python's garbage collector are shared by all
+threads.
 """
 
 from __future__ import annotations
 
 import functools
 import threading
-from typing import Any, Callable, TypeVar
+from collections.abc import Callable
+from typing import Any, TypeVar
 
 TURN = threading.RLock()
 """Whoever renders or develops holds it."""

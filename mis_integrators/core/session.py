@@ -1,4 +1,5 @@
-"""A render as a sequence of iterations: what every session offers, and that of Mitsuba's own integrators."""
+"""A render as a sequence of iterations: what every session offers, and that of Mitsuba's own
+integrators."""
 
 from __future__ import annotations
 
@@ -9,13 +10,15 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .sums import Sums
 from .render_lock import by_turns
+from .sums import Sums
 from .untrusted import Fields
 
-# Camera paths that one pass of a Mitsuba integrator traces: bounds its memory, and the wait after a Ctrl-C.
+# Camera paths that one pass of a Mitsuba integrator traces: bounds its memory, and the wait after a
+# Ctrl-C.
 PATHS_PER_PASS = 1 << 20
-# Samples that a sampler makes of those that it is asked for, at most: some only know squares or powers of two.
+# Samples that a sampler makes of those that it is asked for, at most: some only know squares or
+# powers of two.
 ROUNDING = 4
 # Passes of a render that estimates its error or is spread over workers, at least.
 FEWEST_PASSES = 32
@@ -24,11 +27,13 @@ Setting = str | int | float
 
 
 class Session(Protocol):
-    """One render in progress: ``iterate`` adds an independent iteration, ``image`` is the mean of those done.
+    """One render in progress: ``iterate`` adds an independent iteration, ``image`` is the mean of
+    those done.
 
-    A session may have a method ``plan_time(seconds: float) -> None``. It is called once, before the first
-    iteration, when the render has a time limit instead of a number of samples. It may have ``remarks``, a list of lines that
-    the user should read, complete once an iteration is done, and ``fewest_iterations``, how many its image needs (else one).
+    A session may have a method ``plan_time(seconds: float) -> None``. It is called once, before the
+    first iteration, when the render has a time limit instead of a number of samples. It may have
+    ``remarks``, a list of lines that the user should read, complete once an iteration is done, and
+    ``fewest_iterations``, how many its image needs (else one).
     """
 
     iterations_planned: int | None
@@ -42,29 +47,34 @@ class Session(Protocol):
     """Camera paths per pixel of one iteration."""
 
     channels: list[str]
-    """Names of the image's C channels: ``R``, ``G``, ``B``, perhaps ``A`` (or ``Y``), then the AOVs."""
+    """Names of the image's C channels: ``R``, ``G``, ``B``, perhaps ``A`` (or ``Y``), then the
+    AOVs."""
 
     settings: dict[str, Setting]
     """What a reader of the image should know about how it was made, by name."""
 
     sums: Sums
-    """All that has been rendered so far: a session of the same scene and settings with the same sums has the same image."""
+    """All that has been rendered so far: a session of the same scene and settings with the same
+    sums has the same image."""
 
     @property
     def learned(self) -> dict[str, Any]:
         """What ``start`` has found out and the seed alone would not tell again, in JSON's types."""
 
     def iterate(self, iteration: int | None = None) -> None:
-        """Run one iteration and wait until it is done: that of the given number, or the first that is missing.
+        """Run one iteration and wait until it is done: that of the given number, or the first that
+        is missing.
 
         Iterations depend on the seed and their number alone.
         """
 
     def image(self) -> np.ndarray:
-        """Mean over the iterations done: float32 of shape (H, W, C), radiance in the scene's units."""
+        """Mean over the iterations done: float32 of shape (H, W, C), radiance in the scene's
+        units."""
 
     def unfinite_pixels(self) -> int:
-        """How many pixels had values that are not finite in some iteration. Those values are left out of the sums."""
+        """How many pixels had values that are not finite in some iteration. Those values are left
+        out of the sums."""
 
     def sum_shapes(self) -> dict[str, tuple[int, ...]]:
         """The shapes that the sums will have after an iteration, by name."""
@@ -73,21 +83,29 @@ class Session(Protocol):
         """From the first iteration on, keep what ``estimate`` needs."""
 
     def estimate(self) -> tuple[np.ndarray, np.ndarray]:
-        """Mean colour and its estimated variance: float64 of the same shape (H, W, 3), or other colour channels.
+        """Mean colour and its estimated variance: float64 of the same shape (H, W, 3), or other
+        colour channels.
 
         Needs two iterations, and ``keep_variance``.
         """
 
     def start(self) -> None:
-        """Find out what must be known before the first iteration, unless it is known: pilots, caches."""
+        """Find out what must be known before the first iteration, unless it is known: pilots,
+        caches."""
 
     def recall(self, learned: dict[str, Any]) -> None:
-        """Take over what another session of the same render has ``learned``; before the first iteration. It may come from a file that anyone wrote:
-        raises ``untrusted.Malformed`` if it is not what such a session can have learned."""
+        """Take over what another session of the same render has ``learned``; before the first
+        iteration. It may come from a file that anyone wrote: raises ``untrusted.Malformed`` if it
+        is not what such a session can have learned."""
 
 
 def make_session(
-    integrator: mi.Integrator, scene: mi.Scene, sensor: mi.Sensor, seed: int, spp: int, fine: bool = False
+    integrator: mi.Integrator,
+    scene: mi.Scene,
+    sensor: mi.Sensor,
+    seed: int,
+    spp: int,
+    fine: bool = False,
 ) -> Session:
     """A session that renders ``spp`` samples per pixel, or without a planned end if ``spp`` is 0.
 
@@ -99,16 +117,30 @@ def make_session(
 
 
 class MitsubaSession:
-    """A ``Session`` of one of Mitsuba's own integrators: the mean of independent passes' developed images.
+    """A ``Session`` of one of Mitsuba's own integrators: the mean of independent passes' developed
+    images.
 
-    All passes have the same number of samples, so the total is ``spp`` rounded up to a multiple of it. If ``fine``, there are
-    ``FEWEST_PASSES`` passes at least (samples allowing), and without a planned end they have 16 samples at most.
+    All passes have the same number of samples, so the total is ``spp`` rounded up to a multiple of
+    it. If ``fine``, there are ``FEWEST_PASSES`` passes at least (samples allowing), and without a
+    planned end they have 16 samples at most.
     """
 
     def __init__(
-        self, integrator: mi.Integrator, scene: mi.Scene, sensor: mi.Sensor, seed: int, spp: int, fine: bool = False
+        self,
+        integrator: mi.Integrator,
+        scene: mi.Scene,
+        sensor: mi.Sensor,
+        seed: int,
+        spp: int,
+        fine: bool = False,
     ):
-        self._integrator, self._scene, self._sensor, self._seed, self._spp = integrator, scene, sensor, seed, spp
+        self._integrator, self._scene, self._sensor, self._seed, self._spp = (
+            integrator,
+            scene,
+            sensor,
+            seed,
+            spp,
+        )
         width, height = sensor.film().crop_size()
         largest = self._largest = max(1, PATHS_PER_PASS // (width * height))
         if fine:
@@ -128,7 +160,9 @@ class MitsubaSession:
         sampler = self._sensor.sampler().clone()
         sampler.set_sample_count(samples)
         self.samples_per_iteration = int(sampler.sample_count())
-        self.iterations_planned = math.ceil(self._spp / self.samples_per_iteration) if self._spp else None
+        self.iterations_planned = (
+            math.ceil(self._spp / self.samples_per_iteration) if self._spp else None
+        )
 
     @property
     def iterations(self) -> int:
@@ -156,7 +190,8 @@ class MitsubaSession:
             )
         # The film has all channels; the tensor that render() could return lacks some under `aov`.
         image = np.array(self._sensor.film().bitmap(), np.float64).reshape(self._shape)
-        # Else the sampler's unused final state waits, and the next recorded pass would trace these paths again to evaluate it.
+        # Else the sampler's unused final state waits, and the next recorded pass would trace these
+        # paths again to evaluate it.
         self._sensor.sampler().seed(0, 1)
         finite = np.isfinite(image).all(axis=2, keepdims=True)
         image = np.where(finite, image, 0.0)
@@ -188,7 +223,9 @@ class MitsubaSession:
     def estimate(self) -> tuple[np.ndarray, np.ndarray]:
         n = self._counts()
         mean = self.sums["total"][..., self._colours] / np.maximum(n, 1)
-        return mean, np.maximum(self.sums["square"] / np.maximum(n, 1) - np.square(mean), 0) / np.maximum(n - 1, 1)
+        return mean, np.maximum(
+            self.sums["square"] / np.maximum(n, 1) - np.square(mean), 0
+        ) / np.maximum(n - 1, 1)
 
 
 def _colour_channels(channels: list[str]) -> list[int]:

@@ -1,15 +1,18 @@
-"""Sums over iterations: all of a render in progress that a checkpoint, or the process that gathers the work of others, needs to know."""
+"""Sums over iterations: all of a render in progress that a checkpoint, or the process that gathers
+the work of others, needs to know."""
 
 from __future__ import annotations
 
 import contextlib
-from typing import Any, Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
 
 import numpy as np
 
 
 class Iterations:
-    """A set of iteration numbers that is nearly 0, 1, ..., n - 1: those below a number, and some beyond it."""
+    """A set of iteration numbers that is nearly 0, 1, ..., n - 1: those below a number, and some
+    beyond it."""
 
     def __init__(self, below: int = 0, beyond: tuple[int, ...] = ()):
         self.below = below
@@ -24,7 +27,10 @@ class Iterations:
         return iteration < self.below or iteration in self.beyond
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, Iterations) and (self.below, self.beyond) == (other.below, other.beyond)
+        return isinstance(other, Iterations) and (self.below, self.beyond) == (
+            other.below,
+            other.beyond,
+        )
 
     @property
     def first_missing(self) -> int:
@@ -36,7 +42,8 @@ class Iterations:
         return (self.below + 1) // 2 + sum(1 for iteration in self.beyond if iteration % 2 == 0)
 
     def add(self, iteration: int) -> None:
-        """Add a number; raises ``ValueError`` if it is in the set, for nothing may be summed twice."""
+        """Add a number; raises ``ValueError`` if it is in the set, for nothing may be summed
+        twice."""
         if iteration in self or iteration < 0:
             raise ValueError(f"iteration {iteration} is among those summed already, or negative")
         self.beyond.add(iteration)
@@ -44,11 +51,11 @@ class Iterations:
             self.beyond.remove(self.below)
             self.below += 1
 
-    def copy(self) -> "Iterations":
+    def copy(self) -> Iterations:
         """The same set, which changes by itself."""
         return Iterations(self.below, tuple(self.beyond))
 
-    def update(self, other: "Iterations") -> None:
+    def update(self, other: Iterations) -> None:
         """Add all numbers of a disjoint set."""
         if not len(self):
             self.below, self.beyond = other.below, set(other.beyond)
@@ -62,7 +69,8 @@ class Iterations:
 
 
 class Sums:
-    """Named sums over iterations, in double precision, and which iterations are in them. Their size does not grow with iterations.
+    """Named sums over iterations, in double precision, and which iterations are in them. Their size
+    does not grow with iterations.
 
     ``tensor`` converts what is added to the type of the sums: ``mi.TensorXd``, or that of NumPy.
     """
@@ -95,7 +103,8 @@ class Sums:
         return {name: np.array(tensor, np.float64) for name, tensor in self.tensors.items()}
 
     def merge(self, arrays: Mapping[str, np.ndarray], done: Iterations) -> None:
-        """Add the sums of other iterations. Raises ``ValueError`` if one of these is in the sums already, or if others are summed."""
+        """Add the sums of other iterations. Raises ``ValueError`` if one of these is in the sums
+        already, or if others are summed."""
         shapes = {name: tuple(array.shape) for name, array in arrays.items()}
         mine = {name: tuple(tensor.shape) for name, tensor in self.tensors.items()}
         if self.tensors and shapes != mine:

@@ -1,4 +1,5 @@
-"""What a scene needs, found once before rendering: nothing that it lacks is traced, stored or gathered."""
+"""What a scene needs, found once before rendering: nothing that it lacks is traced, stored or
+gathered."""
 
 from __future__ import annotations
 
@@ -16,7 +17,9 @@ class UnsupportedScene(ValueError):
 
 
 def scene_objects(root):
-    """Every Mitsuba object below `root` (shapes, nested BSDFs, emitters, media, films, ...), each once."""
+    """Every Mitsuba object below `root` (shapes, nested BSDFs, emitters, media, films, ...), each
+    once."""
+
     class Collector(mi.TraversalCallback):
         def __init__(self):
             super().__init__()
@@ -38,7 +41,8 @@ def scene_objects(root):
 
 
 def used_bsdfs(scene):
-    """Every BSDF that some shape (of a shape group, too) carries, nested ones included, each once."""
+    """Every BSDF that some shape (of a shape group, too) carries, nested ones included, each
+    once."""
     shapes = [o for o in scene_objects(scene) if isinstance(o, mi.Shape)] + list(scene.shapes())
     below = {o.ptr: o for shape in shapes for o in scene_objects(shape) if isinstance(o, mi.BSDF)}
     own = {shape.bsdf().ptr: shape.bsdf() for shape in shapes if shape.bsdf() is not None}
@@ -46,7 +50,8 @@ def used_bsdfs(scene):
 
 
 def registry_table(objects, pointer_type, values, dtype):
-    """A table indexed by Dr.Jit's registry number of `objects`, holding `values`; entry 0 (null pointer) is zero."""
+    """A table indexed by Dr.Jit's registry number of `objects`, holding `values`; entry 0 (null
+    pointer) is zero."""
     numbers = [int(dr.reinterpret_array(mi.UInt32, pointer_type(o))[0]) for o in objects]
     table = np.zeros(max(numbers, default=0) + 1)
     table[numbers] = values
@@ -59,21 +64,25 @@ def lookup(table, pointer, dtype, active=True):
 
 
 def is_lambertian(bsdf):
-    """Whether the BSDF's smooth part is constant (one value on each side of the surface) in the unperturbed frame."""
+    """Whether the BSDF's smooth part is constant (one value on each side of the surface) in the
+    unperturbed frame."""
     name = bsdf.class_name()
     if name == "SmoothDiffuse":
         return True
     if name in ("TwoSidedBRDF", "MaskBSDF", "BlendBSDF"):
-        return all(is_lambertian(child) or not (child.flags() & mi.BSDFFlags.Smooth)
-                   for child in scene_objects(bsdf)
-                   if isinstance(child, mi.BSDF))
+        return all(
+            is_lambertian(child) or not (child.flags() & mi.BSDFFlags.Smooth)
+            for child in scene_objects(bsdf)
+            if isinstance(child, mi.BSDF)
+        )
     return False
 
 
 def scene_bounds(scene):
     """Bounding box of the scene's shapes (`mi.ScalarBoundingBox3f`).
 
-    Not `scene.bbox()`: Mitsuba's loader merges shapes into meshes whose boxes it forgets to compute.
+    Not `scene.bbox()`: Mitsuba's loader merges shapes into meshes whose boxes it forgets to
+    compute.
     """
     box = mi.ScalarBoundingBox3f()
     for shape in scene.shapes():
@@ -91,31 +100,44 @@ def scene_bounds(scene):
 
 
 def unfinite_data(scene):
-    """Descriptions, a line each, of data of the scene that hold values which are not finite: of emitters, textures, BSDFs, media, volumes and shapes. Each says
-    where the data are (as `mi.traverse` names them, from the id on, or from the class where there is none), whose they are, and how many such values there are."""
+    """Descriptions, a line each, of data of the scene that hold values which are not finite: of
+    emitters, textures, BSDFs, media, volumes and shapes. Each says where the data are (as
+    `mi.traverse` names them, from the id on, or from the class where there is none), whose they
+    are, and how many such values there are."""
     kinds = mi.Emitter, mi.Texture, mi.BSDF, mi.Medium, mi.Volume, mi.PhaseFunction, mi.Shape
     parameters = mi.traverse(scene)
-    data = {name: (owner, parameters[name]) for name, (_, _, owner, _) in parameters.properties.items() if isinstance(owner, kinds)}
-    dr.eval([value for _, value in data.values()])                  # at once: each by itself would be a kernel
+    data = {
+        name: (owner, parameters[name])
+        for name, (_, _, owner, _) in parameters.properties.items()
+        if isinstance(owner, kinds)
+    }
+    dr.eval([value for _, value in data.values()])  # at once: each by itself would be a kernel
     found = []
     for name, (owner, value) in data.items():
         values = np.array(value)
-        if values.dtype.kind == "f" and (count := values.size - np.count_nonzero(np.isfinite(values))):
+        if values.dtype.kind == "f" and (
+            count := values.size - np.count_nonzero(np.isfinite(values))
+        ):
             outermost = owner
             while parameters.hierarchy[outermost][1] > 1:
                 outermost = parameters.hierarchy[outermost][0]
-            place = re.sub(r"^object_\d+", outermost.class_name(), name)    # an address, where there is no id
-            found.append(f"{shown(place)} of {owner.class_name()} has {count} of {values.size} values that are not finite")
+            place = re.sub(
+                r"^object_\d+", outermost.class_name(), name
+            )  # an address, where there is no id
+            found.append(
+                f"{shown(place)} of {owner.class_name()} has {count} of {values.size} values that are not finite"
+            )
     return found
 
 
 class SceneTraits:
     """What a scene is made of.
 
-    Attributes: `bounds` (bounding box), `has_delta` (perfectly specular or null scattering somewhere), `has_mixed` (BSDFs with both a
-    smooth and a delta part), `has_rough` (smooth scattering that is not Lambertian), `has_rough_glass` (rough refraction), `has_lambertian`,
-    `has_perturbed` (bump or normal maps), `has_light_surfaces` (emitters that a ray can meet: area lights, environments), `lambertian`,
-    `perturbed` (registry tables for BSDF pointers).
+    Attributes: `bounds` (bounding box), `has_delta` (perfectly specular or null scattering
+    somewhere), `has_mixed` (BSDFs with both a smooth and a delta part), `has_rough` (smooth
+    scattering that is not Lambertian), `has_rough_glass` (rough refraction), `has_lambertian`,
+    `has_perturbed` (bump or normal maps), `has_light_surfaces` (emitters that a ray can meet: area
+    lights, environments), `lambertian`, `perturbed` (registry tables for BSDF pointers).
     """
 
     def __init__(self, scene):
@@ -127,10 +149,14 @@ class SceneTraits:
         self.has_delta = any(f & flag.Delta for f in flags)
         self.has_mixed = any((f & flag.Delta) and (f & flag.Smooth) for f in flags)
         self.has_lambertian = any(lambertian)
-        perturbed = [any(b.class_name() in ("BumpMap", "NormalMap") for b in (bsdf, *scene_objects(bsdf))) for bsdf in bsdfs]
+        perturbed = [
+            any(b.class_name() in ("BumpMap", "NormalMap") for b in (bsdf, *scene_objects(bsdf)))
+            for bsdf in bsdfs
+        ]
         self.has_perturbed = any(perturbed)
         self.perturbed = registry_table(bsdfs, mi.BSDFPtr, perturbed, mi.Bool)
-        # Nested BSDFs count on their own, so a perturbed (bump- or normal-mapped) Lambertian shows through its wrapper.
+        # Nested BSDFs count on their own, so a perturbed (bump- or normal-mapped) Lambertian shows
+        # through its wrapper.
         self.has_rough = any((f & flag.Smooth) and not l for f, l in zip(flags, lambertian))
         self.has_rough_glass = any(f & flag.GlossyTransmission for f in flags)
         self.lambertian = registry_table(bsdfs, mi.BSDFPtr, lambertian, mi.Bool)
@@ -141,13 +167,17 @@ class SceneTraits:
 def check_variant(scene, plugin):
     """Raises `UnsupportedScene` if `scene` belongs to another variant than the active one."""
     if not isinstance(scene, mi.Scene):
-        raise UnsupportedScene(f'{plugin}: the scene was loaded under another variant than the active one '
-                               f'({mi.variant()}); load it again after mi.set_variant()')
+        raise UnsupportedScene(
+            f"{plugin}: the scene was loaded under another variant than the active one "
+            f"({mi.variant()}); load it again after mi.set_variant()"
+        )
 
 
 def has_media(scene):
     """Whether there are participating media in the scene."""
-    return any(isinstance(o, mi.Medium) for o in scene_objects(scene)) or any(s.is_medium_transition() for s in scene.shapes())
+    return any(isinstance(o, mi.Medium) for o in scene_objects(scene)) or any(
+        s.is_medium_transition() for s in scene.shapes()
+    )
 
 
 def check_film(sensor, plugin):
@@ -156,17 +186,24 @@ def check_film(sensor, plugin):
     width, height = film.crop_size()
     if not (width and height):
         full_width, full_height = film.size()
-        raise UnsupportedScene(f"{plugin}: nothing can be rendered on a film of {width} x {height} pixels (the crop window of "
-                               f"{full_width} x {full_height}); width and height must be at least 1")
+        raise UnsupportedScene(
+            f"{plugin}: nothing can be rendered on a film of {width} x {height} pixels (the crop window of "
+            f"{full_width} x {full_height}); width and height must be at least 1"
+        )
 
 
 def check_scene(scene, sensor, plugin):
-    """Raises `UnsupportedScene` for what the surface integrators cannot render, before any sampling."""
+    """Raises `UnsupportedScene` for what the surface integrators cannot render, before any
+    sampling."""
     if mi.is_polarized:
-        raise UnsupportedScene(f'{plugin}: polarised variants are not supported (active: {mi.variant()}); use an unpolarised '
-                               'one such as "llvm_ad_rgb"')
+        raise UnsupportedScene(
+            f"{plugin}: polarised variants are not supported (active: {mi.variant()}); use an unpolarised "
+            'one such as "llvm_ad_rgb"'
+        )
     if has_media(scene):
-        raise UnsupportedScene(f'{plugin}: participating media are not supported by this surface integrator; use "volpath"')
+        raise UnsupportedScene(
+            f'{plugin}: participating media are not supported by this surface integrator; use "volpath"'
+        )
     check_emitters(scene, plugin)
     if mi.has_flag(sensor.film().flags(), mi.FilmFlags.Special):
         raise UnsupportedScene(f'{plugin}: film "specfilm" is not supported; use "hdrfilm"')
@@ -176,8 +213,12 @@ def check_emitters(scene, plugin):
     """Raises `UnsupportedScene` for emitters on which no points can be sampled."""
     for shape in scene.shapes():
         if shape.is_emitter() and shape.class_name() in _UNSAMPLED_SHAPES:
-            raise UnsupportedScene(f'{plugin}: Mitsuba cannot sample points on a {shape.class_name()} shape, so it cannot be an '
-                                   'emitter here; use a mesh, sphere, rectangle, disk or cylinder')
+            raise UnsupportedScene(
+                f"{plugin}: Mitsuba cannot sample points on a {shape.class_name()} shape, so it cannot be an "
+                "emitter here; use a mesh, sphere, rectangle, disk or cylinder"
+            )
 
 
-_UNSAMPLED_SHAPES = frozenset({"BSplineCurve", "LinearCurve", "CatmullRomCurve", "SDFGrid", "Ellipsoids", "EllipsoidsMesh"})
+_UNSAMPLED_SHAPES = frozenset(
+    {"BSplineCurve", "LinearCurve", "CatmullRomCurve", "SDFGrid", "Ellipsoids", "EllipsoidsMesh"}
+)

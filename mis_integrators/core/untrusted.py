@@ -1,11 +1,13 @@
-"""Read JSON that anyone may have written: headers of images, checkpoints. Every value has a type and a range; whatever else is there is refused."""
+"""Read JSON that anyone may have written: headers of images, checkpoints. Every value has a type
+and a range; whatever else is there is refused."""
 
 from __future__ import annotations
 
 import json
 import math
 import sys
-from typing import Any, Iterable
+from collections.abc import Iterable
+from typing import Any
 
 LONGEST_JSON = 1 << 24
 """Characters of a JSON text that is read, at most."""
@@ -16,7 +18,8 @@ LONGEST_SHOWN = 200
 
 
 class Malformed(ValueError):
-    """A value that is missing, of the wrong type or out of range; the message says in one line which, and what is allowed."""
+    """A value that is missing, of the wrong type or out of range; the message says in one line
+    which, and what is allowed."""
 
 
 def parse(text: object, what: str) -> Any:
@@ -45,7 +48,8 @@ def _refuse_constant(name: str) -> None:
 
 
 class Fields:
-    """The fields of a JSON object: each is asked for by its name, type and range, and ``finish`` refuses those that were not asked for.
+    """The fields of a JSON object: each is asked for by its name, type and range, and ``finish``
+    refuses those that were not asked for.
 
     All methods raise ``Malformed``.
     """
@@ -68,7 +72,9 @@ class Fields:
 
     def refuse(self, name: str, allowed: str) -> Malformed:
         """The error that the value of a field is not ``allowed``."""
-        return Malformed(f'{self._what}: "{name}" = {shown(self._given.get(name))} is not allowed: expected {allowed}')
+        return Malformed(
+            f'{self._what}: "{name}" = {shown(self._given.get(name))} is not allowed: expected {allowed}'
+        )
 
     def any(self, name: str) -> Any:
         """Any value: for what is only compared."""
@@ -82,10 +88,14 @@ class Fields:
         return value
 
     def number(self, name: str, most: float = math.inf, positive: bool = True) -> float:
-        """A finite number, more than zero (or zero, too, if not ``positive``), and at most ``most``."""
+        """A finite number, more than zero (or zero, too, if not ``positive``), and at most
+        ``most``."""
         value = self._get(name)
         if not is_number(value) or not 0 <= value <= most or (positive and not value):
-            raise self.refuse(name, f"a number, {'more than' if positive else 'at least'} 0{'' if math.isinf(most) else f', at most {most:g}'}")
+            raise self.refuse(
+                name,
+                f"a number, {'more than' if positive else 'at least'} 0{'' if math.isinf(most) else f', at most {most:g}'}",
+            )
         return float(value)
 
     def boolean(self, name: str) -> bool:
@@ -119,11 +129,14 @@ class Fields:
     def assignments(self, name: str) -> list[tuple[str, str]]:
         """A list of pairs of a name (letters, digits, ``_``, ``.``) and a printable text."""
         value = self._get(name)
-        if not isinstance(value, list) or not all(isinstance(pair, list) and len(pair) == 2 and is_name(pair[0]) and is_text(pair[1]) for pair in value):
+        if not isinstance(value, list) or not all(
+            isinstance(pair, list) and len(pair) == 2 and is_name(pair[0]) and is_text(pair[1])
+            for pair in value
+        ):
             raise self.refuse(name, "a list of pairs [name, text]")
         return [(first, second) for first, second in value]
 
-    def object(self, name: str) -> "Fields":
+    def object(self, name: str) -> Fields:
         """The fields of an object inside this one."""
         value = self._get(name)
         if not isinstance(value, dict):
@@ -142,7 +155,11 @@ class Fields:
 
 def is_number(value: object) -> bool:
     """Whether a JSON value is a finite number."""
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
+    return (
+        isinstance(value, (int, float))
+        and not isinstance(value, bool)
+        and abs(value) <= sys.float_info.max
+    )
 
 
 def is_text(value: object) -> bool:
@@ -152,4 +169,9 @@ def is_text(value: object) -> bool:
 
 def is_name(value: object) -> bool:
     """Whether a JSON value can be the name of a variable or of a parameter."""
-    return isinstance(value, str) and 0 < len(value) <= 100 and value.isascii() and value.replace(".", "_").isidentifier()
+    return (
+        isinstance(value, str)
+        and 0 < len(value) <= 100
+        and value.isascii()
+        and value.replace(".", "_").isidentifier()
+    )

@@ -1,1 +1,2 @@
-"""The plugins: one file each. Import through `mis_integrators`, which registers them for the active variant."""
+"""The plugins: one file each. Import through `mis_integrators`, which registers them for the active
+variant."""

@@ -7,19 +7,19 @@ import time
 import drjit as dr
 import mitsuba as mi
 
-from ..paths.camera_pass import film_sample_count, trace_camera_paths
-from ..photons.coverage import covered_share
 from ..core.film import splat_samples
-from ..photons.gather import gather_photons
-from ..paths.light_pass import trace_light_paths
-from ..lights.lights import Lights
 from ..core.packing import rounded_up
-from ..photons.grid import PhotonMap, build_photon_map, smallest_cell
 from ..core.recording import recorder
 from ..core.traits import SceneTraits, lookup
 from ..core.untrusted import Fields
-from .common import MOST_LIGHT_PATHS, IterativeIntegrator, IterativeSession
+from ..lights.lights import Lights
+from ..paths.camera_pass import film_sample_count, trace_camera_paths
+from ..paths.light_pass import trace_light_paths
+from ..photons.coverage import covered_share
+from ..photons.gather import gather_photons
+from ..photons.grid import PhotonMap, build_photon_map, smallest_cell
 from ..pilot.run import choose_radii
+from .common import MOST_LIGHT_PATHS, IterativeIntegrator, IterativeSession
 from .schedule import read_radius, shrunk
 
 SPARE_PHOTONS = 1 << 20
@@ -39,31 +39,35 @@ class BDPM(IterativeIntegrator):
 
      * - bdd
        - |int|
-       - Backward diffuse depth: the camera vertex at which photons are gathered, counted over vertices that scatter smoothly, from
+       - Backward diffuse depth: the camera vertex at which photons are gathered, counted over
+         vertices that scatter smoothly, from
          0. Direct light is estimated at every vertex up to it. (Default: 1)
      * - photon_count
        - |int|
-       - Light sub-paths an iteration; 0 stands for as many as the cropped film has pixels. (Default: 0)
+       - Light sub-paths an iteration; 0 stands for as many as the cropped film has pixels.
+         (Default: 0)
      * - initial_radius
        - |float|
-       - Merge radius of the first iteration, in scene units; 0 balances noise against blur in a short pilot, apart for caustic and
-         for other photons, and corrects the estimate near edges where that pays. (Default: 0)
+       - Merge radius of the first iteration, in scene units; 0 balances noise against blur in a
+         short pilot, apart for caustic and for other photons, and corrects the estimate near edges
+         where that pays. (Default: 0)
      * - alpha
        - |float|
-       - Radius reduction of progressive photon mapping, in (0, 1]: iteration i uses R_i^2 = R_0^2 (i + 1)^(alpha - 1). 1 keeps the
-         radius. (Default: 1)
+       - Radius reduction of progressive photon mapping, in (0, 1]: iteration i uses R_i^2 = R_0^2
+         (i + 1)^(alpha - 1). 1 keeps the radius. (Default: 1)
      * - camera_paths
        - |int|
-       - Camera paths per pixel and iteration. 0 stands for one; in a render of a given time whose radius is automatic, for as many
-         of 1, 2, 4 and 8 as make the least error. (Default: 0)
+       - Camera paths per pixel and iteration. 0 stands for one; in a render of a given time whose
+         radius is automatic, for as many of 1, 2, 4 and 8 as make the least error. (Default: 0)
      * - variance
        - |bool|
-       - Adds the channels ``var.R``, ``var.G``, ``var.B`` (mono: ``var.Y``): the estimated variance of the pixel mean over the
-         iterations, of which there must be two at least. (Default: no, i.e. |false|)
+       - Adds the channels ``var.R``, ``var.G``, ``var.B`` (mono: ``var.Y``): the estimated variance
+         of the pixel mean over the iterations, of which there must be two at least. (Default: no,
+         i.e. |false|)
      * - max_depth
        - |int|
-       - Longest path in segments, both halves together (-1: unlimited). A value of 1 shows only directly visible emitters, 2 adds
-         direct light, and so on. (Default: -1)
+       - Longest path in segments, both halves together (-1: unlimited). A value of 1 shows only
+         directly visible emitters, 2 adds direct light, and so on. (Default: -1)
      * - rr_depth
        - |int|
        - Depth from which Russian roulette may end a sub-path, in each half. (Default: 5)
@@ -71,13 +75,14 @@ class BDPM(IterativeIntegrator):
        - |bool|
        - Hide directly visible emitters. (Default: no, i.e. |false|)
 
-    Each iteration traces light sub-paths, stores them as photons in a grid, traces camera paths, and estimates the light that photons
-    bring to the camera paths' vertices from their density. Direct light comes from next-event estimation combined with BSDF sampling;
-    photons carry all light of two or more segments, and caustics, which next-event estimation cannot make. The number of iterations
-    is the number of samples per pixel over ``camera_paths``.
+    Each iteration traces light sub-paths, stores them as photons in a grid, traces camera paths,
+    and estimates the light that photons bring to the camera paths' vertices from their density.
+    Direct light comes from next-event estimation combined with BSDF sampling; photons carry all
+    light of two or more segments, and caustics, which next-event estimation cannot make. The number
+    of iterations is the number of samples per pixel over ``camera_paths``.
 
-    The estimate is consistent: its bias vanishes with the radius. Participating media, polarised variants, gradients and the film
-    ``specfilm`` are refused by name.
+    The estimate is consistent: its bias vanishes with the radius. Participating media, polarised
+    variants, gradients and the film ``specfilm`` are refused by name.
 
     .. tabs::
         .. code-tab:: xml
@@ -105,12 +110,19 @@ class BDPM(IterativeIntegrator):
 
     def read_photon_parameters(self, parameters):
         """Reads what concerns the photon map."""
-        self.photon_count = parameters.integer("photon_count", 0, 0, "at least 0 (0: as many as pixels)", high=MOST_LIGHT_PATHS)
+        self.photon_count = parameters.integer(
+            "photon_count", 0, 0, "at least 0 (0: as many as pixels)", high=MOST_LIGHT_PATHS
+        )
         self.initial_radius, self.alpha = read_radius(parameters)
 
     def settings(self):
-        return {**super().settings(), "photon_count": self.photon_count, "initial_radius": self.initial_radius,
-                "alpha": self.alpha, "bdd": self.bdd}
+        return {
+            **super().settings(),
+            "photon_count": self.photon_count,
+            "initial_radius": self.initial_radius,
+            "alpha": self.alpha,
+            "bdd": self.bdd,
+        }
 
     def new_session(self, scene, sensor, seed, iterations):
         return BDPMSession(self, scene, sensor, seed, iterations)
@@ -121,29 +133,46 @@ class BDPMSession(IterativeSession):
 
     def __init__(self, integrator, scene, sensor, seed, iterations):
         super().__init__(integrator, scene, sensor, seed, iterations)
-        self.traits, self.lights = integrator.survey or (SceneTraits(scene), Lights.seen_by(scene, sensor, integrator.plugin))
+        self.traits, self.lights = integrator.survey or (
+            SceneTraits(scene),
+            Lights.seen_by(scene, sensor, integrator.plugin),
+        )
         self.split_paths(CAMERA_CHUNK)
-        self.light_paths = integrator.photon_count or min(film_sample_count(sensor), MOST_LIGHT_PATHS)
+        self.light_paths = integrator.photon_count or min(
+            film_sample_count(sensor), MOST_LIGHT_PATHS
+        )
         depth = integrator.max_depth
         unreachable = self.lights.needs_photons_for_direct_light()
-        self.has_caustics = not self.lights.dark and ((unreachable and (depth < 0 or depth >= 2)) or
-                                                      (self.traits.has_delta and (depth < 0 or depth >= 3)))
+        self.has_caustics = not self.lights.dark and (
+            (unreachable and (depth < 0 or depth >= 2))
+            or (self.traits.has_delta and (depth < 0 or depth >= 3))
+        )
         self.has_indirect = not self.lights.dark and (depth < 0 or depth >= integrator.bdd + 3)
-        self.one_vertex = not self.traits.has_mixed and (integrator.bdd == 0 or not self.has_caustics)
+        self.one_vertex = not self.traits.has_mixed and (
+            integrator.bdd == 0 or not self.has_caustics
+        )
         self.photon_capacity = rounded_up(3 * self.light_paths)
         self.vertex_capacity = self._vertex_room(self.chunk)
-        self.radii = {kind: integrator.initial_radius for kind in self.kinds()} if integrator.initial_radius else None
-        self.corrected = {kind: False for kind in self.kinds()}
-        self.seconds = self.begun = None           # what rendering may take, and when it began
-        self.forecast = self.judged_by = None      # what the pilot expects, and the image (of its pixels) that errors are relative to
-        self.rehearsed = {}                        # iterations that the pilot has rendered already, by number
-        self.photons_found = 0                     # by the last light pass
+        self.radii = (
+            dict.fromkeys(self.kinds(), integrator.initial_radius)
+            if integrator.initial_radius
+            else None
+        )
+        self.corrected = dict.fromkeys(self.kinds(), False)
+        self.seconds = self.begun = None  # what rendering may take, and when it began
+        self.forecast = self.judged_by = (
+            # what the pilot expects, and the image (of its pixels) that errors are relative to
+            None
+        )
+        self.rehearsed = {}  # iterations that the pilot has rendered already, by number
+        self.photons_found = 0  # by the last light pass
         self._sized = False
         self.recorded = recorder()
         self._freeze()
 
     def plan_time(self, seconds):
-        """Rendering will last `seconds`: the automatic radius is chosen for as many iterations as fit."""
+        """Rendering will last `seconds`: the automatic radius is chosen for as many iterations as
+        fit."""
         self.seconds = seconds
 
     @property
@@ -159,7 +188,11 @@ class BDPMSession(IterativeSession):
 
     def kinds(self):
         """Photon maps that the scene needs."""
-        return [kind for kind, needed in (("caustic", self.has_caustics), ("indirect", self.has_indirect)) if needed]
+        return [
+            kind
+            for kind, needed in (("caustic", self.has_caustics), ("indirect", self.has_indirect))
+            if needed
+        ]
 
     def send(self, camera_paths):
         """Sends so many camera paths through each pixel from the next iteration on."""
@@ -171,7 +204,10 @@ class BDPMSession(IterativeSession):
 
     def radii_at(self, iteration):
         """Merge radius of each kind of photon."""
-        return {kind: dr.opaque(mi.Float, shrunk(radius, self.integrator.alpha, iteration)) for kind, radius in self.radii.items()}
+        return {
+            kind: dr.opaque(mi.Float, shrunk(radius, self.integrator.alpha, iteration))
+            for kind, radius in self.radii.items()
+        }
 
     def _vertex_room(self, paths):
         if not self.kinds():
@@ -181,36 +217,79 @@ class BDPMSession(IterativeSession):
     # ------------------------------------------------------------------ passes
 
     def _freeze(self):
-        """Records the passes anew; from the second iteration on, their kernels run without their Python."""
+        """Records the passes anew; from the second iteration on, their kernels run without their
+        Python."""
         self._tables = [self.traits.lambertian, self.traits.perturbed, *self.lights.tables()]
         self._light_pass = self.recorded(self._trace_light)
         self._map_pass = self.recorded(self._build_maps)
         self._camera_pass = self.recorded(self._render_chunk)
 
     def _trace_light(self, scene, sensor, tables, seed, spectral):
-        return trace_light_paths(scene, self.lights, self.traits, seed, self.light_paths, self.photon_capacity,
-                                 spectral["wavelengths"], sensor.shutter_open(), sensor.shutter_open_time(),
-                                 self.integrator.max_depth, self.integrator.rr_depth)
+        return trace_light_paths(
+            scene,
+            self.lights,
+            self.traits,
+            seed,
+            self.light_paths,
+            self.photon_capacity,
+            spectral["wavelengths"],
+            sensor.shutter_open(),
+            sensor.shutter_open_time(),
+            self.integrator.max_depth,
+            self.integrator.rr_depth,
+        )
 
-    def _trace_camera(self, scene, sensor, seed, first, stride, paths, together, capacity, spectral):
-        """Traces `paths` camera paths, those with numbers `first`, `first + stride`, ..., of which each pixel has so many `together`."""
+    def _trace_camera(
+        self, scene, sensor, seed, first, stride, paths, together, capacity, spectral
+    ):
+        """Traces `paths` camera paths, those with numbers `first`, `first + stride`, ..., of which
+        each pixel has so many `together`."""
         integrator = self.integrator
-        return trace_camera_paths(scene, sensor, integrator, self.lights, self.traits, seed, first, stride, paths,
-                                  together, spectral["sample"], integrator.bdd, integrator.max_depth,
-                                  integrator.rr_depth, integrator.hide_emitters, capacity, self.has_caustics, self.has_indirect,
-                                  self.one_vertex)
+        return trace_camera_paths(
+            scene,
+            sensor,
+            integrator,
+            self.lights,
+            self.traits,
+            seed,
+            first,
+            stride,
+            paths,
+            together,
+            spectral["sample"],
+            integrator.bdd,
+            integrator.max_depth,
+            integrator.rr_depth,
+            integrator.hide_emitters,
+            capacity,
+            self.has_caustics,
+            self.has_indirect,
+            self.one_vertex,
+        )
 
     def _gather(self, photon_map, vertices, kind, radii, spectral, grey=False):
         """What photons of one kind bring to each vertex, for each radius."""
-        return gather_photons(self.traits, photon_map, vertices, radii, spectral["wavelengths"], self.light_paths, self.integrator.max_depth,
-                              only_last=kind == "indirect", grey=grey)
+        return gather_photons(
+            self.traits,
+            photon_map,
+            vertices,
+            radii,
+            spectral["wavelengths"],
+            self.light_paths,
+            self.integrator.max_depth,
+            only_last=kind == "indirect",
+            grey=grey,
+        )
 
     def _covered(self, scene, tables, vertices, radius, seed):
-        """Share of each vertex' merge disk that holds surface; one where the surface is not Lambertian: in a highlight the noise of dividing by
-        an estimate would outweigh what it mends."""
+        """Share of each vertex' merge disk that holds surface; one where the surface is not
+        Lambertian: in a highlight the noise of dividing by an estimate would outweigh what it
+        mends."""
         probed = dr.max(vertices["throughput"]) > 0
         if self.traits.has_rough:
-            shape = dr.select(probed, vertices["hit"].shape, dr.zeros(mi.ShapePtr))          # unused places hold no pointers
+            shape = dr.select(
+                probed, vertices["hit"].shape, dr.zeros(mi.ShapePtr)
+            )  # unused places hold no pointers
             probed &= lookup(self.traits.lambertian, shape.bsdf(), mi.Bool, probed)
         return dr.select(probed, covered_share(scene, vertices, radius, seed, probed), 1)
 
@@ -219,13 +298,21 @@ class BDPMSession(IterativeSession):
         if self.one_vertex:
             return values
         total = dr.zeros(type(values), paths)
-        dr.scatter_reduce(dr.ReduceOp.Add, total, values, vertices["path"], dr.max(vertices["throughput"]) > 0,
-                          dr.ReduceMode.Direct)
+        dr.scatter_reduce(
+            dr.ReduceOp.Add,
+            total,
+            values,
+            vertices["path"],
+            dr.max(vertices["throughput"]) > 0,
+            dr.ReduceMode.Direct,
+        )
         return total
 
     def _map(self, photons, kind, radius):
         notes = photons[3] if kind == "indirect" and len(photons) > 3 else None
-        return build_photon_map(*photons[:3], self.traits.bounds, self._cell(radius), self.photon_capacity, kind, notes)
+        return build_photon_map(
+            *photons[:3], self.traits.bounds, self._cell(radius), self.photon_capacity, kind, notes
+        )
 
     def _cell(self, radius):
         return dr.maximum(radius, smallest_cell(self.traits.bounds, self.photon_capacity))
@@ -234,27 +321,45 @@ class BDPMSession(IterativeSession):
         return {kind: self._map(photons, kind, radius).arrays() for kind, radius in radii.items()}
 
     def _render_chunk(self, scene, sensor, tables, maps, seed, first, spectral, radii):
-        radiance, alpha, position, vertices, count = self._trace_camera(scene, sensor, seed, first, 1, self.chunk,
-                                                                        self.samples_per_iteration, self.vertex_capacity, spectral)
+        radiance, alpha, position, vertices, count = self._trace_camera(
+            scene,
+            sensor,
+            seed,
+            first,
+            1,
+            self.chunk,
+            self.samples_per_iteration,
+            self.vertex_capacity,
+            spectral,
+        )
         if radii:
             dr.eval(radiance, alpha, position, vertices, count)
         for kind, radius in radii.items():
-            photon_map = PhotonMap.with_grid(maps[kind], self.traits.bounds, self._cell(radius), self.photon_capacity)
+            photon_map = PhotonMap.with_grid(
+                maps[kind], self.traits.bounds, self._cell(radius), self.photon_capacity
+            )
             (gathered,) = self._gather(photon_map, vertices, kind, [radius], spectral)
             if self.corrected[kind]:
                 gathered *= dr.rcp(self._covered(scene, tables, vertices, radius, seed))
             radiance += self._per_path(gathered, vertices, self.chunk)
         if self.integrator.hide_emitters:
-            radiance = dr.select(alpha > 0, radiance, 0)       # as `path` does: what is behind nothing but null surfaces is hidden
-        return splat_samples(sensor.film(), position, radiance, alpha, spectral["matrix"], self.in_chunk(first)), count
+            radiance = dr.select(
+                alpha > 0, radiance, 0
+            )  # as `path` does: what is behind nothing but null surfaces is hidden
+        return splat_samples(
+            sensor.film(), position, radiance, alpha, spectral["matrix"], self.in_chunk(first)
+        ), count
 
     # ------------------------------------------------------------------ iterations
 
     def _photons(self, iteration, spectral):
-        """An iteration's photons. Where they overflow the buffers, these grow and the pass runs again; after a first pass that
-        needs less than half of them, they shrink to what was needed, with some room."""
+        """An iteration's photons. Where they overflow the buffers, these grow and the pass runs
+        again; after a first pass that needs less than half of them, they shrink to what was needed,
+        with some room."""
         while True:
-            photons = self._light_pass(self.scene, self.sensor, self._tables, self._seed(iteration, LIGHT), spectral)
+            photons = self._light_pass(
+                self.scene, self.sensor, self._tables, self._seed(iteration, LIGHT), spectral
+            )
             dr.eval(photons)
             found = self.photons_found = int(photons[2][0])
             room = rounded_up(found + found // 8 + 1024)
@@ -270,7 +375,8 @@ class BDPMSession(IterativeSession):
         self.set_up()
 
     def set_up(self):
-        """What `start` does when it has looked at the clock: chooses the radii, unless they are known."""
+        """What `start` does when it has looked at the clock: chooses the radii, unless they are
+        known."""
         if self.radii is None:
             self.forecast = choose_radii(self)
 
@@ -278,9 +384,11 @@ class BDPMSession(IterativeSession):
     def learned(self):
         if self.radii is None:
             return {}
-        return {"radii": {kind: float(radius) for kind, radius in self.radii.items()},
-                "corrected": {kind: bool(flag) for kind, flag in self.corrected.items()},
-                "camera_paths": self.samples_per_iteration}
+        return {
+            "radii": {kind: float(radius) for kind, radius in self.radii.items()},
+            "corrected": {kind: bool(flag) for kind, flag in self.corrected.items()},
+            "camera_paths": self.samples_per_iteration,
+        }
 
     def recall(self, learned):
         if not learned:
@@ -299,13 +407,23 @@ class BDPMSession(IterativeSession):
             return self.rehearsed.pop(iteration)
         radii = self.radii_at(iteration)
         spectral = self._spectral(iteration)
-        photons = self._photons(iteration, spectral) if radii else None          # before any pass is looked up: they may have to be recorded anew
+        photons = (
+            self._photons(iteration, spectral) if radii else None
+        )  # before any pass is looked up: they may have to be recorded anew
         maps = self._map_pass(photons, radii) if radii else None
 
         def render(chunk, first):
             while True:
-                block, count = self._camera_pass(self.scene, self.sensor, self._tables, maps, self._seed(iteration, CAMERA), first,
-                                                 spectral, radii)
+                block, count = self._camera_pass(
+                    self.scene,
+                    self.sensor,
+                    self._tables,
+                    maps,
+                    self._seed(iteration, CAMERA),
+                    first,
+                    spectral,
+                    radii,
+                )
                 wanted = 0 if self.one_vertex else int(dr.max(count)[0])
                 if wanted <= self.vertex_capacity or not radii:
                     return (block,)

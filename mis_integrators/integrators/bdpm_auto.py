@@ -1,4 +1,5 @@
-"""Plugin `bdpm_auto`: decides from the scene and a short pilot which integrator of this package, or Mitsuba's `path`, renders it."""
+"""Plugin `bdpm_auto`: decides from the scene and a short pilot which integrator of this package, or
+Mitsuba's `path`, renders it."""
 
 from __future__ import annotations
 
@@ -25,14 +26,18 @@ class BDPMAuto(IterativeIntegrator):
        -
        - As of :monosp:`bdpm`.
 
-    Chooses among ``path``, ``bdpm`` and ``bdpm_opt`` with two or three strategies: those that can see all the light of the scene are tried on a few
-    thousand pixels for a few iterations, and the one of which the least error is expected in the time that is planned renders the image. What an
-    iteration costs is counted (segments, photons) and priced, not clocked. Scenes with media are rendered by ``volpath_multiview``.
+    Chooses among ``path``, ``bdpm`` and ``bdpm_opt`` with two or three strategies: those that can
+    see all the light of the scene are tried on a few thousand pixels for a few iterations, and the
+    one of which the least error is expected in the time that is planned renders the image. What an
+    iteration costs is counted (segments, photons) and priced, not clocked. Scenes with media are
+    rendered by ``volpath_multiview``.
 
-    The settings of the image (in the EXR's header) say which integrator was chosen and why, with the predictions; ``mis-render`` prints the reasons,
-    too. Without a time limit, the same seed and number of samples make the same choice and image again. ``bdpm`` with ``bdd`` 0, if chosen, makes the
-    same image by itself. The others' merge radii are judged by the image that this first candidate's pilot saw, so that by themselves they may find
-    different ones. ``path`` draws the random numbers of this package, not those of Mitsuba: the same mean, other noise.
+    The settings of the image (in the EXR's header) say which integrator was chosen and why, with
+    the predictions; ``mis-render`` prints the reasons, too. Without a time limit, the same seed and
+    number of samples make the same choice and image again. ``bdpm`` with ``bdd`` 0, if chosen,
+    makes the same image by itself. The others' merge radii are judged by the image that this first
+    candidate's pilot saw, so that by themselves they may find different ones. ``path`` draws the
+    random numbers of this package, not those of Mitsuba: the same mean, other noise.
 
     .. tabs::
         .. code-tab:: xml
@@ -55,7 +60,9 @@ class BDPMAuto(IterativeIntegrator):
     def new_session(self, scene, sensor, seed, iterations):
         if has_media(scene):
             volumetric = mi.load_dict({"type": "volpath_multiview", **handed_on(self)})
-            return volumetric.session(scene, sensor, seed, (iterations or 0) * self.fewest_camera_paths)
+            return volumetric.session(
+                scene, sensor, seed, (iterations or 0) * self.fewest_camera_paths
+            )
         return AutoSession(self, scene, sensor, seed, iterations)
 
 
@@ -75,18 +82,38 @@ class AutoSession(IterativeSession):
         if self.decision is None:
             return super().settings
         chosen = self.decision.session.settings
-        return {**chosen, "integrator": self.integrator.plugin, "choice": self.decision.plugin,
-                **{f"choice.because.{number}": reason for number, reason in enumerate(self.decision.reasons, 1)},
-                **{f"choice.relmse.{name}": error for name, error in self.decision.errors.items()}}
+        return {
+            **chosen,
+            "integrator": self.integrator.plugin,
+            "choice": self.decision.plugin,
+            **{
+                f"choice.because.{number}": reason
+                for number, reason in enumerate(self.decision.reasons, 1)
+            },
+            **{f"choice.relmse.{name}": error for name, error in self.decision.errors.items()},
+        }
 
     @property
     def remarks(self):
         """Why what renders was chosen, line by line."""
-        return [f"{self.integrator.plugin}: {reason}" for reason in self.decision.reasons] if self.decision else []
+        return (
+            [f"{self.integrator.plugin}: {reason}" for reason in self.decision.reasons]
+            if self.decision
+            else []
+        )
 
     def start(self):
         if self.decision is None:
-            self._take(choose(self.integrator, self.scene, self.sensor, self.seed, self.iterations_planned, self.seconds))
+            self._take(
+                choose(
+                    self.integrator,
+                    self.scene,
+                    self.sensor,
+                    self.seed,
+                    self.iterations_planned,
+                    self.seconds,
+                )
+            )
 
     def _take(self, decision):
         self.decision, self.samples_per_iteration = decision, decision.session.samples_per_iteration
@@ -96,20 +123,35 @@ class AutoSession(IterativeSession):
         if self.decision is None:
             return {}
         decision = self.decision
-        return {"plugin": decision.plugin, "parameters": decision.parameters, "reasons": decision.reasons, "errors": decision.errors,
-                "session": decision.session.learned}
+        return {
+            "plugin": decision.plugin,
+            "parameters": decision.parameters,
+            "reasons": decision.reasons,
+            "errors": decision.errors,
+            "session": decision.session.learned,
+        }
 
     def recall(self, learned):
         if not learned:
             return
         fields = Fields(learned, "learned")
         plugin = fields.choice("plugin", [name for name, _ in CANDIDATES])
-        parameters = fields.choice("parameters", [given for name, given in CANDIDATES if name == plugin])
+        parameters = fields.choice(
+            "parameters", [given for name, given in CANDIDATES if name == plugin]
+        )
         expected = fields.object("errors")
         errors = {name: expected.number(name, positive=False) for name in expected.names()}
         reasons, inner = fields.texts("reasons"), fields.any("session")
         fields.finish()
-        session = new_session(plugin, parameters, self.integrator, self.scene, self.sensor, self.seed, self.iterations_planned)
+        session = new_session(
+            plugin,
+            parameters,
+            self.integrator,
+            self.scene,
+            self.sensor,
+            self.seed,
+            self.iterations_planned,
+        )
         session.recall(inner)
         self.iterations_planned = session.iterations_planned
         self._take(Decision(plugin, parameters, session, reasons, errors))

@@ -1,4 +1,5 @@
-"""Plugin `bdpm_balance`: merging at several camera vertices, under Veach's balance or power heuristic."""
+"""Plugin `bdpm_balance`: merging at several camera vertices, under Veach's balance or power
+heuristic."""
 
 from __future__ import annotations
 
@@ -20,19 +21,22 @@ class BDPMBalance(WeightedBDPM):
 
      * - strategies
        - |int|
-       - How many strategies are mixed: photons are merged at that many first camera vertices that scatter smoothly. From 1 to 6.
-         (Default: 3)
+       - How many strategies are mixed: photons are merged at that many first camera vertices that
+         scatter smoothly. From 1 to 6. (Default: 3)
      * - beta
        - |float|
-       - Exponent of the heuristic, from 1 to 8: 1 is Veach's balance heuristic, 2 his power heuristic. (Default: 1)
-     * - photon_count, initial_radius, alpha, camera_paths, variance, max_depth, rr_depth, hide_emitters
+       - Exponent of the heuristic, from 1 to 8: 1 is Veach's balance heuristic, 2 his power
+         heuristic. (Default: 1)
+     * - photon_count, initial_radius, alpha, camera_paths, variance, max_depth, rr_depth,
+         hide_emitters
        -
        - As of :monosp:`bdpm`.
 
-    The same strategies as those of :monosp:`bdpm_opt`, and the weights that are usual elsewhere to compare it with: each light path is shared
-    among the strategies that can make it in proportion to the densities with which they do (Veach 1997, equations 9.8 and 9.13; densities
-    of merges as Georgiev et al. 2012 have them). That camera paths share their photons, whose noise they do not average out, is outside
-    that theory.
+    The same strategies as those of :monosp:`bdpm_opt`, and the weights that are usual elsewhere to
+    compare it with: each light path is shared among the strategies that can make it in proportion
+    to the densities with which they do (Veach 1997, equations 9.8 and 9.13; densities of merges as
+    Georgiev et al. 2012 have them). That camera paths share their photons, whose noise they do not
+    average out, is outside that theory.
 
     .. tabs::
         .. code-tab:: xml
@@ -52,7 +56,12 @@ class BDPMBalance(WeightedBDPM):
     def read_parameters(self, parameters):
         self.read_photon_parameters(parameters)
         self.strategies = parameters.integer("strategies", 3, 1, "from 1 to 6", high=6)
-        self.beta = parameters.number("beta", 1.0, lambda beta: 1 <= beta <= 8, "from 1 (balance) to 8; 2 is the power heuristic")
+        self.beta = parameters.number(
+            "beta",
+            1.0,
+            lambda beta: 1 <= beta <= 8,
+            "from 1 (balance) to 8; 2 is the power heuristic",
+        )
 
     def settings(self):
         return {**super().settings(), "beta": self.beta}
@@ -67,13 +76,21 @@ class BDPMBalanceSession(WeightedSession):
     def weights(self, merging):
         integrator = self.integrator
         beta = int(integrator.beta) if integrator.beta == int(integrator.beta) else integrator.beta
-        return HeuristicWeights(self.lights, merging["disk_paths"], merging["caustic_share"], integrator.strategies, beta)
+        return HeuristicWeights(
+            self.lights,
+            merging["disk_paths"],
+            merging["caustic_share"],
+            integrator.strategies,
+            beta,
+        )
 
     def merging(self, radii):
         radius = radii.get("indirect", radii.get("caustic"))
         both = {"caustic", "indirect"} <= radii.keys()
-        return {"disk_paths": dr.pi * dr.square(radius) * self.light_paths,
-                "caustic_share": dr.square(radius / radii["caustic"]) if both else mi.Float(1)}
+        return {
+            "disk_paths": dr.pi * dr.square(radius) * self.light_paths,
+            "caustic_share": dr.square(radius / radii["caustic"]) if both else mi.Float(1),
+        }
 
     def weigher(self, weights, kind, level, vertices, photon_map):
         return weights.weigher(kind, level, vertices, photon_map)

@@ -1,4 +1,5 @@
-"""Plugins `bdpm_opt`, `bdpm_opt2`, `bdpm_opt3`: merging at several camera vertices, under optimal weights."""
+"""Plugins `bdpm_opt`, `bdpm_opt2`, `bdpm_opt3`: merging at several camera vertices, under optimal
+weights."""
 
 from __future__ import annotations
 
@@ -7,11 +8,11 @@ import math
 import drjit as dr
 import mitsuba as mi
 
-from ..photons.irradiance_cache import IrradianceCache
-from ..paths.light_pass import trace_light_paths
-from .common import MOST_LIGHT_PATHS
-from ..mis.optimal import OptimalWeights
 from ..mis.neighbour_radiance import Surroundings
+from ..mis.optimal import OptimalWeights
+from ..paths.light_pass import trace_light_paths
+from ..photons.irradiance_cache import IrradianceCache
+from .common import MOST_LIGHT_PATHS
 from .weighted import WeightedBDPM, WeightedSession
 
 USUAL_FROZEN_PATHS = 1 << 17
@@ -33,32 +34,38 @@ class BDPMOpt(WeightedBDPM):
 
      * - strategies
        - |int|
-       - How many strategies are mixed: photons are merged at the camera vertices ``first_vertex``, ``first_vertex`` + 1, ... (vertices
-         that scatter smoothly, counted from 0). (Default: 3)
+       - How many strategies are mixed: photons are merged at the camera vertices ``first_vertex``,
+         ``first_vertex`` + 1, ... (vertices that scatter smoothly, counted from 0). (Default: 3)
      * - first_vertex
        - |int|
        - The first camera vertex at which photons are merged, from 0 to 16. (Default: 0)
      * - weights
        - |string|
-       - ``full`` keeps the means over directions in the optimal weights, estimated from typical neighbours; ``local`` drops them, which
-         is cheaper and on diffuse scenes as good. (Default: ``local``)
+       - ``full`` keeps the means over directions in the optimal weights, estimated from typical
+         neighbours; ``local`` drops them, which is cheaper and on diffuse scenes as good. (Default:
+         ``local``)
      * - mix_diffuse
        - |bool|
-       - Whether strategies go on beyond vertices that scatter as Lambertians do; else a path's first Lambertian vertex is its last strategy. It
-         pays only where a merge disk holds few photons. (Default: where ``initial_radius`` is given, and a typical disk of that radius
+       - Whether strategies go on beyond vertices that scatter as Lambertians do; else a path's
+         first Lambertian vertex is its last strategy. It pays only where a merge disk holds few
+         photons. (Default: where ``initial_radius`` is given, and a typical disk of that radius
          holds less than one photon)
      * - frozen_photons
        - |int|
-       - Light sub-paths of the pass from which the weights learn where light is; they do not contribute to the image. 0 stands for
+       - Light sub-paths of the pass from which the weights learn where light is; they do not
+         contribute to the image. 0 stands for
          131072. (Default: 0)
-     * - photon_count, initial_radius, alpha, camera_paths, variance, max_depth, rr_depth, hide_emitters
+     * - photon_count, initial_radius, alpha, camera_paths, variance, max_depth, rr_depth,
+         hide_emitters
        -
        - As of :monosp:`bdpm`.
 
-    Each light path that several strategies can make, because its photon may be merged at one camera vertex or the next, is shared among
-    them with weights that minimise the noise of the pixel (Ershov, Kopylov and Voloboy 2021, here for any number of strategies by a scalar
-    recursion). What the weights must know of the light around a path comes from a cache of irradiance; an inexact cache costs noise, but
-    leaves the mean as it is. Weights may be negative or exceed one; those of a path sum to one.
+    Each light path that several strategies can make, because its photon may be merged at one camera
+    vertex or the next, is shared among them with weights that minimise the noise of the pixel
+    (Ershov, Kopylov and Voloboy 2021, here for any number of strategies by a scalar recursion).
+    What the weights must know of the light around a path comes from a cache of irradiance; an
+    inexact cache costs noise, but leaves the mean as it is. Weights may be negative or exceed one;
+    those of a path sum to one.
 
     ``bdpm_opt2`` and ``bdpm_opt3`` are the same with ``strategies`` fixed to 2 and 3.
 
@@ -79,16 +86,27 @@ class BDPMOpt(WeightedBDPM):
 
     def read_parameters(self, parameters):
         self.read_photon_parameters(parameters)
-        self.strategies = self.fixed_strategies or parameters.integer("strategies", 3, 1, "from 1 to 6", high=6)
-        self.first_vertex = self.bdd = parameters.integer("first_vertex", 0, 0, "from 0 to 16", high=16)
+        self.strategies = self.fixed_strategies or parameters.integer(
+            "strategies", 3, 1, "from 1 to 6", high=6
+        )
+        self.first_vertex = self.bdd = parameters.integer(
+            "first_vertex", 0, 0, "from 0 to 16", high=16
+        )
         self.weights = parameters.choice("weights", "local", ("full", "local"))
         self.mix_diffuse = parameters.boolean("mix_diffuse", None)
-        self.frozen_photons = parameters.integer("frozen_photons", 0, 0, "at least 0 (0: 131072)", high=MOST_LIGHT_PATHS)
+        self.frozen_photons = parameters.integer(
+            "frozen_photons", 0, 0, "at least 0 (0: 131072)", high=MOST_LIGHT_PATHS
+        )
 
     def settings(self):
         mixing = "automatic" if self.mix_diffuse is None else self.mix_diffuse
-        return {**super().settings(), "first_vertex": self.first_vertex, "weights": self.weights, "mix_diffuse": mixing,
-                "frozen_photons": self.frozen_photons}
+        return {
+            **super().settings(),
+            "first_vertex": self.first_vertex,
+            "weights": self.weights,
+            "mix_diffuse": mixing,
+            "frozen_photons": self.frozen_photons,
+        }
 
     def new_session(self, scene, sensor, seed, iterations):
         return BDPMOptSession(self, scene, sensor, seed, iterations)
@@ -112,8 +130,13 @@ class BDPMOptSession(WeightedSession):
     weighted_pilot = True
 
     def usual_radius(self):
-        """The radius at which a typical lit point has `USUAL_PHOTONS` photons within its merge disk."""
-        area = USUAL_PHOTONS * self.cache.typical_flux / (self.light_paths * max(self.cache.mean, 1e-30))
+        """The radius at which a typical lit point has `USUAL_PHOTONS` photons within its merge
+        disk."""
+        area = (
+            USUAL_PHOTONS
+            * self.cache.typical_flux
+            / (self.light_paths * max(self.cache.mean, 1e-30))
+        )
         return dr.opaque(mi.Float, math.sqrt(area / math.pi))
 
     def __init__(self, integrator, scene, sensor, seed, iterations):
@@ -129,19 +152,32 @@ class BDPMOptSession(WeightedSession):
     def mixes(self):
         if self.undecided and self.integrator.strategies > 1:
             self._learn()
-            photons = self.light_paths * math.pi * max(self.radii.values()) ** 2 * self.cache.mean / max(self.cache.typical_flux, 1e-30)
+            photons = (
+                self.light_paths
+                * math.pi
+                * max(self.radii.values()) ** 2
+                * self.cache.mean
+                / max(self.cache.typical_flux, 1e-30)
+            )
             self.mix_diffuse, self.undecided = photons < FEW_PHOTONS, False
         if not (self.traits.has_rough or self.mix_diffuse):
             return False
         self._learn()
-        return dr.width(self.cache.center) > 0           # where light meets nothing there is nothing to learn, nor to mix
+        return (
+            dr.width(self.cache.center) > 0
+        )  # where light meets nothing there is nothing to learn, nor to mix
 
     def prepare(self, spectral):
         if self.integrator.weights == "full":
-            self.surroundings = Surroundings(self.scene, self.weights({"n": mi.Spectrum(0), "caustic_cost": mi.Float(0)}), spectral["wavelengths"])
+            self.surroundings = Surroundings(
+                self.scene,
+                self.weights({"n": mi.Spectrum(0), "caustic_cost": mi.Float(0)}),
+                spectral["wavelengths"],
+            )
 
     def _learn(self):
-        """One dense light pass, frozen, the first time that it is asked for: for the weights only."""
+        """One dense light pass, frozen, the first time that it is asked for: for the weights
+        only."""
         if self.cache is not None:
             return
         integrator, spectral = self.integrator, self._spectral(0)
@@ -149,31 +185,63 @@ class BDPMOptSession(WeightedSession):
         capacity, found = 0, PHOTONS_A_PATH * paths
         while found > capacity:
             capacity = found
-            photons = trace_light_paths(self.scene, self.lights, self.traits, self._seed(0, FROZEN), paths, capacity, spectral["wavelengths"],
-                                        self.sensor.shutter_open(), self.sensor.shutter_open_time(), integrator.max_depth,
-                                        integrator.rr_depth, keep_direct=True)
+            photons = trace_light_paths(
+                self.scene,
+                self.lights,
+                self.traits,
+                self._seed(0, FROZEN),
+                paths,
+                capacity,
+                spectral["wavelengths"],
+                self.sensor.shutter_open(),
+                self.sensor.shutter_open_time(),
+                integrator.max_depth,
+                integrator.rr_depth,
+                keep_direct=True,
+            )
             dr.eval(photons)
             found = int(photons[2][0])
-        self.cache = IrradianceCache(self.scene, self.lights, *photons, paths, self.traits.bounds, spectral["wavelengths"])
+        self.cache = IrradianceCache(
+            self.scene, self.lights, *photons, paths, self.traits.bounds, spectral["wavelengths"]
+        )
 
     def _freeze(self):
         super()._freeze()
         if self._weighted:
-            self._tables += self.cache.tables() + ([self.surroundings.table, self.surroundings.albedo] if self.surroundings else [])
+            self._tables += self.cache.tables() + (
+                [self.surroundings.table, self.surroundings.albedo] if self.surroundings else []
+            )
 
     def weights(self, merging):
         integrator = self.integrator
-        return OptimalWeights(self.lights, self.traits, self.cache, self.surroundings, merging["n"], merging["caustic_cost"],
-                              integrator.strategies, integrator.first_vertex, self.samples_per_iteration, integrator.weights == "full",
-                              self.mix_diffuse)
+        return OptimalWeights(
+            self.lights,
+            self.traits,
+            self.cache,
+            self.surroundings,
+            merging["n"],
+            merging["caustic_cost"],
+            integrator.strategies,
+            integrator.first_vertex,
+            self.samples_per_iteration,
+            integrator.weights == "full",
+            self.mix_diffuse,
+        )
 
     def merging(self, radii):
         cache = self.cache
-        inverse = [dr.opaque(mi.Float, self.light_paths / flux if flux > 0 else 0.0) for flux in cache.photon_flux]      # no kernel's literals
+        inverse = [
+            dr.opaque(mi.Float, self.light_paths / flux if flux > 0 else 0.0)
+            for flux in cache.photon_flux
+        ]  # no kernel's literals
         radius = radii.get("indirect", radii.get("caustic"))
         dearer = dr.opaque(mi.Float, sum(cache.caustic_flux) / max(sum(cache.photon_flux), 1e-30))
-        return {"n": dr.pi * dr.square(radius) * mi.Spectrum(inverse if len(inverse) > 1 else inverse[0]),
-                "caustic_cost": dearer * dr.square(radius / radii.get("caustic", radius))}
+        return {
+            "n": dr.pi
+            * dr.square(radius)
+            * mi.Spectrum(inverse if len(inverse) > 1 else inverse[0]),
+            "caustic_cost": dearer * dr.square(radius / radii.get("caustic", radius)),
+        }
 
 
 FROZEN = 3

@@ -7,24 +7,33 @@ from functools import partial
 import drjit as dr
 import mitsuba as mi
 
-from ..paths.connect import by_path, join, join_sensor, list_pairs, visible
-from ..core.film import as_camera_weights, colour_channels, expected_weight, splat_channels, splat_samples, with_colour
-from ..paths.sensor import Lens
-from ..lights.lights import Lights
+from ..core.film import (
+    as_camera_weights,
+    colour_channels,
+    expected_weight,
+    splat_channels,
+    splat_samples,
+    with_colour,
+)
 from ..core.packing import rounded_up
 from ..core.random import next_2d, vertex_streams
 from ..core.recording import lanes, recorder
 from ..core.spectra import channel_mean
-from ..paths.subpaths import read_vertices, trace_camera_subpaths, trace_light_subpaths
 from ..core.traits import SceneTraits
-from .common import MOST_LIGHT_PATHS, IterativeIntegrator, IterativeSession
+from ..lights.lights import Lights
 from ..mis.vertex_merging import ConnectionWeights
+from ..paths.connect import by_path, join, join_sensor, list_pairs, visible
+from ..paths.sensor import Lens
+from ..paths.subpaths import read_vertices, trace_camera_subpaths, trace_light_subpaths
+from .common import MOST_LIGHT_PATHS, IterativeIntegrator, IterativeSession
 from .pyramid import Ledger, camera_images, sensor_images, technique_channels, with_rest
 
 CHUNK = 1 << 19
-"""Camera paths, and as many light sub-paths, traced at once at most; larger films are traced in parts (bounds memory)."""
+"""Camera paths, and as many light sub-paths, traced at once at most; larger films are traced in
+parts (bounds memory)."""
 THINNING = 0.05
-"""Joined pairs that would bring less than this share of the mean radiance are left out by Russian roulette."""
+"""Joined pairs that would bring less than this share of the mean radiance are left out by Russian
+roulette."""
 
 
 class BDPT(IterativeIntegrator):
@@ -38,27 +47,30 @@ class BDPT(IterativeIntegrator):
 
      * - beta
        - |float|
-       - Exponent of the heuristic, from 1 to 8: 1 is Veach's balance heuristic, 2 his power heuristic. (Default: 1)
+       - Exponent of the heuristic, from 1 to 8: 1 is Veach's balance heuristic, 2 his power
+         heuristic. (Default: 1)
      * - techniques
        - |int|
-       - Adds an image of its own for each technique (s, t), s vertices from the light and t from the camera, of paths of up to that many
-         segments: channels ``technique.s2.t1.R`` and so on (mono: ``.Y``), and ``technique.rest.*`` for all longer paths. From 0 (none) to 10.
+       - Adds an image of its own for each technique (s, t), s vertices from the light and t from
+         the camera, of paths of up to that many segments: channels ``technique.s2.t1.R`` and so on
+         (mono: ``.Y``), and ``technique.rest.*`` for all longer paths. From 0 (none) to 10.
          (Default: 0)
      * - technique_weights
        - |bool|
-       - Those images show each technique's share, and their sum is the image; |false| shows each as if it were the only technique.
-         (Default: |true|)
+       - Those images show each technique's share, and their sum is the image; |false| shows each as
+         if it were the only technique. (Default: |true|)
      * - camera_paths
        - |int|
        - Camera paths per pixel and iteration, each with a light sub-path of its own. (Default: 1)
      * - variance
        - |bool|
-       - Adds the channels ``var.R``, ``var.G``, ``var.B`` (mono: ``var.Y``): the estimated variance of the pixel mean over the
-         iterations, of which there must be two at least. (Default: no, i.e. |false|)
+       - Adds the channels ``var.R``, ``var.G``, ``var.B`` (mono: ``var.Y``): the estimated variance
+         of the pixel mean over the iterations, of which there must be two at least. (Default: no,
+         i.e. |false|)
      * - max_depth
        - |int|
-       - Longest path in segments, both halves together (-1: unlimited). A value of 1 shows only directly visible emitters, 2 adds
-         direct light, and so on. (Default: -1)
+       - Longest path in segments, both halves together (-1: unlimited). A value of 1 shows only
+         directly visible emitters, 2 adds direct light, and so on. (Default: -1)
      * - rr_depth
        - |int|
        - Depth from which Russian roulette may end a sub-path, in each half. (Default: 5)
@@ -66,12 +78,14 @@ class BDPT(IterativeIntegrator):
        - |bool|
        - Hide directly visible emitters. (Default: no, i.e. |false|)
 
-    Each camera path is traced with a light sub-path. Light comes from emitters that the camera path meets, from next-event estimation,
-    from joining each of its vertices with each of the light sub-path's (few of those that would bring little), and from joining the latter's with
-    the sensor, on perspective, thin-lens and orthographic sensors. All techniques that could have made a path share it by Veach's
-    heuristic (1997, chapter 10).
+    Each camera path is traced with a light sub-path. Light comes from emitters that the camera path
+    meets, from next-event estimation, from joining each of its vertices with each of the light
+    sub-path's (few of those that would bring little), and from joining the latter's with the
+    sensor, on perspective, thin-lens and orthographic sensors. All techniques that could have made
+    a path share it by Veach's heuristic (1997, chapter 10).
 
-    Unbiased, without any parameter to choose. Participating media, polarised variants, gradients and the film ``specfilm`` are refused by name.
+    Unbiased, without any parameter to choose. Participating media, polarised variants, gradients
+    and the film ``specfilm`` are refused by name.
 
     .. tabs::
         .. code-tab:: xml
@@ -95,26 +109,43 @@ class BDPT(IterativeIntegrator):
 
     def read_heuristic(self, parameters):
         """Reads the exponent."""
-        self.beta = parameters.number("beta", 1.0, lambda beta: 1 <= beta <= 8, "from 1 (balance) to 8; 2 is the power heuristic")
+        self.beta = parameters.number(
+            "beta",
+            1.0,
+            lambda beta: 1 <= beta <= 8,
+            "from 1 (balance) to 8; 2 is the power heuristic",
+        )
 
     def aov_names(self):
-        return super().aov_names() + (technique_channels(self.techniques, self.technique_weights) if self.techniques else [])
+        return super().aov_names() + (
+            technique_channels(self.techniques, self.technique_weights) if self.techniques else []
+        )
 
     def settings(self):
-        return {**super().settings(), "beta": self.beta, "techniques": self.techniques, "technique_weights": self.technique_weights}
+        return {
+            **super().settings(),
+            "beta": self.beta,
+            "techniques": self.techniques,
+            "technique_weights": self.technique_weights,
+        }
 
     def new_session(self, scene, sensor, seed, iterations):
         return BDPTSession(self, scene, sensor, seed, iterations)
 
 
 class BDPTSession(IterativeSession):
-    """Iterations of `bdpt`: light sub-paths, camera sub-paths, connections, the light that meets the sensor."""
+    """Iterations of `bdpt`: light sub-paths, camera sub-paths, connections, the light that meets
+    the sensor."""
 
     shortest = 2
     """Segments that a light sub-path adds at least to a camera path with which it is joined."""
-    PASSES = {"_light_pass": ("_trace_light", ("light",)), "_camera_pass": ("_trace_camera", ("camera",)),
-              "_pair_pass": ("_list_pairs", ("light", "camera", "pairs")), "_connection_pass": ("_connect", ("light", "camera", "pairs")),
-              "_sensor_pass": ("_join_sensor", ("light",))}
+    PASSES = {
+        "_light_pass": ("_trace_light", ("light",)),
+        "_camera_pass": ("_trace_camera", ("camera",)),
+        "_pair_pass": ("_list_pairs", ("light", "camera", "pairs")),
+        "_connection_pass": ("_connect", ("light", "camera", "pairs")),
+        "_sensor_pass": ("_join_sensor", ("light",)),
+    }
 
     def __init__(self, integrator, scene, sensor, seed, iterations):
         super().__init__(integrator, scene, sensor, seed, iterations)
@@ -125,10 +156,16 @@ class BDPTSession(IterativeSession):
         self.light_paths = self.chunks * self.light_chunk
         width, height = sensor.film().crop_size()
         self.pixel_paths = width * height * integrator.camera_paths
-        self.capacity = {"light": rounded_up(3 * self.light_chunk), "camera": rounded_up(3 * self.chunk), "pairs": rounded_up(4 * self.chunk)}
+        self.capacity = {
+            "light": rounded_up(3 * self.light_chunk),
+            "camera": rounded_up(3 * self.chunk),
+            "pairs": rounded_up(4 * self.chunk),
+        }
         self.lens = Lens(sensor).connects
         if integrator.techniques:
-            self.accumulator.technique_channels = len(technique_channels(integrator.techniques, integrator.technique_weights))
+            self.accumulator.technique_channels = len(
+                technique_channels(integrator.techniques, integrator.technique_weights)
+            )
         depth = integrator.max_depth
         self.bidirectional = not self.lights.dark and (depth < 0 or depth >= 2)
         self.expected_weight = expected_weight(sensor.film(), integrator.camera_paths)
@@ -152,21 +189,50 @@ class BDPTSession(IterativeSession):
     # ------------------------------------------------------------------ passes
 
     def _trace_light(self, scene, sensor, tables, seed, spectral):
-        return trace_light_subpaths(scene, self.lights, self.traits, self.weights(spectral), seed, self.light_chunk, self.capacity["light"],
-                                    spectral["wavelengths"], sensor.shutter_open(), sensor.shutter_open_time(),
-                                    self.integrator.max_depth, self.integrator.rr_depth)
+        return trace_light_subpaths(
+            scene,
+            self.lights,
+            self.traits,
+            self.weights(spectral),
+            seed,
+            self.light_chunk,
+            self.capacity["light"],
+            spectral["wavelengths"],
+            sensor.shutter_open(),
+            sensor.shutter_open_time(),
+            self.integrator.max_depth,
+            self.integrator.rr_depth,
+        )
 
     def _trace_camera(self, scene, sensor, tables, seed, first, skip, spectral):
         integrator = self.integrator
         ledger = self._ledger() if integrator.techniques else None
         radiance, alpha, position, vertices, count = trace_camera_subpaths(
-            scene, sensor, integrator, self.lights, self.traits, self.weights(spectral), seed, first, skip, self.chunk, integrator.camera_paths,
-            spectral["sample"], integrator.max_depth, integrator.rr_depth, integrator.hide_emitters, self.capacity["camera"], ledger,
-            self.shortest)
+            scene,
+            sensor,
+            integrator,
+            self.lights,
+            self.traits,
+            self.weights(spectral),
+            seed,
+            first,
+            skip,
+            self.chunk,
+            integrator.camera_paths,
+            spectral["sample"],
+            integrator.max_depth,
+            integrator.rr_depth,
+            integrator.hide_emitters,
+            self.capacity["camera"],
+            ledger,
+            self.shortest,
+        )
         return radiance, alpha, position, vertices, count, ledger.entries if ledger else None
 
     def _ledger(self, entries=None):
-        return Ledger(self.chunk, self.integrator.techniques, self.integrator.technique_weights, entries)
+        return Ledger(
+            self.chunk, self.integrator.techniques, self.integrator.technique_weights, entries
+        )
 
     def _list_pairs(self, tables, light, radiance, camera, camera_count, seed, spectral):
         vertices, count, lengths = light
@@ -174,8 +240,21 @@ class BDPTSession(IterativeSession):
         thinning = THINNING if self.integrator.technique_weights else 0
         level = dr.zeros(mi.Float, self.chunk) + dr.mean(channel_mean(radiance)) * thinning
         dr.eval(level, start, order)
-        return list_pairs(self.traits, self.weights(spectral), camera, camera_count, self.capacity["camera"], vertices, start, order, lengths,
-                          self.integrator.max_depth, self.capacity["pairs"], level, seed)
+        return list_pairs(
+            self.traits,
+            self.weights(spectral),
+            camera,
+            camera_count,
+            self.capacity["camera"],
+            vertices,
+            start,
+            order,
+            lengths,
+            self.integrator.max_depth,
+            self.capacity["pairs"],
+            level,
+            seed,
+        )
 
     def _connect(self, scene, tables, radiance, camera, light, pairs, spectral, entries):
         """Radiance of camera paths with that of connections added."""
@@ -186,7 +265,9 @@ class BDPTSession(IterativeSession):
         y = read_vertices(light, dr.gather(mi.UInt32, light_place, index, active), active)
         pair = join(self.traits, z, y, spectral["wavelengths"], active)
         seen = visible(scene, pair, z, active & (dr.max(pair.value) > 0))
-        share = self.weights(spectral).connected(pair, z, y) * dr.gather(mi.Float, factor, index, active)
+        share = self.weights(spectral).connected(pair, z, y) * dr.gather(
+            mi.Float, factor, index, active
+        )
         total = mi.Spectrum(radiance)
         dr.scatter_reduce(dr.ReduceOp.Add, total, pair.value * share, z["path"], seen)
         if entries:
@@ -202,14 +283,26 @@ class BDPTSession(IterativeSession):
         y = read_vertices(vertices, index, active)
         rng = vertex_streams(y["path"], y["number"], seed)
         aperture = next_2d(rng) if sensor.needs_aperture_sample() else mi.Point2f(0.5)
-        joined = join_sensor(scene, self.integrator, self.traits, Lens(sensor), y, aperture, mi.Float(sensor.shutter_open()),
-                             spectral["wavelengths"], self.integrator.hide_emitters, active)
+        joined = join_sensor(
+            scene,
+            self.integrator,
+            self.traits,
+            Lens(sensor),
+            y,
+            aperture,
+            mi.Float(sensor.shutter_open()),
+            spectral["wavelengths"],
+            self.integrator.hide_emitters,
+            active,
+        )
         value = joined.value * (self.pixel_paths / self.light_paths)
         share = self.weights(spectral).seen_by_sensor(joined, y)
         channels = list(colour_channels(value * share, spectral["matrix"]))
         if self.integrator.techniques:
             value = value * share if self.integrator.technique_weights else value
-            channels += sensor_images(self.integrator.techniques, y["depth"], value, spectral["matrix"])
+            channels += sensor_images(
+                self.integrator.techniques, y["depth"], value, spectral["matrix"]
+            )
         return splat_channels(sensor.film(), joined.film, channels, joined.active)
 
     def _splat(self, radiance, alpha, position, first, spectral, entries):
@@ -218,32 +311,61 @@ class BDPTSession(IterativeSession):
         if entries:
             channels = camera_images(self._ledger(entries), spectral["matrix"])
             techniques = splat_channels(film, position, channels, active)
-        return splat_samples(film, position, radiance, alpha, spectral["matrix"], active), techniques
+        return splat_samples(
+            film, position, radiance, alpha, spectral["matrix"], active
+        ), techniques
 
     # ------------------------------------------------------------------ iterations
 
     def _chunk(self, iteration, spectral, chunk, first):
-        """Blocks of one part of the paths: of camera paths, of their techniques, of light that met the sensor (None where there is none)."""
+        """Blocks of one part of the paths: of camera paths, of their techniques, of light that met
+        the sensor (None where there is none)."""
         light = lit = None
         while self.bidirectional:
-            light = self._light_pass(self.scene, self.sensor, self._tables, self._seed(iteration, LIGHT, chunk), spectral)
+            light = self._light_pass(
+                self.scene, self.sensor, self._tables, self._seed(iteration, LIGHT, chunk), spectral
+            )
             if not self._grown("light", light[1]):
                 break
         while True:
             radiance, alpha, position, camera, count, entries = self._camera_pass(
-                self.scene, self.sensor, self._tables, self._seed(iteration, CAMERA), first, dr.opaque(mi.UInt32, 0), spectral)
+                self.scene,
+                self.sensor,
+                self._tables,
+                self._seed(iteration, CAMERA),
+                first,
+                dr.opaque(mi.UInt32, 0),
+                spectral,
+            )
             if not self.bidirectional or not self._grown("camera", count):
                 break
         if self.bidirectional:
             while True:
-                pairs = self._pair_pass(self._tables, light, radiance, camera, count, self._seed(iteration, THIN, chunk), spectral)
+                pairs = self._pair_pass(
+                    self._tables,
+                    light,
+                    radiance,
+                    camera,
+                    count,
+                    self._seed(iteration, THIN, chunk),
+                    spectral,
+                )
                 if not self._grown("pairs", pairs[-1]):
                     break
-            radiance, entries = self._connection_pass(self.scene, self._tables, radiance, camera, light[0], pairs, spectral, entries)
+            radiance, entries = self._connection_pass(
+                self.scene, self._tables, radiance, camera, light[0], pairs, spectral, entries
+            )
             radiance = self._merge(radiance, camera, count, light, spectral)
-            dr.eval(radiance)                              # else its sums may still wait when the film's are made
+            dr.eval(radiance)  # else its sums may still wait when the film's are made
             if self.lens:
-                lit = self._sensor_pass(self.scene, self.sensor, self._tables, light, self._seed(iteration, APERTURE, chunk), spectral)
+                lit = self._sensor_pass(
+                    self.scene,
+                    self.sensor,
+                    self._tables,
+                    light,
+                    self._seed(iteration, APERTURE, chunk),
+                    spectral,
+                )
         return *self._splat(radiance, alpha, position, first, spectral, entries), lit
 
     def _merge(self, radiance, camera, count, light, spectral):
@@ -258,7 +380,9 @@ class BDPTSession(IterativeSession):
             block = with_colour(block, light[:, :, :3])
             techniques = None if techniques is None else techniques + light[:, :, 3:]
         if techniques is not None:
-            techniques = with_rest(techniques, block) if self.integrator.technique_weights else techniques
+            techniques = (
+                with_rest(techniques, block) if self.integrator.technique_weights else techniques
+            )
         self.accumulator.add(block, iteration, techniques)
 
 

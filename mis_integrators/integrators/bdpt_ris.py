@@ -14,12 +14,14 @@ class PCBPT(ResampledIntegrator):
 
     .. pluginparameters::
 
-     * - light_paths, resamples, cache_neighbors, target, light_tracing, camera_paths, variance, max_depth, rr_depth, hide_emitters
+     * - light_paths, resamples, cache_neighbors, target, light_tracing, camera_paths, variance,
+         max_depth, rr_depth, hide_emitters
        -
        - As of :monosp:`bdpt_ris`.
 
-    The connections of :monosp:`bdpt_ris` (Popov, Ramamoorthi, Durand and Drettakis 2015) under weights that know nothing of the resampling: the
-    balance heuristic of the densities with which a light sub-path and a camera sub-path make a path. For comparison.
+    The connections of :monosp:`bdpt_ris` (Popov, Ramamoorthi, Durand and Drettakis 2015) under
+    weights that know nothing of the resampling: the balance heuristic of the densities with which a
+    light sub-path and a camera sub-path make a path. For comparison.
 
     .. tabs::
         .. code-tab:: xml
@@ -48,31 +50,38 @@ class BDPTRIS(ResampledIntegrator):
 
      * - light_paths
        - |int|
-       - Light sub-paths (M) that all camera paths of an iteration share; from 1 to 100000. (Default: 200)
+       - Light sub-paths (M) that all camera paths of an iteration share; from 1 to 100000.
+         (Default: 200)
      * - resamples
        - |int|
-       - Connections (N) of each camera vertex, each to a light vertex drawn anew; from 1 to 1024. (Default: 1)
+       - Connections (N) of each camera vertex, each to a light vertex drawn anew; from 1 to 1024.
+         (Default: 1)
      * - cache_neighbors
        - |int|
        - Cache points whose pmfs a camera vertex mixes (N_c); from 1 to 16. (Default: 3)
      * - target
        - |string|
-       - What the pmfs are proportional to: ``f_y_rho_g_v`` is a light vertex's light at the cache point, visibility included; ``f_y_f_yz`` also has the
-         BSDF there. (Default: ``f_y_rho_g_v``)
+       - What the pmfs are proportional to: ``f_y_rho_g_v`` is a light vertex's light at the cache
+         point, visibility included; ``f_y_f_yz`` also has the BSDF there. (Default:
+         ``f_y_rho_g_v``)
      * - light_tracing
        - |float|
-       - Light sub-paths that are joined to the sensor, for each camera path (N_t); from 0.125 to 8. 0 stands for as many as pay, up to 1, by noise and
-         cost, which the first iteration tells (1 in it, and in renders of fewer than 8 iterations). (Default: 0)
+       - Light sub-paths that are joined to the sensor, for each camera path (N_t); from 0.125 to 8.
+         0 stands for as many as pay, up to 1, by noise and cost, which the first iteration tells (1
+         in it, and in renders of fewer than 8 iterations). (Default: 0)
      * - camera_paths
        - |int|
-       - Camera paths per pixel and iteration, which share its light sub-paths and pmfs. (Default: 4)
+       - Camera paths per pixel and iteration, which share its light sub-paths and pmfs. (Default:
+         4)
      * - variance
        - |bool|
-       - Adds the channels ``var.R``, ``var.G``, ``var.B`` (mono: ``var.Y``): the estimated variance of the pixel mean over the
-         iterations, of which there must be two at least. (Default: no, i.e. |false|)
+       - Adds the channels ``var.R``, ``var.G``, ``var.B`` (mono: ``var.Y``): the estimated variance
+         of the pixel mean over the iterations, of which there must be two at least. (Default: no,
+         i.e. |false|)
      * - max_depth
        - |int|
-       - Longest path in segments (-1: unlimited). A value of 1 shows only directly visible emitters, 2 adds direct light, and so on. (Default: -1)
+       - Longest path in segments (-1: unlimited). A value of 1 shows only directly visible
+         emitters, 2 adds direct light, and so on. (Default: -1)
      * - rr_depth
        - |int|
        - Depth from which Russian roulette may end a sub-path, in each half. (Default: 5)
@@ -80,12 +89,14 @@ class BDPTRIS(ResampledIntegrator):
        - |bool|
        - Hide directly visible emitters. (Default: no, i.e. |false|)
 
-    Each iteration traces light sub-paths and, at cache points strewn over what the camera sees, makes the pmf of the light vertices of M of them,
-    with shadow rays. A camera vertex draws the light vertices that it connects to from the pmfs of the cache points near it. Light tracing and
-    emission that camera paths meet are techniques beside it, and the weights of all know that the connections were resampled (Nabata, Iwasaki and Dobashi
-    2020). Unbiased.
+    Each iteration traces light sub-paths and, at cache points strewn over what the camera sees,
+    makes the pmf of the light vertices of M of them, with shadow rays. A camera vertex draws the
+    light vertices that it connects to from the pmfs of the cache points near it. Light tracing and
+    emission that camera paths meet are techniques beside it, and the weights of all know that the
+    connections were resampled (Nabata, Iwasaki and Dobashi 2020). Unbiased.
 
-    Participating media, polarised variants, gradients and the film ``specfilm`` are refused by name.
+    Participating media, polarised variants, gradients and the film ``specfilm`` are refused by
+    name.
 
     .. tabs::
         .. code-tab:: xml

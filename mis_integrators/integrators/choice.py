@@ -1,8 +1,10 @@
-"""The choice of `bdpm_auto`: which integrator will have the least error in the time that there is, predicted from a pilot.
+"""The choice of `bdpm_auto`: which integrator will have the least error in the time that there is,
+predicted from a pilot.
 
-Every candidate is tried on the same few thousand pixels. Its error after n iterations is its squared bias (the blur of the photons' disks) plus its
-variance over n, both relative and pixel by pixel (`transport.radius`); n follows from what an iteration costs (`costs`). Candidates that cannot see
-some of the light are not tried.
+Every candidate is tried on the same few thousand pixels. Its error after n iterations is its
+squared bias (the blur of the photons' disks) plus its variance over n, both relative and pixel by
+pixel (`transport.radius`); n follows from what an iteration costs (`costs`). Candidates that cannot
+see some of the light are not tried.
 """
 
 from __future__ import annotations
@@ -13,32 +15,43 @@ from dataclasses import dataclass, field
 import mitsuba as mi
 import numpy as np
 
-from ..paths.path_length_statistics import mean_segments
-from ..pilot.radius import relative_weights, usual_mean
 from ..core.recording import lanes
 from ..core.spectra import channel_mean
-from . import costs
+from ..paths.path_length_statistics import mean_segments
+from ..pilot.radius import relative_weights, usual_mean
 from ..pilot.run import FEWEST_ITERATIONS, PILOT_INDEX, UNPLANNED_ITERATIONS, pilot_pixels
+from . import costs
 from .unidirectional import PathSession
 
-PHOTON_MAPPERS = FIRST, OPT2, LATER, OPT3 = ("bdpm", {"bdd": 0}), ("bdpm_opt2", {}), ("bdpm", {"bdd": 1}), ("bdpm_opt3", {})
+PHOTON_MAPPERS = FIRST, OPT2, LATER, OPT3 = (
+    ("bdpm", {"bdd": 0}),
+    ("bdpm_opt2", {}),
+    ("bdpm", {"bdd": 1}),
+    ("bdpm_opt3", {}),
+)
 """The first is tried in any case."""
 CANDIDATES = ("path", {}), *PHOTON_MAPPERS
 PILOT_SHARE = 0.05
-"""Share of the planned time that the pilot may have; `path` and the first photon mapper are tried however long that takes."""
+"""Share of the planned time that the pilot may have; `path` and the first photon mapper are tried
+however long that takes."""
 KEEPS_UP = 4
-"""Where the error expected of `path` is at most so many times that of the first photon mapper, camera paths find much of the light by themselves, and what
-spoils photon maps are highlights on glossy surfaces: optimal weights are likely to be the best. (Where `path` is ahead, they seldom are by more than
-their trial takes.)"""
+"""Where the error expected of `path` is at most so many times that of the first photon mapper,
+camera paths find much of the light by themselves, and what spoils photon maps are highlights on
+glossy surfaces: optimal weights are likely to be the best. (Where `path` is ahead, they seldom are
+by more than their trial takes.)"""
 WORTH_SHARE = 0.3
-"""The share of the time that is left that a trial may then take. If it is won, nothing of it was in vain."""
+"""The share of the time that is left that a trial may then take. If it is won, nothing of it was in
+vain."""
 LIKE_THE_FIRST = 2.5
-"""What trying another photon mapper takes, in the seconds that the first one took (optimal weights have to learn first): 1.6 to 3."""
+"""What trying another photon mapper takes, in the seconds that the first one took (optimal weights
+have to learn first): 1.6 to 3."""
 PATH_TRIALS = 12
 UNSEEN = 1e-3
-"""Share of the light, brought by caustics, from which on a `path` that cannot see them is out of the question."""
+"""Share of the light, brought by caustics, from which on a `path` that cannot see them is out of
+the question."""
 RARE = 0.02
-"""The same for a `path` that meets them by chance only: so seldom that a pilot does not see how noisy they are."""
+"""The same for a `path` that meets them by chance only: so seldom that a pilot does not see how
+noisy they are."""
 
 
 @dataclass
@@ -53,7 +66,8 @@ class Decision:
     """Relative mean squared errors predicted, by candidate."""
     trials: list[Trial] = field(default_factory=list)
     usual_cost: float = 0.0
-    """Of an iteration of the first photon mapper, a pixel; the time planned for is counted in those."""
+    """Of an iteration of the first photon mapper, a pixel; the time planned for is counted in
+    those."""
 
 
 @dataclass
@@ -80,7 +94,10 @@ class Trial:
 
 def handed_on(integrator):
     """The parameters that every integrator of this package shares."""
-    return {name: getattr(integrator, name) for name in ("max_depth", "rr_depth", "hide_emitters", "camera_paths", "variance")}
+    return {
+        name: getattr(integrator, name)
+        for name in ("max_depth", "rr_depth", "hide_emitters", "camera_paths", "variance")
+    }
 
 
 def name_of(plugin, parameters):
@@ -89,7 +106,8 @@ def name_of(plugin, parameters):
 
 
 def choose(integrator, scene, sensor, seed, iterations, seconds):
-    """The `Decision` for a render of so many iterations, or of so many seconds (either may be `None`)."""
+    """The `Decision` for a render of so many iterations, or of so many seconds (either may be
+    `None`)."""
     began = time.perf_counter()
     path = PathSession(integrator, scene, sensor, seed, iterations)
     plugin, parameters = FIRST
@@ -100,12 +118,20 @@ def choose(integrator, scene, sensor, seed, iterations, seconds):
     first.start()
     forecast = first.forecast
     if forecast is None:
-        return Decision("path", {}, path, ["path: no camera path meets a surface that scatters smoothly"])
+        return Decision(
+            "path", {}, path, ["path: no camera path meets a surface that scatters smoothly"]
+        )
     first_seconds = time.perf_counter() - began
 
     stride, pixels, _ = pilot_pixels(first)
-    segments = mean_segments(scene, sensor, seed, stride, pixels, integrator.max_depth, integrator.rr_depth)
-    trials, reasons, spent = [_trial(plugin, parameters, first, segments)], [], _pilot_cost(first, segments)
+    segments = mean_segments(
+        scene, sensor, seed, stride, pixels, integrator.max_depth, integrator.rr_depth
+    )
+    trials, reasons, spent = (
+        [_trial(plugin, parameters, first, segments)],
+        [],
+        _pilot_cost(first, segments),
+    )
     usual = trials[0].cost
     budget = (forecast.count if seconds else iterations or UNPLANNED_ITERATIONS) * usual
     blind = _why_not_path(first, forecast)
@@ -113,25 +139,53 @@ def choose(integrator, scene, sensor, seed, iterations, seconds):
         reasons.append(blind)
     else:
         trials.insert(0, _try_path(path, segments, stride, pixels, forecast.mean))
-    weighting = not blind and 1 < trials[0].error(budget) / max(trials[1].error(budget), 1e-30) < KEEPS_UP
+    weighting = (
+        not blind and 1 < trials[0].error(budget) / max(trials[1].error(budget), 1e-30) < KEEPS_UP
+    )
     for plugin, parameters in later_candidates(first.traits):
         name = name_of(plugin, parameters)
         if plugin.startswith("bdpm_opt") and not first.traits.has_rough:
-            reasons.append(f"not {name}: all smooth surfaces are diffuse, where one strategy does as well")
+            reasons.append(
+                f"not {name}: all smooth surfaces are diffuse, where one strategy does as well"
+            )
             continue
-        if plugin == "bdpm_opt3" and not first.traits.has_mixed and trials[-1].name.endswith("bdd=1") and _worse(trials, budget):
-            reasons.append(f"not {name}: merging at the second vertex does not pay, let alone at the third")
+        if (
+            plugin == "bdpm_opt3"
+            and not first.traits.has_mixed
+            and trials[-1].name.endswith("bdd=1")
+            and _worse(trials, budget)
+        ):
+            reasons.append(
+                f"not {name}: merging at the second vertex does not pay, let alone at the third"
+            )
             continue
         if seconds is None:
             whole, gone, takes = budget, spent, FEWEST_ITERATIONS * usual * 0.5
         else:
-            whole, gone, takes = seconds, time.perf_counter() - began, LIKE_THE_FIRST * first_seconds
+            whole, gone, takes = (
+                seconds,
+                time.perf_counter() - began,
+                LIKE_THE_FIRST * first_seconds,
+            )
         likely = weighting and plugin.startswith("bdpm_opt")
-        if gone + takes > PILOT_SHARE * whole and not (likely and takes < WORTH_SHARE * (whole - gone)):
-            reasons.append(f"not {name}: trying it would take more than {WORTH_SHARE if likely else PILOT_SHARE:.0%} of the time")
+        if gone + takes > PILOT_SHARE * whole and not (
+            likely and takes < WORTH_SHARE * (whole - gone)
+        ):
+            reasons.append(
+                f"not {name}: trying it would take more than {WORTH_SHARE if likely else PILOT_SHARE:.0%} of the time"
+            )
             continue
         weighting &= not likely
-        session = new_session(plugin, parameters, integrator, scene, sensor, seed, max(int(budget / usual), 1), (first.traits, first.lights))
+        session = new_session(
+            plugin,
+            parameters,
+            integrator,
+            scene,
+            sensor,
+            seed,
+            max(int(budget / usual), 1),
+            (first.traits, first.lights),
+        )
         session.judged_by, session.seconds, session.begun = forecast.mean, seconds, began
         session.start()
         if session.forecast is None:
@@ -139,24 +193,28 @@ def choose(integrator, scene, sensor, seed, iterations, seconds):
         trials.append(_trial(plugin, parameters, session, segments))
         spent += _pilot_cost(session, segments)
     best = min(trials, key=lambda trial: trial.error(budget))
-    reasons.insert(0, f"{best.name}: least predicted error in this time; bias {best.squared_bias:.2g}, noise "
-                      f"{best.variance * best.cost / budget:.2g} (squared, relative)")
+    reasons.insert(
+        0,
+        f"{best.name}: least predicted error in this time; bias {best.squared_bias:.2g}, noise "
+        f"{best.variance * best.cost / budget:.2g} (squared, relative)",
+    )
     best.session.iterations_planned = iterations
     for trial in trials:
         if trial is not best:
-            trial.session = None                              # its photons' and kernels' memory is free to go
+            trial.session = None  # its photons' and kernels' memory is free to go
     errors = {trial.name: float(trial.error(budget)) for trial in trials}
     return Decision(best.plugin, best.parameters, best.session, reasons, errors, trials, usual)
 
 
 def later_candidates(traits):
-    """Photon mappers, those first that are most often the best. Within and behind rough glass camera paths meet it twice before photons are of use: three
-    strategies."""
+    """Photon mappers, those first that are most often the best. Within and behind rough glass
+    camera paths meet it twice before photons are of use: three strategies."""
     return (OPT3, OPT2, LATER) if traits.has_rough_glass else (OPT2, LATER, OPT3)
 
 
 def new_session(plugin, parameters, integrator, scene, sensor, seed, iterations, survey=None):
-    """A session of a candidate, with the parameters of `integrator` that all share; `survey` as in `BDPM`."""
+    """A session of a candidate, with the parameters of `integrator` that all share; `survey` as in
+    `BDPM`."""
     if plugin == "path":
         return PathSession(integrator, scene, sensor, seed, iterations)
     made = mi.load_dict({"type": plugin, **handed_on(integrator), **parameters})
@@ -176,7 +234,9 @@ def _why_not_path(session, forecast):
         return None
     if not session.traits.has_light_surfaces or session.lights.needs_photons_for_direct_light():
         if forecast.caustic_share > UNSEEN:
-            return f"not path: it cannot see the caustics, {forecast.caustic_share:.1%} of the light"
+            return (
+                f"not path: it cannot see the caustics, {forecast.caustic_share:.1%} of the light"
+            )
     elif forecast.caustic_share > RARE:
         return f"not path: it would meet the caustics, {forecast.caustic_share:.1%} of the light, by chance only"
     return None
@@ -185,7 +245,14 @@ def _why_not_path(session, forecast):
 def _trial(plugin, parameters, session, segments):
     forecast = session.forecast
     counted = costs.events(session, segments, session.last_vertex, forecast.gathered)
-    return Trial(plugin, parameters, session, forecast.squared_bias, forecast.variance, costs.cost(plugin, counted) * forecast.cost_of_paths)
+    return Trial(
+        plugin,
+        parameters,
+        session,
+        forecast.squared_bias,
+        forecast.variance,
+        costs.cost(plugin, counted) * forecast.cost_of_paths,
+    )
 
 
 def _pilot_cost(session, segments):
@@ -197,18 +264,33 @@ def _pilot_cost(session, segments):
 
 def _try_path(path, segments, stride, pixels, mean):
     """`path` on the pilot's pixels."""
-    passes = PATH_TRIALS if mi.is_spectral else 1            # wavelengths are shared by all that is traced at once
+    passes = (
+        PATH_TRIALS if mi.is_spectral else 1
+    )  # wavelengths are shared by all that is traced at once
     together = PATH_TRIALS // passes
     trial = lanes(together * pixels) // pixels
     values = []
     stride *= path.samples_per_iteration
-    first = trial * (-pixels * stride % 2 ** 32)             # back to the first pixel
+    first = trial * (-pixels * stride % 2**32)  # back to the first pixel
     for number in range(PILOT_INDEX, PILOT_INDEX + passes):
-        radiance, *_ = path.trace(number, 0, first, stride, together * pixels, path._spectral(number), trial)
-        values += list(np.broadcast_to(np.array(channel_mean(radiance)), together * pixels).reshape(together, pixels))
+        radiance, *_ = path.trace(
+            number, 0, first, stride, together * pixels, path._spectral(number), trial
+        )
+        values += list(
+            np.broadcast_to(np.array(channel_mean(radiance)), together * pixels).reshape(
+                together, pixels
+            )
+        )
     path.sampler.seed(0, 1)
     variance = usual_mean(relative_weights(mean) * np.var(values, axis=0, ddof=1))
-    return Trial("path", {}, path, 0.0, variance / path.samples_per_iteration, costs.cost("path", costs.events(path, segments, None, 0.0)) * path.samples_per_iteration)
+    return Trial(
+        "path",
+        {},
+        path,
+        0.0,
+        variance / path.samples_per_iteration,
+        costs.cost("path", costs.events(path, segments, None, 0.0)) * path.samples_per_iteration,
+    )
 
 
 def _worse(trials, budget):

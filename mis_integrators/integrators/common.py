@@ -1,4 +1,5 @@
-"""What the iterating integrators share: parameters, the session that runs iterations, and the film at the end."""
+"""What the iterating integrators share: parameters, the session that runs iterations, and the film
+at the end."""
 
 from __future__ import annotations
 
@@ -8,31 +9,32 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..paths.camera_pass import film_sample_count, with_gaps
 from ..core.film import Accumulator, shared_wavelengths, variance_channels
 from ..core.packing import rounded_up
 from ..core.random import mix
 from ..core.recording import settle
-from ..core.traits import UnsupportedScene, check_film, check_scene, check_variant, unfinite_data
 from ..core.render_lock import TURN, by_turns
+from ..core.traits import UnsupportedScene, check_film, check_scene, check_variant, unfinite_data
 from ..core.untrusted import Fields
+from ..paths.camera_pass import film_sample_count, with_gaps
 from .parameters import Parameters
 
-
-MOST_PATHS = 2 ** 32 - 1
+MOST_PATHS = 2**32 - 1
 """Camera paths of an iteration at most: their numbers have 32 bits."""
-MOST_LIGHT_PATHS = 2 ** 28
+MOST_LIGHT_PATHS = 2**28
 """Light sub-paths of an iteration at most: the words of their photons are numbered with 32 bits."""
 
 
 class IterativeIntegrator(mi.AdjointIntegrator):
     """Base of integrators that render by independent iterations and average them.
 
-    A subclass reads its own parameters in `read_parameters` and makes the object that runs iterations in `new_session`.
+    A subclass reads its own parameters in `read_parameters` and makes the object that runs
+    iterations in `new_session`.
     """
 
     CAMERA_PATHS = 1, 1, "at least 1"
-    """Default, least value and range in words of the parameter `camera_paths`; 0 stands for as many as the session finds worth while."""
+    """Default, least value and range in words of the parameter `camera_paths`; 0 stands for as many
+    as the session finds worth while."""
 
     def __init__(self, props):
         parameters = Parameters(props)
@@ -50,7 +52,8 @@ class IterativeIntegrator(mi.AdjointIntegrator):
         """Reads the subclass's own parameters (there need not be any)."""
 
     def new_session(self, scene, sensor, seed, iterations):
-        """The object that runs iterations; see `mis_integrators.core.session.Session`. Every subclass has its own."""
+        """The object that runs iterations; see `mis_integrators.core.session.Session`. Every
+        subclass has its own."""
         raise TypeError(f"{type(self).__name__} does not define new_session")
 
     def check(self, scene, sensor):
@@ -66,58 +69,83 @@ class IterativeIntegrator(mi.AdjointIntegrator):
 
     @property
     def fewest_camera_paths(self):
-        """The parameter `camera_paths`; where it is automatic, one: until more turn out to be worth while."""
+        """The parameter `camera_paths`; where it is automatic, one: until more turn out to be worth
+        while."""
         return self.camera_paths or 1
 
     def settings(self):
         """Parameter names and values."""
-        return {"max_depth": self.max_depth, "rr_depth": self.rr_depth, "hide_emitters": self.hide_emitters,
-                "camera_paths": self.camera_paths, "variance": self.variance}
+        return {
+            "max_depth": self.max_depth,
+            "rr_depth": self.rr_depth,
+            "hide_emitters": self.hide_emitters,
+            "camera_paths": self.camera_paths,
+            "variance": self.variance,
+        }
 
     def session(self, scene, sensor=0, seed=0, spp=0):
-        """Prepares a rendering of `scene` with `spp` camera paths a pixel, or without a planned end if `spp` is 0."""
+        """Prepares a rendering of `scene` with `spp` camera paths a pixel, or without a planned end
+        if `spp` is 0."""
         sensor = self._sensor(scene, sensor)
         check_film(sensor, self.plugin)
         self.check(scene, sensor)
         self.check_path_number([sensor])
-        return self.new_session(scene, sensor, scalar_seed(seed), self.planned_iterations(spp, self.fewest_camera_paths))
+        return self.new_session(
+            scene, sensor, scalar_seed(seed), self.planned_iterations(spp, self.fewest_camera_paths)
+        )
 
     def check_path_number(self, sensors):
-        """Raises `ValueError` where an iteration would have more camera paths than can be numbered."""
+        """Raises `ValueError` where an iteration would have more camera paths than can be
+        numbered."""
         pixels = sum(film_sample_count(sensor) for sensor in sensors)
         if self.fewest_camera_paths * pixels > MOST_PATHS:
-            raise ValueError(f'{self.plugin}: parameter "camera_paths" = {self.camera_paths} makes more than {MOST_PATHS} paths an iteration on '
-                             f"{pixels} pixels; ask for more samples per pixel (spp), and so more iterations, instead, or crop the film")
+            raise ValueError(
+                f'{self.plugin}: parameter "camera_paths" = {self.camera_paths} makes more than {MOST_PATHS} paths an iteration on '
+                f"{pixels} pixels; ask for more samples per pixel (spp), and so more iterations, instead, or crop the film"
+            )
 
     def planned_iterations(self, spp, camera_paths):
-        """Iterations of `camera_paths` that make `spp` camera paths a pixel; None (no planned end) if `spp` is 0."""
+        """Iterations of `camera_paths` that make `spp` camera paths a pixel; None (no planned end)
+        if `spp` is 0."""
         if not spp:
             return None
         iterations = -(-spp // camera_paths)
         if self.variance and iterations < 2:
-            raise ValueError(f'{self.plugin}: parameter "variance" needs at least two iterations; ask for spp > '
-                             f'{camera_paths}')
+            raise ValueError(
+                f'{self.plugin}: parameter "variance" needs at least two iterations; ask for spp > '
+                f"{camera_paths}"
+            )
         return iterations
 
     def say_rounded(self, session, spp):
         """Warns where a session of `spp` samples per pixel makes more of them."""
         iterations, camera_paths = session.iterations_planned, session.samples_per_iteration
         if iterations * camera_paths != spp:
-            mi.Log(mi.LogLevel.Warn, f"{self.plugin}: {spp} samples per pixel rounded up to {iterations} iterations of "
-                                     f"camera_paths = {camera_paths}")
+            mi.Log(
+                mi.LogLevel.Warn,
+                f"{self.plugin}: {spp} samples per pixel rounded up to {iterations} iterations of "
+                f"camera_paths = {camera_paths}",
+            )
 
     def say_unfinite(self, session):
-        """Warns where values of a session that are not finite were left out, and names the data of the scene that may be to blame."""
+        """Warns where values of a session that are not finite were left out, and names the data of
+        the scene that may be to blame."""
         if pixels := session.unfinite_pixels():
             causes = "; ".join(unfinite_data(session.scene))
-            mi.Log(mi.LogLevel.Warn, f"{self.plugin}: {pixels} pixels had values that are not finite, which are left out" + (f": {causes}" if causes else ""))
+            mi.Log(
+                mi.LogLevel.Warn,
+                f"{self.plugin}: {pixels} pixels had values that are not finite, which are left out"
+                + (f": {causes}" if causes else ""),
+            )
 
     def _sensor(self, scene, sensor):
         check_variant(scene, self.plugin)
         if isinstance(sensor, int):
             sensors = scene.sensors()
             if not 0 <= sensor < len(sensors):
-                raise UnsupportedScene(f"{self.plugin}: the scene has {len(sensors)} sensors; sensor {sensor} does not exist")
+                raise UnsupportedScene(
+                    f"{self.plugin}: the scene has {len(sensors)} sensors; sensor {sensor} does not exist"
+                )
             return sensors[sensor]
         return sensor
 
@@ -147,10 +175,11 @@ class IterativeIntegrator(mi.AdjointIntegrator):
 
 
 class IterativeSession:
-    """Runs iterations and accumulates them; a subclass implements `_iteration(index) -> block tensor`.
+    """Runs iterations and accumulates them; a subclass implements `_iteration(index) -> block
+    tensor`.
 
-    `seed` is an integer; iteration `i` draws all its random numbers from (seed, i), so iterations are independent and any
-    subset of them can be rendered anywhere.
+    `seed` is an integer; iteration `i` draws all its random numbers from (seed, i), so iterations
+    are independent and any subset of them can be rendered anywhere.
     """
 
     def __init__(self, integrator, scene, sensor, seed, iterations):
@@ -181,11 +210,13 @@ class IterativeSession:
         self.accumulator.with_variance = True
 
     def estimate(self):
-        """Mean colour so far and its estimated variance: float64, (height, width, 3) each. Needs two iterations at least, and `keep_variance`."""
+        """Mean colour so far and its estimated variance: float64, (height, width, 3) each. Needs
+        two iterations at least, and `keep_variance`."""
         return self.accumulator.estimate()
 
     def unfinite_pixels(self):
-        """How many pixels had values that are not finite in some iteration; those values are left out."""
+        """How many pixels had values that are not finite in some iteration; those values are left
+        out."""
         return self.accumulator.unfinite_pixels()
 
     def sum_shapes(self):
@@ -193,15 +224,18 @@ class IterativeSession:
         return self.accumulator.shapes()
 
     def start(self):
-        """Finds out what must be known before the first iteration, unless it is known: pilots, caches."""
+        """Finds out what must be known before the first iteration, unless it is known: pilots,
+        caches."""
 
     @property
     def learned(self):
-        """What `start` has found out and the seed alone would not tell again, in JSON's types: the radii that a pilot has chosen."""
+        """What `start` has found out and the seed alone would not tell again, in JSON's types: the
+        radii that a pilot has chosen."""
         return {}
 
     def recall(self, learned):
-        """Takes over what another session of the same render has `learned`; before the first iteration. Raises `Malformed` if it cannot be that."""
+        """Takes over what another session of the same render has `learned`; before the first
+        iteration. Raises `Malformed` if it cannot be that."""
         Fields(learned, "learned").finish()
 
     def most_camera_paths(self):
@@ -209,59 +243,86 @@ class IterativeSession:
         return max(1, MOST_PATHS // film_sample_count(self.sensor))
 
     def resize(self, camera_paths):
-        """Makes iterations of another number of camera paths a pixel; about as many samples as before are planned."""
+        """Makes iterations of another number of camera paths a pixel; about as many samples as
+        before are planned."""
         if self.iterations_planned:
-            self.iterations_planned = math.ceil(self.iterations_planned * self.samples_per_iteration / camera_paths)
+            self.iterations_planned = math.ceil(
+                self.iterations_planned * self.samples_per_iteration / camera_paths
+            )
         self.samples_per_iteration = camera_paths
 
     @property
     def settings(self):
         """Names and values that reproduce the image, together with the scene."""
-        return {"integrator": self.integrator.plugin, **self.integrator.settings(), "camera_paths": self.samples_per_iteration, "seed": self.seed}
+        return {
+            "integrator": self.integrator.plugin,
+            **self.integrator.settings(),
+            "camera_paths": self.samples_per_iteration,
+            "seed": self.seed,
+        }
 
     @by_turns
     def iterate(self, iteration=None):
         """Runs one iteration to its end: that of the given number, or the first that is missing."""
         if mi.variant() != self.variant:
-            raise RuntimeError(f"{self.integrator.plugin}: this render was begun under the variant {self.variant}, but the active one is now "
-                               f"{mi.variant()}")
+            raise RuntimeError(
+                f"{self.integrator.plugin}: this render was begun under the variant {self.variant}, but the active one is now "
+                f"{mi.variant()}"
+            )
         with dr.suspend_grad(), self.sums.all_or_nothing():
             self._run(self.sums.done.first_missing if iteration is None else iteration)
             dr.eval(self.sums.tensors)
             dr.sync_thread()
 
     PASSES = {}
-    """Recorded passes of sessions whose buffers grow one by one: the method of each, and the buffers that it uses."""
+    """Recorded passes of sessions whose buffers grow one by one: the method of each, and the
+    buffers that it uses."""
 
     def _record(self, grown):
-        """Records the `PASSES` anew, or those that use the buffer that has `grown`; from the second iteration on, kernels run without their Python."""
+        """Records the `PASSES` anew, or those that use the buffer that has `grown`; from the second
+        iteration on, kernels run without their Python."""
         for name, (function, buffers) in self.PASSES.items():
             if grown is None or grown in buffers:
                 setattr(self, name, self.recorded(getattr(self, function)))
 
     def split_paths(self, largest):
-        """Splits the `path_count` camera paths of an iteration into `chunks` parts of `chunk` paths, all those of a pixel in the same part and about `largest` at
-        most: that bounds memory."""
+        """Splits the `path_count` camera paths of an iteration into `chunks` parts of `chunk`
+        paths, all those of a pixel in the same part and about `largest` at most: that bounds
+        memory."""
         self.path_count = film_sample_count(self.sensor) * self.samples_per_iteration
         self.chunks = -(-self.path_count // largest)
-        self.chunk = -(-self.path_count // (self.chunks * self.samples_per_iteration)) * self.samples_per_iteration
+        self.chunk = (
+            -(-self.path_count // (self.chunks * self.samples_per_iteration))
+            * self.samples_per_iteration
+        )
 
     def sum_of_chunks(self, render):
-        """What `render(chunk, first)` returns, a tuple of tensors or `None`s, summed over all parts; `first`: the number of the part's first path."""
+        """What `render(chunk, first)` returns, a tuple of tensors or `None`s, summed over all
+        parts; `first`: the number of the part's first path."""
         total = None
         for chunk in range(self.chunks):
             blocks = render(chunk, dr.opaque(mi.UInt32, chunk * self.chunk))
-            total = blocks if total is None else tuple(None if a is None else a + b for a, b in zip(total, blocks))
+            total = (
+                blocks
+                if total is None
+                else tuple(None if a is None else a + b for a, b in zip(total, blocks))
+            )
         return total
 
     def all_over_the_film(self, chunk=0):
-        """Numbers `first` and `skip` of a part's camera paths that see all of the film, as of `trace_camera_vertices`: for pilots, or for all parts."""
+        """Numbers `first` and `skip` of a part's camera paths that see all of the film, as of
+        `trace_camera_vertices`: for pilots, or for all parts."""
         paths = self.samples_per_iteration
         return dr.opaque(mi.UInt32, chunk * paths), dr.opaque(mi.UInt32, paths * (self.chunks - 1))
 
     def in_chunk(self, first, skip=0):
-        """Which of `chunk` paths from number `first` on there are, with gaps of `skip` after each pixel's: the last part may have fewer."""
-        return dr.arange(mi.UInt32, self.chunk) + with_gaps(first, skip, self.chunk, self.samples_per_iteration) < self.path_count
+        """Which of `chunk` paths from number `first` on there are, with gaps of `skip` after each
+        pixel's: the last part may have fewer."""
+        return (
+            dr.arange(mi.UInt32, self.chunk)
+            + with_gaps(first, skip, self.chunk, self.samples_per_iteration)
+            < self.path_count
+        )
 
     def _run(self, iteration):
         """Adds an iteration to the sums."""
@@ -271,15 +332,17 @@ class IterativeSession:
     """Purpose of the random seed of an iteration's wavelengths."""
 
     def _spectral(self, iteration):
-        """The wavelengths that all sub-paths of an iteration share, the sample that makes them, and their conversion to colour."""
+        """The wavelengths that all sub-paths of an iteration share, the sample that makes them, and
+        their conversion to colour."""
         return shared_wavelengths(self.sensor, mix(self.seed, iteration, self.WAVELENGTH))
 
     def _seed(self, iteration, *purpose):
         return dr.opaque(mi.UInt32, mix(self.seed, iteration, *purpose))
 
     def _grown(self, name, count):
-        """Whether the `count` (an array of width one) found more than there is room for in the buffer of that name; then there
-        will be more room. For sessions with a dictionary `capacity` and a method `_freeze`, which calls `_record`."""
+        """Whether the `count` (an array of width one) found more than there is room for in the
+        buffer of that name; then there will be more room. For sessions with a dictionary `capacity`
+        and a method `_freeze`, which calls `_record`."""
         found = int(count[0])
         if found <= self.capacity[name]:
             return False
@@ -301,7 +364,9 @@ class IterativeSession:
     def image(self):
         """The image so far: float32, (height, width, channels)."""
         if self.integrator.variance and self.iterations < 2:
-            raise ValueError(f'{self.integrator.plugin}: parameter "variance" needs at least two iterations')
+            raise ValueError(
+                f'{self.integrator.plugin}: parameter "variance" needs at least two iterations'
+            )
         self.fill_film()
         return np.array(self.sensor.film().develop(), dtype=np.float32)
 

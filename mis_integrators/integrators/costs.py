@@ -1,7 +1,8 @@
-"""What an iteration costs: prices of events, counted and not clocked, so that a decision does not hang on how busy a machine is.
+"""What an iteration costs: prices of events, counted and not clocked, so that a decision does not
+hang on how busy a machine is.
 
-The unit is the cost of one segment of Mitsuba's `path` (a ray, its surface, a shadow ray). The prices in `costs.json` were fitted to the bundled
-scenes by ``benchmarks/run.py costs``.
+The unit is the cost of one segment of Mitsuba's `path` (a ray, its surface, a shadow ray). The
+prices in `costs.json` were fitted to the bundled scenes by ``benchmarks/run.py costs``.
 """
 
 from __future__ import annotations
@@ -10,19 +11,24 @@ import json
 from pathlib import Path
 
 EVENTS = ("camera", "light", "gathered", "pixel")
-"""A pixel's camera segments, light segments, and photons within its merge disk; and what does not depend on any of them."""
+"""A pixel's camera segments, light segments, and photons within its merge disk; and what does not
+depend on any of them."""
 PRICES = json.loads(Path(__file__).with_name("costs.json").read_text())
 
 
 def events(session, segments, last_vertex, gathered):
     """Events of an iteration of one camera path a pixel, in the order of `EVENTS`.
 
-    `segments`: `transport.census.mean_segments`; `last_vertex`: the last smooth vertex that shades (`None`: all); `gathered`: photons within a
-    vertex's merge disks.
+    `segments`: `transport.census.mean_segments`; `last_vertex`: the last smooth vertex that shades
+    (`None`: all); `gathered`: photons within a vertex's merge disks.
     """
-    camera = float(sum(segments if last_vertex is None else segments[:last_vertex + 1]))
+    camera = float(sum(segments if last_vertex is None else segments[: last_vertex + 1]))
     paths = getattr(session, "light_paths", 0)
-    light = (paths + getattr(session, "photons_found", 0)) * session.samples_per_iteration / session.path_count
+    light = (
+        (paths + getattr(session, "photons_found", 0))
+        * session.samples_per_iteration
+        / session.path_count
+    )
     return camera, light, gathered, 1.0
 
 

@@ -1,22 +1,27 @@
-"""Reading plugin parameters: types and ranges checked, unknown names refused, before any sampling."""
+"""Reading plugin parameters: types and ranges checked, unknown names refused, before any
+sampling."""
 
 from __future__ import annotations
 
-REFUSED = {"samples_per_pass": 'iterations are passes already; use "camera_paths" and spp',
-           "timeout": 'use "mis-render --time SECONDS"',
-           "block_size": "there are no blocks: an iteration covers the whole film"}
+REFUSED = {
+    "samples_per_pass": 'iterations are passes already; use "camera_paths" and spp',
+    "timeout": 'use "mis-render --time SECONDS"',
+    "block_size": "there are no blocks: an iteration covers the whole film",
+}
 
 
-LARGEST = 2 ** 31 - 1
+LARGEST = 2**31 - 1
 """Integers beyond this fit into no array of 32 bits."""
 
 
 class ParameterError(ValueError):
-    """A plugin parameter that is unknown, of the wrong type or out of range; the message says what is allowed."""
+    """A plugin parameter that is unknown, of the wrong type or out of range; the message says what
+    is allowed."""
 
 
 class Parameters:
-    """Typed access to a plugin's `mi.Properties`; remembers what was asked for, so that the rest can be refused."""
+    """Typed access to a plugin's `mi.Properties`; remembers what was asked for, so that the rest
+    can be refused."""
 
     def __init__(self, props):
         self.props = props
@@ -24,22 +29,31 @@ class Parameters:
         self.known = []
         for name, advice in REFUSED.items():
             if name in props:
-                raise ParameterError(f'{self.plugin}: parameter "{name}" is not supported: {advice}')
+                raise ParameterError(
+                    f'{self.plugin}: parameter "{name}" is not supported: {advice}'
+                )
 
     def _fail(self, name, value, allowed):
-        raise ParameterError(f'{self.plugin}: parameter "{name}" = {value!r} is not allowed: expected {allowed}')
+        raise ParameterError(
+            f'{self.plugin}: parameter "{name}" = {value!r} is not allowed: expected {allowed}'
+        )
 
     def _get(self, name, default):
         self.known.append(name)
         return self.props.get(name, default) if name in self.props else default
 
     def integer(self, name, default, low, allowed, high=LARGEST):
-        """An integer in [low, high]; `allowed` is the range in words (that a number is too large is added where it does not say so)."""
+        """An integer in [low, high]; `allowed` is the range in words (that a number is too large is
+        added where it does not say so)."""
         value = self._get(name, default)
         if type(value) is not int or value < low:
             self._fail(name, value, f"an integer, {allowed}")
         if value > high:
-            self._fail(name, value, f"an integer, {allowed}" + ("" if str(high) in allowed else f", at most {high}"))
+            self._fail(
+                name,
+                value,
+                f"an integer, {allowed}" + ("" if str(high) in allowed else f", at most {high}"),
+            )
         return value
 
     def number(self, name, default, accept, allowed):
@@ -68,4 +82,6 @@ class Parameters:
         unknown = [name for name in self.props.unqueried() if name not in self.known]
         if unknown:
             names = ", ".join(sorted(self.known))
-            raise ParameterError(f'{self.plugin}: unknown parameter "{unknown[0]}"; allowed are: {names}')
+            raise ParameterError(
+                f'{self.plugin}: unknown parameter "{unknown[0]}"; allowed are: {names}'
+            )

@@ -1,4 +1,5 @@
-"""What `pcbpt` and `bdpt_ris` share: connections to light sub-paths drawn from pmfs of cache points."""
+"""What `pcbpt` and `bdpt_ris` share: connections to light sub-paths drawn from pmfs of cache
+points."""
 
 from __future__ import annotations
 
@@ -6,39 +7,60 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..resampling.cache_points import CacheGrid
-from ..paths.camera_vertices import STEP, hit_layout, sum_before, trace_camera_vertices
-from ..paths.connect import join_sensor, list_draws
-from ..core.film import as_camera_weights, colour_channels, expected_weight, splat_channels, splat_samples, with_colour
-from ..paths.vertex import scattered_mean
-from ..paths.sensor import Lens
-from ..resampling.light_vertices import END, LightEnds, list_ends
-from ..paths.light_starts import sample_light_starts
-from ..lights.lights import Lights
+from ..core.film import (
+    as_camera_weights,
+    colour_channels,
+    expected_weight,
+    splat_channels,
+    splat_samples,
+    with_colour,
+)
 from ..core.packing import from_numpy, rounded_up, to_numpy
-from ..resampling.proposals import Proposals, cumulative_sums
 from ..core.random import mix, next_2d, vertex_streams
 from ..core.recording import lanes, recorder
 from ..core.spectra import channel_mean
-from ..paths.subpaths import junction_of, read_vertices, seen_normal, trace_light_subpaths
 from ..core.traits import SceneTraits
 from ..core.untrusted import Fields
+from ..lights.lights import Lights
+from ..mis.resampling import (
+    LENGTHS,
+    ResampledWeights,
+    around,
+    doubt,
+    guessed_weight,
+    ignorant,
+    tabulate,
+)
+from ..paths.camera_vertices import STEP, hit_layout, sum_before, trace_camera_vertices
+from ..paths.connect import join_sensor, list_draws
+from ..paths.light_starts import sample_light_starts
+from ..paths.sensor import Lens
+from ..paths.subpaths import junction_of, read_vertices, seen_normal, trace_light_subpaths
+from ..paths.vertex import scattered_mean
+from ..resampling.cache_points import CacheGrid
+from ..resampling.light_vertices import END, LightEnds, list_ends
+from ..resampling.proposals import Proposals, cumulative_sums
 from .common import IterativeIntegrator, IterativeSession
 from .light_tracing import LEAST, MOST, best_ratio, observed_noise, path_costs
-from ..mis.resampling import LENGTHS, ResampledWeights, around, doubt, guessed_weight, ignorant, tabulate
 
 CHUNK = 1 << 18
-"""Camera paths, and as many light sub-paths, traced at once at most; larger films are traced in parts (bounds memory), which share their proposals."""
+"""Camera paths, and as many light sub-paths, traced at once at most; larger films are traced in
+parts (bounds memory), which share their proposals."""
 CACHE_SHARE, FEWEST_CACHE_POINTS = 1 / 300, 256
-"""Cache points: this share of a part's camera vertices, but at least so many. More of them cost shadow rays."""
+"""Cache points: this share of a part's camera vertices, but at least so many. More of them cost
+shadow rays."""
 MOST_PAIRS = 1 << 24
-"""Pairs of a cache point and a light vertex at most, four bytes each (and some more while they are made); beyond that there are fewer cache points."""
+"""Pairs of a cache point and a light vertex at most, four bytes each (and some more while they are
+made); beyond that there are fewer cache points."""
 FEW = 8
-"""Renders of fewer iterations do not find out how many light sub-paths pay: the passes would have to be recorded anew for the rest."""
+"""Renders of fewer iterations do not find out how many light sub-paths pay: the passes would have
+to be recorded anew for the rest."""
 KEPT_DRAWS = 0.9
-"""Share of the camera vertices that there is room for among those that draw, at first: enough in most scenes."""
+"""Share of the camera vertices that there is room for among those that draw, at first: enough in
+most scenes."""
 KNOWN_PATHS, MOST_KNOWN_SETS = 200, 8
-"""Light sub-paths of the first iteration from which Q and Q_s are estimated, in sets of M; at most so many sets."""
+"""Light sub-paths of the first iteration from which Q and Q_s are estimated, in sets of M; at most
+so many sets."""
 
 
 class ResampledIntegrator(IterativeIntegrator):
@@ -48,33 +70,54 @@ class ResampledIntegrator(IterativeIntegrator):
     aware = True
 
     def read_parameters(self, parameters):
-        self.light_paths = parameters.integer("light_paths", 200, 1, "from 1 to 100000", high=100000)
+        self.light_paths = parameters.integer(
+            "light_paths", 200, 1, "from 1 to 100000", high=100000
+        )
         self.resamples = parameters.integer("resamples", 1, 1, "from 1 to 1024", high=1024)
         self.cache_neighbors = parameters.integer("cache_neighbors", 3, 1, "from 1 to 16", high=16)
         self.target = parameters.choice("target", "f_y_rho_g_v", ("f_y_rho_g_v", "f_y_f_yz"))
-        self.light_tracing = parameters.number("light_tracing", 0.0, lambda n: n == 0 or LEAST <= n <= MOST, f"0 or from {LEAST:g} to {MOST:g}")
+        self.light_tracing = parameters.number(
+            "light_tracing",
+            0.0,
+            lambda n: n == 0 or LEAST <= n <= MOST,
+            f"0 or from {LEAST:g} to {MOST:g}",
+        )
 
     def settings(self):
-        return {**super().settings(), "light_paths": self.light_paths, "resamples": self.resamples, "cache_neighbors": self.cache_neighbors,
-                "target": self.target, "light_tracing": self.light_tracing}
+        return {
+            **super().settings(),
+            "light_paths": self.light_paths,
+            "resamples": self.resamples,
+            "cache_neighbors": self.cache_neighbors,
+            "target": self.target,
+            "light_tracing": self.light_tracing,
+        }
 
     def new_session(self, scene, sensor, seed, iterations):
         return ResampledSession(self, scene, sensor, seed, iterations)
 
 
 def ends_room(lengths, M):
-    """Room for the vertices of M light sub-paths, where some have had `lengths` (NumPy array): rarely too little, and not much more than they need,
-    for every place is a lane at each cache point."""
+    """Room for the vertices of M light sub-paths, where some have had `lengths` (NumPy array):
+    rarely too little, and not much more than they need, for every place is a lane at each cache
+    point."""
     return rounded_up(int(np.ceil(M * lengths.mean() + 4 * np.sqrt(M) * lengths.std())) + 1)
 
 
 class ResampledSession(IterativeSession):
-    """Iterations of both plugins: light sub-paths, pmfs of the cache points, camera sub-paths, connections, emission met, light that meets the sensor."""
+    """Iterations of both plugins: light sub-paths, pmfs of the cache points, camera sub-paths,
+    connections, emission met, light that meets the sensor."""
 
-    PASSES = {"_light_pass": ("_trace_light", ("light",)), "_camera_pass": ("_trace_camera", ("camera", "hits")),
-              "_pilot_pass": ("_pilot_targets", ("light", "ends")), "_target_pass": ("_own_targets", ("light", "ends")),
-              "_draw_pass": ("_list_draws", ("camera", "draws")), "_connection_pass": ("_connect", ("light", "camera", "ends", "draws")),
-              "_hit_pass": ("_meet", ("camera", "hits")), "_sensor_pass": ("_join_sensor", ("light",))}
+    PASSES = {
+        "_light_pass": ("_trace_light", ("light",)),
+        "_camera_pass": ("_trace_camera", ("camera", "hits")),
+        "_pilot_pass": ("_pilot_targets", ("light", "ends")),
+        "_target_pass": ("_own_targets", ("light", "ends")),
+        "_draw_pass": ("_list_draws", ("camera", "draws")),
+        "_connection_pass": ("_connect", ("light", "camera", "ends", "draws")),
+        "_hit_pass": ("_meet", ("camera", "hits")),
+        "_sensor_pass": ("_join_sensor", ("light",)),
+    }
 
     def __init__(self, integrator, scene, sensor, seed, iterations):
         super().__init__(integrator, scene, sensor, seed, iterations)
@@ -83,15 +126,21 @@ class ResampledSession(IterativeSession):
         self.split_paths(CHUNK)
         width, height = sensor.film().crop_size()
         self.pixel_paths = width * height * integrator.camera_paths
-        self.capacity = {"camera": rounded_up(4 * self.chunk), "draws": rounded_up(self.chunk), "hits": rounded_up(self.chunk),
-                         "ends": rounded_up(6 * integrator.light_paths)}
+        self.capacity = {
+            "camera": rounded_up(4 * self.chunk),
+            "draws": rounded_up(self.chunk),
+            "hits": rounded_up(self.chunk),
+            "ends": rounded_up(6 * integrator.light_paths),
+        }
         self.light_tracing = integrator.light_tracing or None
         self.lens = Lens(sensor).connects
         self._share_light(*self._wanted_light(0))
         depth = integrator.max_depth
         self.lit = not self.lights.dark and (depth < 0 or depth >= 2)
         bounds = self.traits.bounds
-        self.reach = 4 * float(np.linalg.norm(np.array(bounds.max).ravel() - np.array(bounds.min).ravel()))
+        self.reach = 4 * float(
+            np.linalg.norm(np.array(bounds.max).ravel() - np.array(bounds.min).ravel())
+        )
         self.expected_weight = expected_weight(sensor.film(), integrator.camera_paths)
         self.recorded = recorder()
         self.grid = CacheGrid(mi.Point3f(0), mi.Normal3f(0, 0, 1), integrator.cache_neighbors)
@@ -101,7 +150,11 @@ class ResampledSession(IterativeSession):
 
     @property
     def settings(self):
-        return super().settings if self.light_tracing is None else {**super().settings, "light_tracing": self.light_tracing}
+        return (
+            super().settings
+            if self.light_tracing is None
+            else {**super().settings, "light_tracing": self.light_tracing}
+        )
 
     @property
     def learned(self):
@@ -114,59 +167,116 @@ class ResampledSession(IterativeSession):
             fields.finish()
 
     def _wanted_light(self, iteration):
-        """Light sub-paths for each camera path of an iteration, and vertices of each that there shall be room for. Of the first one nothing is known."""
+        """Light sub-paths for each camera path of an iteration, and vertices of each that there
+        shall be room for. Of the first one nothing is known."""
         if iteration == 0:
             return float(self.lens) * (self.integrator.light_tracing or 1.0), 4.0
         return float(self.lens) * (self.light_tracing or 1.0), 1.25 * self.vertices[0]
 
     def _share_light(self, ratio, vertices):
-        """Has about `ratio` light sub-paths traced for each camera path, enough in any case for what is drawn from and for Q; they have so many `vertices`
-        on average."""
+        """Has about `ratio` light sub-paths traced for each camera path, enough in any case for
+        what is drawn from and for Q; they have so many `vertices` on average."""
         self.shared = ratio, vertices
         wanted = ratio * self.chunk
         self.light_rounds = max(round(wanted / CHUNK), 1)
-        self.light_chunk = max(round(wanted / self.light_rounds), self.integrator.light_paths, KNOWN_PATHS)
+        self.light_chunk = max(
+            round(wanted / self.light_rounds), self.integrator.light_paths, KNOWN_PATHS
+        )
         self.capacity["light"] = rounded_up(int(vertices * self.light_chunk))
-        self.ratio = dr.opaque(mi.Float, self.light_chunk * self.light_rounds * self.chunks / self.pixel_paths)
+        self.ratio = dr.opaque(
+            mi.Float, self.light_chunk * self.light_rounds * self.chunks / self.pixel_paths
+        )
 
     def _freeze(self, grown=None):
         self._fill_tables()
         self._record(grown)
 
     def _fill_tables(self):
-        self._tables = [self.traits.lambertian, self.traits.perturbed, self.records, self.shares, self.ratio, *self.grid.tables(),
-                        *self.lights.tables()]
+        self._tables = [
+            self.traits.lambertian,
+            self.traits.perturbed,
+            self.records,
+            self.shares,
+            self.ratio,
+            *self.grid.tables(),
+            *self.lights.tables(),
+        ]
 
     def weights(self):
         """The weights of this session."""
         integrator = self.integrator
-        return ResampledWeights(self.lights, self.grid, self.records, self.shares, integrator.light_paths, integrator.resamples, integrator.aware,
-                                self.ratio)
+        return ResampledWeights(
+            self.lights,
+            self.grid,
+            self.records,
+            self.shares,
+            integrator.light_paths,
+            integrator.resamples,
+            integrator.aware,
+            self.ratio,
+        )
 
     # ------------------------------------------------------------------ passes
 
     def _trace_light(self, scene, sensor, tables, seed, spectral):
-        return trace_light_subpaths(scene, self.lights, self.traits, self.weights(), seed, self.light_chunk, self.capacity["light"],
-                                    spectral["wavelengths"], sensor.shutter_open(), sensor.shutter_open_time(), self.integrator.max_depth,
-                                    self.integrator.rr_depth)
+        return trace_light_subpaths(
+            scene,
+            self.lights,
+            self.traits,
+            self.weights(),
+            seed,
+            self.light_chunk,
+            self.capacity["light"],
+            spectral["wavelengths"],
+            sensor.shutter_open(),
+            sensor.shutter_open_time(),
+            self.integrator.max_depth,
+            self.integrator.rr_depth,
+        )
 
     def _trace_camera(self, scene, sensor, tables, seed, first, skip, spectral):
         integrator = self.integrator
-        return trace_camera_vertices(scene, sensor, integrator, self.lights, self.traits, self.weights(), seed, first, skip, self.chunk,
-                                     integrator.camera_paths, spectral["sample"], self.ratio, integrator.max_depth, integrator.rr_depth,
-                                     integrator.hide_emitters, self.capacity["camera"], self.capacity["hits"])
+        return trace_camera_vertices(
+            scene,
+            sensor,
+            integrator,
+            self.lights,
+            self.traits,
+            self.weights(),
+            seed,
+            first,
+            skip,
+            self.chunk,
+            integrator.camera_paths,
+            spectral["sample"],
+            self.ratio,
+            integrator.max_depth,
+            integrator.rr_depth,
+            integrator.hide_emitters,
+            self.capacity["camera"],
+            self.capacity["hits"],
+        )
 
     def _starts(self, sensor, seed, spectral):
-        return sample_light_starts(self.lights, seed, self.integrator.light_paths, spectral["wavelengths"], mi.Float(sensor.shutter_open()))
+        return sample_light_starts(
+            self.lights,
+            seed,
+            self.integrator.light_paths,
+            spectral["wavelengths"],
+            mi.Float(sensor.shutter_open()),
+        )
 
     def _ends(self, starts, light, places, found):
         M = self.integrator.light_paths
         kept = dr.minimum(found, dr.opaque(mi.UInt32, self.capacity["ends"]))
         return LightEnds(self.traits, self.lights, starts, M, light, places, kept + M, self.reach)
 
-    def _targets(self, scene, sensor, tables, seed, light, count, lengths, first, cache, spectral, target):
-        """q*/p of every light vertex of M sub-paths (from the number `first` on) at every cache point if nothing stood between, row by row; whether nothing
-        does; what makes their `LightEnds`; how many vertices they have; `guessed_weight`."""
+    def _targets(
+        self, scene, sensor, tables, seed, light, count, lengths, first, cache, spectral, target
+    ):
+        """q*/p of every light vertex of M sub-paths (from the number `first` on) at every cache
+        point if nothing stood between, row by row; whether nothing does; what makes their
+        `LightEnds`; how many vertices they have; `guessed_weight`."""
         room, M = self.capacity["ends"], self.integrator.light_paths
         places, found = list_ends(light, count, lengths, first, M, self.capacity["light"], room)
         starts = self._starts(sensor, seed, spectral)
@@ -176,7 +286,9 @@ class ResampledSession(IterativeSession):
         point, end = index // width, index % width
         active = end < dr.gather(mi.UInt32, ends.count, 0)
         z = {name: dr.gather(type(values), values, point, active) for name, values in cache.items()}
-        sent = ends.send(z["p"], end, mi.Float(sensor.shutter_open()), spectral["wavelengths"], active)
+        sent = ends.send(
+            z["p"], end, mi.Float(sensor.shutter_open()), spectral["wavelengths"], active
+        )
         if self.integrator.max_depth > 0:
             active &= z["depth"] + sent.vertices <= self.integrator.max_depth
         if target == "f_y_rho_g_v":
@@ -184,58 +296,137 @@ class ResampledSession(IterativeSession):
             cosine = dr.select(z["through"], dr.abs(cosine), dr.maximum(cosine, 0))
             r = channel_mean(sent.light) * cosine
         else:
-            r = channel_mean(sent.light * junction_of(self.traits, z, spectral["wavelengths"], active).between(z["towards"], sent.d, active)[0])
+            r = channel_mean(
+                sent.light
+                * junction_of(self.traits, z, spectral["wavelengths"], active).between(
+                    z["towards"], sent.d, active
+                )[0]
+            )
         active &= (r > 0) & dr.isfinite(r)
         seen = ends.unblocked(scene, z["p"], z["n"], sent, active)
-        return dr.select(active, r, 0), seen, starts, places, found, sent.vertices, guessed_weight(z, sent)
+        return (
+            dr.select(active, r, 0),
+            seen,
+            starts,
+            places,
+            found,
+            sent.vertices,
+            guessed_weight(z, sent),
+        )
 
     def _own_targets(self, scene, sensor, tables, seed, light, count, lengths, cache, spectral):
-        """What pmfs are made of: q*/p of the first M sub-paths for the target at hand, times the guessed weight; then as of `_targets`."""
+        """What pmfs are made of: q*/p of the first M sub-paths for the target at hand, times the
+        guessed weight; then as of `_targets`."""
         target = self.integrator.target
-        r, *others, _, guess = self._targets(scene, sensor, tables, seed, light, count, lengths, mi.UInt32(0), cache, spectral, target)
+        r, *others, _, guess = self._targets(
+            scene,
+            sensor,
+            tables,
+            seed,
+            light,
+            count,
+            lengths,
+            mi.UInt32(0),
+            cache,
+            spectral,
+            target,
+        )
         return dr.select(r > 0, r * guess, 0), *others
 
-    def _pilot_targets(self, scene, sensor, tables, seed, light, count, lengths, first, cache, spectral):
-        return self._targets(scene, sensor, tables, seed, light, count, lengths, first, cache, spectral, "f_y_rho_g_v")
+    def _pilot_targets(
+        self, scene, sensor, tables, seed, light, count, lengths, first, cache, spectral
+    ):
+        return self._targets(
+            scene,
+            sensor,
+            tables,
+            seed,
+            light,
+            count,
+            lengths,
+            first,
+            cache,
+            spectral,
+            "f_y_rho_g_v",
+        )
 
     def _pmfs(self, r, seen, found):
         """The cache points' pmfs as of `cumulative_sums`."""
         M, room = self.integrator.light_paths, self.capacity["ends"]
         pmfs = cumulative_sums(r, seen, dr.minimum(found, room) + M, M + room)
-        dr.eval(pmfs)                                              # a recording cannot make it
+        dr.eval(pmfs)  # a recording cannot make it
         return pmfs
 
     def _list_draws(self, tables, camera, count, expected, seed):
         """As `list_draws`."""
-        return list_draws(self.grid, expected, camera, count, self.capacity["camera"], self.chunk, STEP, self.capacity["draws"], seed)
+        return list_draws(
+            self.grid,
+            expected,
+            camera,
+            count,
+            self.capacity["camera"],
+            self.chunk,
+            STEP,
+            self.capacity["draws"],
+            seed,
+        )
 
-    def _connect(self, scene, sensor, tables, radiance, camera, draws, light, starts, places, found, pmfs, seed, spectral):
-        """Radiance of camera paths with that of connections to drawn light sub-paths added. `draws`: as of `list_draws`."""
+    def _connect(
+        self,
+        scene,
+        sensor,
+        tables,
+        radiance,
+        camera,
+        draws,
+        light,
+        starts,
+        places,
+        found,
+        pmfs,
+        seed,
+        spectral,
+    ):
+        """Radiance of camera paths with that of connections to drawn light sub-paths added.
+        `draws`: as of `list_draws`."""
         integrator, weights = self.integrator, self.weights()
         ends = self._ends(starts, light, places, found)
-        proposals = Proposals(self.grid, *pmfs[:2], ends.count, integrator.light_paths + self.capacity["ends"])
+        proposals = Proposals(
+            self.grid, *pmfs[:2], ends.count, integrator.light_paths + self.capacity["ends"]
+        )
         index = lanes(self.capacity["draws"] * integrator.resamples)
         chosen, factor, count = draws
         slot = index // integrator.resamples
         active = slot < dr.gather(mi.UInt32, count, 0)
         z = read_vertices(camera, dr.gather(mi.UInt32, chosen, slot, active), active, states=STEP)
-        rng = vertex_streams(z["path"] * integrator.resamples + index % integrator.resamples, z["number"], seed)
+        rng = vertex_streams(
+            z["path"] * integrator.resamples + index % integrator.resamples, z["number"], seed
+        )
         row = self.grid.row(z["p"], seen_normal(z))
         drawn = proposals.draw(row, rng, active)
         active &= drawn < dr.gather(mi.UInt32, ends.count, 0)
         probability = proposals.probability(row, drawn, active)
 
-        sent = ends.send(z["p"], drawn, mi.Float(sensor.shutter_open()), spectral["wavelengths"], active)
+        sent = ends.send(
+            z["p"], drawn, mi.Float(sensor.shutter_open()), spectral["wavelengths"], active
+        )
         segments = z["depth"] + sent.vertices
         if integrator.max_depth > 0:
             active &= segments <= integrator.max_depth
-        value, forward, back = junction_of(self.traits, z, spectral["wavelengths"], active).between(z["towards"], sent.d, active)
+        value, forward, back = junction_of(self.traits, z, spectral["wavelengths"], active).between(
+            z["towards"], sent.d, active
+        )
         carried = z["throughput"] * value * sent.light
         active &= (dr.max(carried) > 0) & dr.all(dr.isfinite(carried))
         active = ends.unblocked(scene, z["p"], z["n"], sent, active)
-        share = self._share(weights, camera, z, sent, value, forward, back, segments, active) * dr.gather(mi.Float, factor, slot, active)
-        estimate = carried * (share * dr.rcp(integrator.light_paths * integrator.resamples * dr.maximum(probability, 1e-20)))
-        total = radiance + dr.zeros(mi.Spectrum, self.chunk)        # radiance may be a single zero
+        share = self._share(
+            weights, camera, z, sent, value, forward, back, segments, active
+        ) * dr.gather(mi.Float, factor, slot, active)
+        estimate = carried * (
+            share
+            * dr.rcp(integrator.light_paths * integrator.resamples * dr.maximum(probability, 1e-20))
+        )
+        total = radiance + dr.zeros(mi.Spectrum, self.chunk)  # radiance may be a single zero
         dr.scatter_reduce(dr.ReduceOp.Add, total, estimate, z["path"], active)
         return total
 
@@ -243,20 +434,48 @@ class ResampledSession(IterativeSession):
         """Weight w_t of a connection among all techniques of its joint path."""
         cosine = dr.abs(dr.dot(z["n"], sent.d))
         row = weights.row(z["p"], dr.mulsign(z["n"], dr.dot(z["n"], sent.d)))
-        own = weights.gain(sent.mean * weights.softened(cosine, dr.square(sent.distance)), row, sent.vertices, active)
-        nearer = sum_before(camera, z, z["parent"], sent.across * cosine, sent.mean * dr.rcp(dr.maximum(sent.across, 1e-20)),
-                            scattered_mean(value, z["n"], sent.d), back, segments, weights, active)
+        own = weights.gain(
+            sent.mean * weights.softened(cosine, dr.square(sent.distance)),
+            row,
+            sent.vertices,
+            active,
+        )
+        nearer = sum_before(
+            camera,
+            z,
+            z["parent"],
+            sent.across * cosine,
+            sent.mean * dr.rcp(dr.maximum(sent.across, 1e-20)),
+            scattered_mean(value, z["n"], sent.d),
+            back,
+            segments,
+            weights,
+            active,
+        )
         return own * dr.rcp(dr.maximum(own + forward * cosine * sent.behind + nearer, 1e-20))
 
     def _meet(self, tables, radiance, camera, hits, hit_count):
-        """Radiance of camera paths with that of emission that they meet beyond the first vertex added."""
+        """Radiance of camera paths with that of emission that they meet beyond the first vertex
+        added."""
         index = lanes(self.capacity["hits"])
         active = index < dr.gather(mi.UInt32, hit_count, 0)
         hit = hit_layout().read(hits, index, active)
-        nearer = sum_before(camera, hit, hit["parent"], hit["start"], hit["light_mean"], mi.Float(1), hit["across"], hit["depth"],
-                            self.weights(), active)
-        total = radiance + dr.zeros(mi.Spectrum, self.chunk)        # radiance may be a single zero
-        dr.scatter_reduce(dr.ReduceOp.Add, total, hit["value"] * dr.rcp(1 + nearer), hit["path"], active)
+        nearer = sum_before(
+            camera,
+            hit,
+            hit["parent"],
+            hit["start"],
+            hit["light_mean"],
+            mi.Float(1),
+            hit["across"],
+            hit["depth"],
+            self.weights(),
+            active,
+        )
+        total = radiance + dr.zeros(mi.Spectrum, self.chunk)  # radiance may be a single zero
+        dr.scatter_reduce(
+            dr.ReduceOp.Add, total, hit["value"] * dr.rcp(1 + nearer), hit["path"], active
+        )
         return total
 
     def _join_sensor(self, scene, sensor, tables, light, count, seed, spectral):
@@ -264,25 +483,52 @@ class ResampledSession(IterativeSession):
         index = lanes(self.capacity["light"])
         active = index < dr.gather(mi.UInt32, count, 0)
         y = read_vertices(light, index, active, states=END)
-        aperture = next_2d(vertex_streams(y["path"], y["number"], seed)) if sensor.needs_aperture_sample() else mi.Point2f(0.5)
-        joined = join_sensor(scene, self.integrator, self.traits, Lens(sensor), y, aperture, mi.Float(sensor.shutter_open()),
-                             spectral["wavelengths"], self.integrator.hide_emitters, active)
+        aperture = (
+            next_2d(vertex_streams(y["path"], y["number"], seed))
+            if sensor.needs_aperture_sample()
+            else mi.Point2f(0.5)
+        )
+        joined = join_sensor(
+            scene,
+            self.integrator,
+            self.traits,
+            Lens(sensor),
+            y,
+            aperture,
+            mi.Float(sensor.shutter_open()),
+            spectral["wavelengths"],
+            self.integrator.hide_emitters,
+            active,
+        )
         value = joined.value * (self.weights().seen_by_sensor(joined, y) / self.ratio)
-        return splat_channels(sensor.film(), joined.film, [*colour_channels(value, spectral["matrix"]), dr.square(channel_mean(value))], joined.active)
+        return splat_channels(
+            sensor.film(),
+            joined.film,
+            [*colour_channels(value, spectral["matrix"]), dr.square(channel_mean(value))],
+            joined.active,
+        )
 
     # ------------------------------------------------------------------ before the first iteration
 
     def _prepare(self):
-        """Begins the first iteration: draws the cache points from its first part, and finds out how many light sub-paths pay where nobody has said so. All
-        sessions of a render see the same here, whatever they have been told."""
+        """Begins the first iteration: draws the cache points from its first part, and finds out how
+        many light sub-paths pay where nobody has said so. All sessions of a render see the same
+        here, whatever they have been told."""
         spectral = self._spectral(0)
         light, traced = self._light(0, 0, spectral), self._camera(0, 0, spectral)
         vertices, M = min(int(traced[4][0]), self.capacity["camera"]), self.integrator.light_paths
         self.vertices = int(light[1][0]) / self.light_chunk, vertices / self.chunk
         wanted = min(max(FEWEST_CACHE_POINTS, int(vertices * CACHE_SHARE)), max(vertices, 1))
-        self.capacity |= {"ends": ends_room(np.array(light[2]), M), "draws": rounded_up(max(int(KEPT_DRAWS * vertices), 1))}
-        self.cache = self._cache_points(traced[3], vertices, max(min(wanted, MOST_PAIRS // (M + self.capacity["ends"])), 1))
-        self.grid = CacheGrid(self.cache["p"], seen_normal(self.cache), self.integrator.cache_neighbors)
+        self.capacity |= {
+            "ends": ends_room(np.array(light[2]), M),
+            "draws": rounded_up(max(int(KEPT_DRAWS * vertices), 1)),
+        }
+        self.cache = self._cache_points(
+            traced[3], vertices, max(min(wanted, MOST_PAIRS // (M + self.capacity["ends"])), 1)
+        )
+        self.grid = CacheGrid(
+            self.cache["p"], seen_normal(self.cache), self.integrator.cache_neighbors
+        )
         self.records, self.shares = ignorant(self.grid)
         self._freeze()
         self.first_light = light
@@ -293,16 +539,28 @@ class ResampledSession(IterativeSession):
             self.begun = proposals, part
 
     def _best_light_tracing(self, radiance, alpha, position, met):
-        """How many light sub-paths pay for each camera path, by a part (`_part`) of an iteration with one."""
+        """How many light sub-paths pay for each camera path, by a part (`_part`) of an iteration
+        with one."""
         paths, met = self.integrator.camera_paths, self.chunks * np.array(met)
-        border, weight = self.sensor.film().rfilter().border_size(), np.array(self.expected_weight)[:, :, 0]
+        border, weight = (
+            self.sensor.film().rfilter().border_size(),
+            np.array(self.expected_weight)[:, :, 0],
+        )
         corner = to_numpy(position) - np.array(self.sensor.film().crop_offset())[:, None] + border
-        noise = observed_noise(np.floor(corner).astype(int), np.array(channel_mean(radiance)), paths, met[:, :, :3].mean(axis=2), met[:, :, 3], weight)
+        noise = observed_noise(
+            np.floor(corner).astype(int),
+            np.array(channel_mean(radiance)),
+            paths,
+            met[:, :, :3].mean(axis=2),
+            met[:, :, 3],
+            weight,
+        )
         return best_ratio(noise, *path_costs(self.integrator.plugin, self.vertices, paths))
 
     def _take_weights(self, iteration):
-        """Sets the weights of an iteration. They must not depend on its own light sub-paths: the first one's goes by densities alone, those of all
-        others by what the first one's sub-paths tell of Q and Q_s."""
+        """Sets the weights of an iteration. They must not depend on its own light sub-paths: the
+        first one's goes by densities alone, those of all others by what the first one's sub-paths
+        tell of Q and Q_s."""
         if not self.integrator.aware:
             return
         if iteration > 0 and self.known is None:
@@ -318,17 +576,30 @@ class ResampledSession(IterativeSession):
             self._freeze("light")
 
     def _cache_points(self, camera, vertices, count):
-        """`count` of the camera's vertices, at random (a single one in nothingness if there is none)."""
+        """`count` of the camera's vertices, at random (a single one in nothingness if there is
+        none)."""
         active = mi.Bool(vertices > 0)
-        order = read_vertices(camera, dr.arange(mi.UInt32, max(vertices, 1)), active, ("path", "number"), STEP)
-        order = np.lexsort((np.array(order["number"]), np.array(order["path"])))        # places in the buffer are accidental
-        chosen = np.random.default_rng(mix(self.seed, PILOT, CAMERA)).choice(order, count, replace=False)
+        order = read_vertices(
+            camera, dr.arange(mi.UInt32, max(vertices, 1)), active, ("path", "number"), STEP
+        )
+        order = np.lexsort(
+            (np.array(order["number"]), np.array(order["path"]))
+        )  # places in the buffer are accidental
+        chosen = np.random.default_rng(mix(self.seed, PILOT, CAMERA)).choice(
+            order, count, replace=False
+        )
         cache = read_vertices(camera, from_numpy(mi.UInt32, chosen), active, states=STEP)
-        cache = {name: cache[name] for name in ("p", "n", "ns", "towards", "value", "density", "depth", "hit", "near") if name in cache}
+        cache = {
+            name: cache[name]
+            for name in ("p", "n", "ns", "towards", "value", "density", "depth", "hit", "near")
+            if name in cache
+        }
         cache["through"] = dr.full(mi.Bool, False, count)
         if "hit" in cache:
             flags = dr.select(active, cache["hit"].shape, dr.zeros(mi.ShapePtr)).bsdf().flags()
-            cache["through"] |= (flags & (mi.BSDFFlags.GlossyTransmission | mi.BSDFFlags.DiffuseTransmission)) != 0
+            cache["through"] |= (
+                flags & (mi.BSDFFlags.GlossyTransmission | mi.BSDFFlags.DiffuseTransmission)
+            ) != 0
         dr.eval(cache)
         return cache
 
@@ -337,13 +608,32 @@ class ResampledSession(IterativeSession):
         M, points, cache = self.integrator.light_paths, dr.width(self.cache["depth"]), self.cache
         sets = max(min(-(-KNOWN_PATHS // M), MOST_KNOWN_SETS, self.light_chunk // M), 1)
         normals = to_numpy(seen_normal(cache)).T
-        near = around(to_numpy(cache["p"]).T, normals, self.integrator.cache_neighbors, self.grid.normal_cost)
-        Q_s, Q_blind, doubts, ends_s = np.zeros((points, LENGTHS)), np.zeros(points), np.zeros(points), np.zeros(LENGTHS)
+        near = around(
+            to_numpy(cache["p"]).T, normals, self.integrator.cache_neighbors, self.grid.normal_cost
+        )
+        Q_s, Q_blind, doubts, ends_s = (
+            np.zeros((points, LENGTHS)),
+            np.zeros(points),
+            np.zeros(points),
+            np.zeros(LENGTHS),
+        )
         for k in range(sets):
-            r, seen, _, _, found, vertices, _ = self._ends_fit(lambda: self._pilot_pass(
-                self.scene, self.sensor, self._tables, self._seed(PILOT, START, k), *light, dr.opaque(mi.UInt32, k * M), cache, spectral))
+            r, seen, _, _, found, vertices, _ = self._ends_fit(
+                lambda: self._pilot_pass(
+                    self.scene,
+                    self.sensor,
+                    self._tables,
+                    self._seed(PILOT, START, k),
+                    *light,
+                    dr.opaque(mi.UInt32, k * M),
+                    cache,
+                    spectral,
+                )
+            )
             used = M + int(found[0])
-            r, seen = (np.array(x).reshape(points, M + self.capacity["ends"])[:, :used] for x in (r, seen))
+            r, seen = (
+                np.array(x).reshape(points, M + self.capacity["ends"])[:, :used] for x in (r, seen)
+            )
             length = np.minimum(np.array(vertices)[:used], LENGTHS) - 1
             Q_s += np.where(seen, r, 0) @ np.eye(LENGTHS)[length]
             Q_blind += r.sum(axis=1)
@@ -356,19 +646,31 @@ class ResampledSession(IterativeSession):
     def _light(self, iteration, chunk, spectral):
         """What `trace_light_subpaths` returns."""
         while True:
-            light = self._light_pass(self.scene, self.sensor, self._tables, self._seed(iteration, LIGHT, chunk), spectral)
+            light = self._light_pass(
+                self.scene, self.sensor, self._tables, self._seed(iteration, LIGHT, chunk), spectral
+            )
             if not self._grown("light", light[1]):
                 return light
 
     def _camera(self, iteration, chunk, spectral):
         """What `trace_camera_vertices` returns."""
         while True:
-            traced = self._camera_pass(self.scene, self.sensor, self._tables, self._seed(iteration, CAMERA), *self.all_over_the_film(chunk), spectral)
-            if not self.lit or not (self._grown("camera", traced[4]) or self._grown("hits", traced[6])):
+            traced = self._camera_pass(
+                self.scene,
+                self.sensor,
+                self._tables,
+                self._seed(iteration, CAMERA),
+                *self.all_over_the_film(chunk),
+                spectral,
+            )
+            if not self.lit or not (
+                self._grown("camera", traced[4]) or self._grown("hits", traced[6])
+            ):
                 return traced
 
     def _ends_fit(self, compute):
-        """Result of `compute()`, repeated with more room for ends if there were more (its fifth entry counts them)."""
+        """Result of `compute()`, repeated with more room for ends if there were more (its fifth
+        entry counts them)."""
         while True:
             result = compute()
             dr.eval(result)
@@ -376,9 +678,19 @@ class ResampledSession(IterativeSession):
                 return result
 
     def _proposals(self, iteration, spectral, light):
-        """What all camera paths of an iteration draw from: the vertices and starts of M of the sub-paths `light`, and the pmfs."""
-        r, seen, *ends = self._ends_fit(lambda: self._target_pass(
-            self.scene, self.sensor, self._tables, self._seed(iteration, START), *light, self.cache, spectral))
+        """What all camera paths of an iteration draw from: the vertices and starts of M of the
+        sub-paths `light`, and the pmfs."""
+        r, seen, *ends = self._ends_fit(
+            lambda: self._target_pass(
+                self.scene,
+                self.sensor,
+                self._tables,
+                self._seed(iteration, START),
+                *light,
+                self.cache,
+                spectral,
+            )
+        )
         return light[0], *ends, self._pmfs(r, seen, ends[-1])
 
     def _draws(self, camera, count, expected, seed):
@@ -389,39 +701,70 @@ class ResampledSession(IterativeSession):
                 return draws
 
     def _radiance(self, iteration, chunk, traced, proposals, spectral):
-        """Radiance of camera paths (`trace_camera_vertices`) with everything that they meet and are connected to."""
+        """Radiance of camera paths (`trace_camera_vertices`) with everything that they meet and are
+        connected to."""
         radiance, _, _, camera, count, hits, hit_count = traced
         *_, (*_, expected) = proposals
         draws = self._draws(camera, count, expected, self._seed(iteration, THIN, chunk))
-        radiance = self._connection_pass(self.scene, self.sensor, self._tables, radiance, camera, draws, *proposals, self._seed(iteration, DRAW, chunk),
-                                         spectral)
+        radiance = self._connection_pass(
+            self.scene,
+            self.sensor,
+            self._tables,
+            radiance,
+            camera,
+            draws,
+            *proposals,
+            self._seed(iteration, DRAW, chunk),
+            spectral,
+        )
         radiance = self._hit_pass(self._tables, radiance, camera, hits, hit_count)
-        dr.eval(radiance)                                  # else its sums may still wait when the film's are made
+        dr.eval(radiance)  # else its sums may still wait when the film's are made
         return radiance
 
     def _meet_sensor(self, light, seed, spectral):
-        """Block of the light sub-paths (`trace_light_subpaths`) that meet the sensor: three channels, and the square of their mean."""
+        """Block of the light sub-paths (`trace_light_subpaths`) that meet the sensor: three
+        channels, and the square of their mean."""
         vertices, found, _ = light
-        return self._sensor_pass(self.scene, self.sensor, self._tables, vertices, found, seed, spectral)
+        return self._sensor_pass(
+            self.scene, self.sensor, self._tables, vertices, found, seed, spectral
+        )
 
     def _part(self, iteration, chunk, spectral, light, proposals, traced=None):
-        """One part of an iteration: radiance, alpha and film position of its camera paths (`traced`, if they are already), and the block of the light that met
-        the sensor (or None). `light`: the first part's light sub-paths."""
+        """One part of an iteration: radiance, alpha and film position of its camera paths
+        (`traced`, if they are already), and the block of the light that met the sensor (or None).
+        `light`: the first part's light sub-paths."""
         traced = traced or self._camera(iteration, chunk, spectral)
         radiance, alpha, position, *_ = traced
         block = None
         if self.lit:
             radiance = self._radiance(iteration, chunk, traced, proposals, spectral)
-            for part in range(chunk * self.light_rounds, (chunk + 1) * self.light_rounds) if self.lens else ():
-                met = self._meet_sensor(self._light(iteration, part, spectral) if part else light, self._seed(iteration, APERTURE, part), spectral)
+            for part in (
+                range(chunk * self.light_rounds, (chunk + 1) * self.light_rounds)
+                if self.lens
+                else ()
+            ):
+                met = self._meet_sensor(
+                    self._light(iteration, part, spectral) if part else light,
+                    self._seed(iteration, APERTURE, part),
+                    spectral,
+                )
                 block = met if block is None else block + met
         return radiance, alpha, position, block
 
     def _chunk(self, spectral, chunk, radiance, alpha, position, block):
         """Blocks of one part (`_part`): of camera paths, and of light that met the sensor."""
         if self.integrator.hide_emitters:
-            radiance = dr.select(alpha > 0, radiance, 0)       # as `path` does: what is behind nothing but null surfaces is hidden
-        return splat_samples(self.sensor.film(), position, radiance, alpha, spectral["matrix"], self.in_chunk(*self.all_over_the_film(chunk))), block
+            radiance = dr.select(
+                alpha > 0, radiance, 0
+            )  # as `path` does: what is behind nothing but null surfaces is hidden
+        return splat_samples(
+            self.sensor.film(),
+            position,
+            radiance,
+            alpha,
+            spectral["matrix"],
+            self.in_chunk(*self.all_over_the_film(chunk)),
+        ), block
 
     def start(self):
         if self.cache is None and self.lit:
@@ -435,20 +778,33 @@ class ResampledSession(IterativeSession):
         if self.lit:
             self._take_weights(iteration)
             self._take_light(iteration)
-            light = self.first_light if iteration == 0 and self.first_light else self._light(iteration, 0, spectral)
+            light = (
+                self.first_light
+                if iteration == 0 and self.first_light
+                else self._light(iteration, 0, spectral)
+            )
             if not self.integrator.aware or self.known is not None:
-                self.first_light = None                    # nobody will ask for it again
+                self.first_light = None  # nobody will ask for it again
             proposals = proposals or self._proposals(iteration, spectral, light)
 
         def render(chunk, _):
-            part = begun if begun and chunk == 0 else self._part(iteration, chunk, spectral, light, proposals)
+            part = (
+                begun
+                if begun and chunk == 0
+                else self._part(iteration, chunk, spectral, light, proposals)
+            )
             return self._chunk(spectral, chunk, *part)
 
         block, light = self.sum_of_chunks(render)
-        return block if light is None else with_colour(block, as_camera_weights(light[:, :, :3], block, self.expected_weight))
+        return (
+            block
+            if light is None
+            else with_colour(block, as_camera_weights(light[:, :, :3], block, self.expected_weight))
+        )
 
 
 LIGHT, CAMERA, APERTURE, START, DRAW, THIN = 0, 1, 3, 4, 5, 6
 """Purposes of an iteration's random seeds, besides `IterativeSession.WAVELENGTH`."""
 PILOT = 1 << 31
-"""The number of the iteration that never is: what only the weights and the cache are made of draws from its seeds."""
+"""The number of the iteration that never is: what only the weights and the cache are made of draws
+from its seeds."""

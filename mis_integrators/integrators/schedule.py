@@ -1,15 +1,21 @@
 """The merge radius of progressive photon mapping: its parameters, and how it shrinks."""
 
-
 SMALLEST, LARGEST = 1e-15, 1e15
-"""Merge radii whose squares, and those of their small parts and multiples, are ordinary numbers of single precision."""
+"""Merge radii whose squares, and those of their small parts and multiples, are ordinary numbers of
+single precision."""
 
 
 def read_radius(parameters):
     """The parameters `initial_radius` and `alpha`."""
-    return (parameters.number("initial_radius", 0.0, lambda r: r == 0 or SMALLEST <= r <= LARGEST,
-                              f"0 (automatic) or from {SMALLEST:g} to {LARGEST:g}"),
-            parameters.number("alpha", 1.0, lambda a: 0 < a <= 1, "in (0, 1]"))
+    return (
+        parameters.number(
+            "initial_radius",
+            0.0,
+            lambda r: r == 0 or SMALLEST <= r <= LARGEST,
+            f"0 (automatic) or from {SMALLEST:g} to {LARGEST:g}",
+        ),
+        parameters.number("alpha", 1.0, lambda a: 0 < a <= 1, "in (0, 1]"),
+    )
 
 
 def shrunk(radius, alpha, iteration):

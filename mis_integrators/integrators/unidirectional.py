@@ -1,17 +1,19 @@
-"""Mitsuba's `path` as iterations like those of this package: same films, same variance channels, same seeds."""
+"""Mitsuba's `path` as iterations like those of this package: same films, same variance channels,
+same seeds."""
 
 from __future__ import annotations
 
 import drjit as dr
 import mitsuba as mi
 
-from ..paths.camera_pass import film_sample_count, start_camera_paths
 from ..core.film import splat_samples
 from ..core.untrusted import Fields
+from ..paths.camera_pass import film_sample_count, start_camera_paths
 from .common import IterativeSession
 
 BUSY = 1 << 19
-"""Camera paths that keep the processor busy: twice as many at once are 3 % faster, 65536 a quarter slower."""
+"""Camera paths that keep the processor busy: twice as many at once are 3 % faster, 65536 a quarter
+slower."""
 CHUNK = 1 << 21
 """Camera paths traced at once at most (bounds memory)."""
 PATHS, SAMPLER = 0, 2
@@ -19,15 +21,21 @@ PATHS, SAMPLER = 0, 2
 
 
 class PathSession(IterativeSession):
-    """Iterations of `path`: `camera_paths` samples a pixel each, or, if that is 0 and no number of iterations is planned, as many as keep the processor
-    busy."""
+    """Iterations of `path`: `camera_paths` samples a pixel each, or, if that is 0 and no number of
+    iterations is planned, as many as keep the processor busy."""
 
     WAVELENGTH = 1
 
     def __init__(self, integrator, scene, sensor, seed, iterations):
         super().__init__(integrator, scene, sensor, seed, iterations)
-        self.path_integrator = mi.load_dict({"type": "path", "max_depth": integrator.max_depth, "rr_depth": integrator.rr_depth,
-                                  "hide_emitters": integrator.hide_emitters})
+        self.path_integrator = mi.load_dict(
+            {
+                "type": "path",
+                "max_depth": integrator.max_depth,
+                "rr_depth": integrator.rr_depth,
+                "hide_emitters": integrator.hide_emitters,
+            }
+        )
         self.sampler = mi.load_dict({"type": "independent"})
         if not integrator.camera_paths and iterations is None:
             self.samples_per_iteration = max(1, BUSY // film_sample_count(sensor))
@@ -48,24 +56,40 @@ class PathSession(IterativeSession):
         self.split_paths(CHUNK)
 
     def trace(self, iteration, chunk, first, stride, paths, spectral, variation=0):
-        """Radiance and alpha of camera paths `first`, `first + stride`, ..., and their positions on the film. Where `first` and `variation` are
-        arrays, each lane has its own, and the paths of one number differ with the variation."""
+        """Radiance and alpha of camera paths `first`, `first + stride`, ..., and their positions on
+        the film. Where `first` and `variation` are arrays, each lane has its own, and the paths of
+        one number differ with the variation."""
         seed = self._seed(iteration, PATHS) + variation
         _, active, _, ray, weight, position, _ = start_camera_paths(
-            self.sensor, seed, first, stride, paths, self.samples_per_iteration, spectral["sample"])
+            self.sensor, seed, first, stride, paths, self.samples_per_iteration, spectral["sample"]
+        )
         differential = mi.RayDifferential3f(ray)
         self.sampler.seed(self._seed(iteration, SAMPLER, chunk), paths)
-        radiance, valid, _ = self.path_integrator.sample(self.scene, self.sampler, differential, None, active)
-        return dr.select(active, weight * radiance, 0), dr.select(valid, mi.Float(1), 0), position, active
+        radiance, valid, _ = self.path_integrator.sample(
+            self.scene, self.sampler, differential, None, active
+        )
+        return (
+            dr.select(active, weight * radiance, 0),
+            dr.select(valid, mi.Float(1), 0),
+            position,
+            active,
+        )
 
     def _iteration(self, iteration):
         spectral = self._spectral(iteration)
 
         def render(chunk, first):
-            radiance, alpha, position, active = self.trace(iteration, chunk, first, 1, self.chunk, spectral)
-            return (splat_samples(self.sensor.film(), position, radiance, alpha, spectral["matrix"], active),)
+            radiance, alpha, position, active = self.trace(
+                iteration, chunk, first, 1, self.chunk, spectral
+            )
+            return (
+                splat_samples(
+                    self.sensor.film(), position, radiance, alpha, spectral["matrix"], active
+                ),
+            )
 
         (block,) = self.sum_of_chunks(render)
-        # Else the sampler's unused final state would be computed with the next iteration, by tracing these paths again.
+        # Else the sampler's unused final state would be computed with the next iteration, by
+        # tracing these paths again.
         self.sampler.seed(0, 1)
         return block

@@ -6,15 +6,15 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..photons.merge import merge, vertex_map
 from ..core.packing import to_numpy
-from ..photons.grid import smallest_cell
 from ..core.recording import lanes
-from ..paths.subpaths import read_vertices
 from ..core.untrusted import Fields
+from ..mis.vertex_merging import ConnectionWeights
+from ..paths.subpaths import read_vertices
+from ..photons.grid import smallest_cell
+from ..photons.merge import merge, vertex_map
 from .bdpt import BDPT, BDPTSession
 from .common import MOST_LIGHT_PATHS
-from ..mis.vertex_merging import ConnectionWeights
 from .schedule import read_radius, shrunk
 
 RADIUS_SHARE = 0.004
@@ -34,27 +34,30 @@ class VCM(BDPT):
 
      * - beta
        - |float|
-       - Exponent of the heuristic, from 1 to 8: 1 is Veach's balance heuristic, 2 his power heuristic. (Default: 1)
+       - Exponent of the heuristic, from 1 to 8: 1 is Veach's balance heuristic, 2 his power
+         heuristic. (Default: 1)
      * - photon_count
        - |int|
        - Light sub-paths an iteration; 0 stands for as many as camera paths. (Default: 0)
      * - initial_radius
        - |float|
-       - Merge radius of the first iteration, in scene units; 0 stands for 0.4 % of the spread of what the camera sees. (Default: 0)
+       - Merge radius of the first iteration, in scene units; 0 stands for 0.4 % of the spread of
+         what the camera sees. (Default: 0)
      * - alpha
        - |float|
-       - Radius reduction of progressive photon mapping, in (0, 1]: iteration i uses R_i^2 = R_0^2 (i + 1)^(alpha - 1). 1 keeps the
-         radius. (Default: 1)
+       - Radius reduction of progressive photon mapping, in (0, 1]: iteration i uses R_i^2 = R_0^2
+         (i + 1)^(alpha - 1). 1 keeps the radius. (Default: 1)
      * - camera_paths, variance, max_depth, rr_depth, hide_emitters
        -
        - As of :monosp:`bdpt`.
 
-    The techniques of :monosp:`bdpt`, and merging: at every smooth vertex of a camera path, all light sub-paths that end within the radius
-    contribute as photons do. All techniques share a path by Veach's heuristic, with the density of merges as Georgiev et al. 2012 have it, which
-    takes each light sub-path for a sample of its own.
+    The techniques of :monosp:`bdpt`, and merging: at every smooth vertex of a camera path, all
+    light sub-paths that end within the radius contribute as photons do. All techniques share a path
+    by Veach's heuristic, with the density of merges as Georgiev et al. 2012 have it, which takes
+    each light sub-path for a sample of its own.
 
-    Consistent: the bias of merging vanishes with the radius. Participating media, polarised variants, gradients and the film ``specfilm``
-    are refused by name.
+    Consistent: the bias of merging vanishes with the radius. Participating media, polarised
+    variants, gradients and the film ``specfilm`` are refused by name.
 
     .. tabs::
         .. code-tab:: xml
@@ -71,20 +74,28 @@ class VCM(BDPT):
 
     def read_parameters(self, parameters):
         self.read_heuristic(parameters)
-        self.photon_count = parameters.integer("photon_count", 0, 0, "at least 0 (0: as many as camera paths)", high=MOST_LIGHT_PATHS)
+        self.photon_count = parameters.integer(
+            "photon_count", 0, 0, "at least 0 (0: as many as camera paths)", high=MOST_LIGHT_PATHS
+        )
         self.initial_radius, self.alpha = read_radius(parameters)
 
     def settings(self):
         settings = super().settings()
         del settings["techniques"], settings["technique_weights"]
-        return {**settings, "photon_count": self.photon_count, "initial_radius": self.initial_radius, "alpha": self.alpha}
+        return {
+            **settings,
+            "photon_count": self.photon_count,
+            "initial_radius": self.initial_radius,
+            "alpha": self.alpha,
+        }
 
     def new_session(self, scene, sensor, seed, iterations):
         return VCMSession(self, scene, sensor, seed, iterations)
 
 
 class VCMSession(BDPTSession):
-    """Iterations of `vcm`: those of `bdpt`, and merging. Films that are rendered in parts have their light sub-paths in parts, too."""
+    """Iterations of `vcm`: those of `bdpt`, and merging. Films that are rendered in parts have
+    their light sub-paths in parts, too."""
 
     shortest = 1
     PASSES = {**BDPTSession.PASSES, "_merge_pass": ("_merge_vertices", ("light", "camera"))}
@@ -126,22 +137,30 @@ class VCMSession(BDPTSession):
             fields.finish()
 
     def _choose_radius(self, spectral):
-        """A share of the spread of the vertices that camera paths meet first: the diagonal, over the root of three, of the box that leaves out 2 % of
-        them at either end of each axis."""
+        """A share of the spread of the vertices that camera paths meet first: the diagonal, over
+        the root of three, of the box that leaves out 2 % of them at either end of each axis."""
         self.radius = 1e-3 * float(dr.norm(self.traits.bounds.extents()))
         if not self.bidirectional:
             return
         spectral = {**spectral, "radius": dr.opaque(mi.Float, self.radius)}
         while True:
-            *_, camera, count, _ = self._camera_pass(self.scene, self.sensor, self._tables, self._seed(PILOT_INDEX, 0), *self.all_over_the_film(),
-                                                     spectral)
+            *_, camera, count, _ = self._camera_pass(
+                self.scene,
+                self.sensor,
+                self._tables,
+                self._seed(PILOT_INDEX, 0),
+                *self.all_over_the_film(),
+                spectral,
+            )
             if not self._grown("camera", count):
                 break
         vertices = read_vertices(camera, dr.arange(mi.UInt32, int(count[0])), True, ("p", "number"))
         points = to_numpy(vertices["p"])[:, np.array(vertices["number"]) == 0]
         if points.shape[1]:
             low, high = np.percentile(points, [2, 98], axis=1)
-            self.radius = max(RADIUS_SHARE * float(np.linalg.norm(high - low)) / 3 ** 0.5, 1e-3 * self.radius)
+            self.radius = max(
+                RADIUS_SHARE * float(np.linalg.norm(high - low)) / 3**0.5, 1e-3 * self.radius
+            )
 
     def weights(self, spectral):
         plain = super().weights(spectral)
@@ -150,8 +169,13 @@ class VCMSession(BDPTSession):
 
     def _merge_vertices(self, tables, radiance, camera, count, light, spectral):
         vertices, light_count, _ = light
-        cell = dr.maximum(spectral["radius"], dr.opaque(mi.Float, smallest_cell(self.traits.bounds, self.capacity["light"])))
-        photon_map = vertex_map(vertices, light_count, self.capacity["light"], self.traits.bounds, cell)
+        cell = dr.maximum(
+            spectral["radius"],
+            dr.opaque(mi.Float, smallest_cell(self.traits.bounds, self.capacity["light"])),
+        )
+        photon_map = vertex_map(
+            vertices, light_count, self.capacity["light"], self.traits.bounds, cell
+        )
         index = lanes(self.capacity["camera"])
         active = index < dr.gather(mi.UInt32, count, 0)
         z = read_vertices(camera, index, active)
@@ -160,8 +184,17 @@ class VCMSession(BDPTSession):
         def weigh(state, back_at_light, back_at_camera):
             return weights.merged(z, state, back_at_light, back_at_camera)
 
-        merged = merge(self.traits, photon_map, z, spectral["radius"], spectral["wavelengths"], self.light_chunk, self.integrator.max_depth,
-                       weigh, active)
+        merged = merge(
+            self.traits,
+            photon_map,
+            z,
+            spectral["radius"],
+            spectral["wavelengths"],
+            self.light_chunk,
+            self.integrator.max_depth,
+            weigh,
+            active,
+        )
         total = mi.Spectrum(radiance)
         dr.scatter_reduce(dr.ReduceOp.Add, total, merged, z["path"], active)
         return total

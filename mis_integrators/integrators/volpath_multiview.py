@@ -1,4 +1,5 @@
-"""Plugin `volpath_multiview`: volumetric path tracing of several views that use each other's paths."""
+"""Plugin `volpath_multiview`: volumetric path tracing of several views that use each other's
+paths."""
 
 from __future__ import annotations
 
@@ -9,14 +10,15 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.film import colour_channels, colour_matrix
-from ..lights.lights import Lights
 from ..core.random import mix, streams
 from ..core.recording import recorder
-from ..core.traits import UnsupportedScene, check_film, check_variant
 from ..core.render_lock import by_turns
+from ..core.traits import UnsupportedScene, check_film, check_variant
+from ..lights.lights import Lights
 from ..volume.films import OWN, SHARED, ViewAccumulator, own_values, splat, write_film
 from ..volume.lines import common_nulls, connect, follow_nulls, sight
-from ..volume.pivots import NOWHERE, ON_SURFACE, OWN as OWN_BRANCH, of_paths, pivot_surface, trace_first_segments
+from ..volume.pivots import NOWHERE, ON_SURFACE, of_paths, pivot_surface, trace_first_segments
+from ..volume.pivots import OWN as OWN_BRANCH
 from ..volume.shifts import SHIFTS
 from ..volume.suffixes import continue_paths, scattered_to
 from ..volume.traits import VolumeTraits, check_volume_scene
@@ -25,7 +27,8 @@ from ..weights.multiview import HEURISTICS, gain, summand
 from .common import IterativeIntegrator, IterativeSession, scalar_seed
 
 PAIRS = 1 << 21
-"""Connections of paths to views that are made at once at most; more are made in parts (bounds memory)."""
+"""Connections of paths to views that are made at once at most; more are made in parts (bounds
+memory)."""
 FEWEST = 1 << 12
 """Camera paths that a part has at least."""
 LAUNCH = 1 << 16
@@ -45,28 +48,34 @@ class VolpathMultiview(IterativeIntegrator):
 
      * - shift
        - |string|
-       - How null interactions are moved from one view's line of sight to another's: ``majorant_optical_depth``, ``raw_depth`` or ``primary_sample``
-         stretch the depth, the same names with ``_copy`` keep it. (Default: ``majorant_optical_depth``)
+       - How null interactions are moved from one view's line of sight to another's:
+         ``majorant_optical_depth``, ``raw_depth`` or ``primary_sample`` stretch the depth, the same
+         names with ``_copy`` keep it. (Default: ``majorant_optical_depth``)
      * - weights
        - |string|
-       - ``mis`` (balance heuristic), ``power`` (power heuristic, exponent 2), ``mwis`` (``mis`` divided by the sum of the weights that arrived
-         at each pixel: consistent, biased at few samples), or ``none`` (the same weight for every view that can make the path: unbiased and
+       - ``mis`` (balance heuristic), ``power`` (power heuristic, exponent 2), ``mwis`` (``mis``
+         divided by the sum of the weights that arrived at each pixel: consistent, biased at few
+         samples), or ``none`` (the same weight for every view that can make the path: unbiased and
          noisy, for comparison). (Default: ``mis``)
      * - add_nulls
        - |bool|
-       - Add null interactions to first segments until all views that see a pivot expect equally many: without them, views hardly agree where
-         majorants are far above the density. Of no effect on copying shifts. (Default: yes, i.e. |true|)
+       - Add null interactions to first segments until all views that see a pivot expect equally
+         many: without them, views hardly agree where majorants are far above the density. Of no
+         effect on copying shifts. (Default: yes, i.e. |true|)
      * - camera_paths
        - |int|
-       - Camera paths per pixel and iteration; 0 stands for as many as keep the processor busy, in eight iterations at least. (Default: 0)
+       - Camera paths per pixel and iteration; 0 stands for as many as keep the processor busy, in
+         eight iterations at least. (Default: 0)
      * - variance
        - |bool|
-       - Adds the channels ``var.R``, ``var.G``, ``var.B`` (mono: ``var.Y``): the estimated variance of the pixel mean over the
-         iterations, of which there must be two at least. (Default: no, i.e. |false|)
+       - Adds the channels ``var.R``, ``var.G``, ``var.B`` (mono: ``var.Y``): the estimated variance
+         of the pixel mean over the iterations, of which there must be two at least. (Default: no,
+         i.e. |false|)
      * - max_depth
        - |int|
-       - Longest path in segments (-1: unlimited). A value of 1 shows only directly visible emitters, 2 adds single scattering, and so
-         on; passing straight through a surface or medium counts for nothing, as in ``volpath``. (Default: -1)
+       - Longest path in segments (-1: unlimited). A value of 1 shows only directly visible
+         emitters, 2 adds single scattering, and so on; passing straight through a surface or medium
+         counts for nothing, as in ``volpath``. (Default: -1)
      * - rr_depth
        - |int|
        - Depth from which Russian roulette may end a path. (Default: 5)
@@ -74,13 +83,14 @@ class VolpathMultiview(IterativeIntegrator):
        - |bool|
        - Hide directly visible emitters. (Default: no, i.e. |false|)
 
-    The views are the children of a ``batch`` sensor, side by side on its film, or one sensor, or any list of sensors through
-    ``mis_integrators.render_views``. Each view's camera paths are traced to the first vertex that scatters, in a medium or on a surface. Every other
-    view that sees it joins there: the null interactions of the first segment are shifted onto its own line of sight, and all views share the rest
-    of the path.
+    The views are the children of a ``batch`` sensor, side by side on its film, or one sensor, or
+    any list of sensors through ``mis_integrators.render_views``. Each view's camera paths are
+    traced to the first vertex that scatters, in a medium or on a surface. Every other view that
+    sees it joins there: the null interactions of the first segment are shifted onto its own line of
+    sight, and all views share the rest of the path.
 
-    With the weights ``mis`` the result is unbiased. Perspective and thin lens sensors are supported; polarised variants, gradients and the film
-    ``specfilm`` are refused by name.
+    With the weights ``mis`` the result is unbiased. Perspective and thin lens sensors are
+    supported; polarised variants, gradients and the film ``specfilm`` are refused by name.
 
     .. tabs::
         .. code-tab:: xml
@@ -105,7 +115,12 @@ class VolpathMultiview(IterativeIntegrator):
         self.add_nulls = parameters.boolean("add_nulls", True)
 
     def settings(self):
-        return {**super().settings(), "shift": self.shift, "weights": self.weights, "add_nulls": self.add_nulls}
+        return {
+            **super().settings(),
+            "shift": self.shift,
+            "weights": self.weights,
+            "add_nulls": self.add_nulls,
+        }
 
     def session(self, scene, sensor=0, seed=0, spp=0):
         sensor = self._sensor(scene, sensor)
@@ -130,7 +145,8 @@ class VolpathMultiview(IterativeIntegrator):
 
     @staticmethod
     def _automatic(sensors, spp):
-        """Camera paths a pixel and iteration that make a launch of about `LAUNCH` paths; a divisor of `spp`, and at most an eighth of it."""
+        """Camera paths a pixel and iteration that make a launch of about `LAUNCH` paths; a divisor
+        of `spp`, and at most an eighth of it."""
         pixels = sum(int(w) * int(h) for w, h in (sensor.film().crop_size() for sensor in sensors))
         most = max(1, min(LAUNCH // max(pixels, 1), spp // 8 if spp else 16))
         return max(n for n in range(1, most + 1) if spp % n == 0)
@@ -139,7 +155,8 @@ class VolpathMultiview(IterativeIntegrator):
 class MultiViewSession(IterativeSession):
     """Iterations of `volpath_multiview`: first segments, connections, suffixes, splats.
 
-    `sensors` are sensors of the scene, alone or batches; films and images of the session itself are the first one's.
+    `sensors` are sensors of the scene, alone or batches; films and images of the session itself are
+    the first one's.
     """
 
     def __init__(self, integrator, scene, sensors, seed, iterations, camera_paths):
@@ -157,7 +174,9 @@ class MultiViewSession(IterativeSession):
     def restart(self, seed):
         """Forgets what has been rendered, and goes on with another seed."""
         self.seed = seed
-        self.accumulator = ViewAccumulator(self.views, self.integrator.variance, self.integrator.weights == "mwis")
+        self.accumulator = ViewAccumulator(
+            self.views, self.integrator.variance, self.integrator.weights == "mwis"
+        )
         self._counts = {name: mi.UInt64(0) for name in ("tried", "reached", "lost")}
 
     @property
@@ -166,21 +185,65 @@ class MultiViewSession(IterativeSession):
 
     def _freeze(self):
         """Records the passes anew."""
-        self._tables = [self.views.table, self.traits.shares, *([] if self.lights.dark else self.lights.tables())]
-        self._first_pass, self._sight_pass, self._agreement_pass, self._connection_pass, self._suffix_pass, self._splat_pass = map(
-            self.recorded, (self._trace_first, self._look, self._agree, self._connect, self._continue, self._splat))
+        self._tables = [
+            self.views.table,
+            self.traits.shares,
+            *([] if self.lights.dark else self.lights.tables()),
+        ]
+        (
+            self._first_pass,
+            self._sight_pass,
+            self._agreement_pass,
+            self._connection_pass,
+            self._suffix_pass,
+            self._splat_pass,
+        ) = map(
+            self.recorded,
+            (
+                self._trace_first,
+                self._look,
+                self._agree,
+                self._connect,
+                self._continue,
+                self._splat,
+            ),
+        )
 
     # ------------------------------------------------------------------ passes
 
     def _trace_first(self, scene, tables, number, seed, spectral):
         integrator = self.integrator
         active = (number < self.views.paths) & (integrator.max_depth != 0)
-        pivot, radiance, rng = trace_first_segments(scene, self.views, self.traits, number, seed, streams(number, seed), spectral["wavelengths"],
-                                                    spectral["weight"], integrator.hide_emitters, active)
+        pivot, radiance, rng = trace_first_segments(
+            scene,
+            self.views,
+            self.traits,
+            number,
+            seed,
+            streams(number, seed),
+            spectral["wavelengths"],
+            spectral["weight"],
+            integrator.hide_emitters,
+            active,
+        )
         line, found = {}, mi.UInt32(0)
         if self.views.count > 1:
-            shared = active & pivot["in_window"] & (pivot["kind"] != NOWHERE) & (pivot["branch"] != OWN_BRANCH)
-            line, found = sight(scene, self.views, self.traits, pivot, pivot["view"], self.slots, integrator.hide_emitters, shared)
+            shared = (
+                active
+                & pivot["in_window"]
+                & (pivot["kind"] != NOWHERE)
+                & (pivot["branch"] != OWN_BRANCH)
+            )
+            line, found = sight(
+                scene,
+                self.views,
+                self.traits,
+                pivot,
+                pivot["view"],
+                self.slots,
+                integrator.hide_emitters,
+                shared,
+            )
             line["log_density"] = mi.Float(line["log_survival"])
         return pivot, radiance, line, found
 
@@ -193,9 +256,20 @@ class MultiViewSession(IterativeSession):
         """Every other view's line of sight to each pivot."""
         view, path = self._pairs()
         pivot = of_paths(pivots, path)
-        active = (dr.gather(mi.UInt32, numbers, path) < self.views.paths) & (dr.gather(mi.Float, lines["density"], path) > 0)
+        active = (dr.gather(mi.UInt32, numbers, path) < self.views.paths) & (
+            dr.gather(mi.Float, lines["density"], path) > 0
+        )
         active &= view != pivot["view"]
-        return sight(scene, self.views, self.traits, pivot, view, self.slots, self.integrator.hide_emitters, active)
+        return sight(
+            scene,
+            self.views,
+            self.traits,
+            pivot,
+            view,
+            self.slots,
+            self.integrator.hide_emitters,
+            active,
+        )
 
     def _agree(self, scene, tables, pivots, lines, sights, numbers, seed):
         """What views are made to agree about, and the paths' own densities and tints under it."""
@@ -203,24 +277,57 @@ class MultiViewSession(IterativeSession):
         common = dr.zeros(mi.Float, self.paths)
         if self.integrator.add_nulls and not self.integrator.shift.endswith("copy"):
             common = common_nulls(lines, sights, pivots["view"], self.views.count, active)
-        log_density, tint, _, _ = follow_nulls(None, pivots, lines, lines, common, numbers, seed, self.slots, active)
+        log_density, tint, _, _ = follow_nulls(
+            None, pivots, lines, lines, common, numbers, seed, self.slots, active
+        )
         return common, log_density, dr.select(active, tint, pivots["tint"])
 
     def _connect(self, scene, tables, pivots, lines, sights, common, numbers, seed):
         _, path = self._pairs()
         number = dr.gather(mi.UInt32, numbers, path)
-        return connect(self.traits, SHIFTS[self.integrator.shift], of_paths(pivots, path), of_paths(lines, path), sights,
-                       dr.gather(mi.Float, common, path), number, seed, self.slots, number < self.views.paths)
+        return connect(
+            self.traits,
+            SHIFTS[self.integrator.shift],
+            of_paths(pivots, path),
+            of_paths(lines, path),
+            sights,
+            dr.gather(mi.Float, common, path),
+            number,
+            seed,
+            self.slots,
+            number < self.views.paths,
+        )
 
     def _continue(self, scene, tables, pivot, connections, number, seed):
         integrator = self.integrator
-        return continue_paths(scene, self.lights, self.traits, partial(summand, integrator.weights), pivot, connections, number, seed,
-                              self.views.count, integrator.max_depth, integrator.rr_depth, number < self.views.paths)
+        return continue_paths(
+            scene,
+            self.lights,
+            self.traits,
+            partial(summand, integrator.weights),
+            pivot,
+            connections,
+            number,
+            seed,
+            self.views.count,
+            integrator.max_depth,
+            integrator.rr_depth,
+            number < self.views.paths,
+        )
 
-    def _splat(self, scene, tables, pivots, radiance, connections, suffixes, value, numbers, spectral):
+    def _splat(
+        self, scene, tables, pivots, radiance, connections, suffixes, value, numbers, spectral
+    ):
         views, matrix = self.views, spectral["matrix"]
         active = numbers < views.paths
-        own = own_values(radiance, pivots["visible"], value, gain(mi.Float(1), suffixes["total"]), suffixes["alone"], matrix)
+        own = own_values(
+            radiance,
+            pivots["visible"],
+            value,
+            gain(mi.Float(1), suffixes["total"]),
+            suffixes["alone"],
+            matrix,
+        )
         image = splat(views, [(pivots["view"], pivots["position"], own)], SHARED + OWN, [active])
         if views.count == 1:
             return image[:, :, :SHARED], image[:, :, SHARED:]
@@ -229,25 +336,37 @@ class MultiViewSession(IterativeSession):
         # The path's own view was served above.
         reached = (connections["ratio"] > 0) & ~suffix["alone"]
         surface = pivot_surface(pivot, reached & (pivot["kind"] == ON_SURFACE))
-        brought = scattered_to(suffix, pivot, surface, connections["d"], reached) * connections["tint"]
+        brought = (
+            scattered_to(suffix, pivot, surface, connections["d"], reached) * connections["tint"]
+        )
         weight = gain(connections["ratio"], suffix["total"])
         colour = colour_channels(brought * weight, matrix)
-        shared = splat(views, [(view, connections["position"], [*colour, weight])], SHARED, [reached])
+        shared = splat(
+            views, [(view, connections["position"], [*colour, weight])], SHARED, [reached]
+        )
         return image[:, :, :SHARED] + shared, image[:, :, SHARED:]
 
     # ------------------------------------------------------------------ iterations
 
     def _spectral(self, iteration):
         """The wavelengths that all paths of an iteration share, and their conversion to colour."""
-        sample = dr.opaque(mi.Float, mix(self.seed, iteration, WAVELENGTH) / 2 ** 32)
-        wavelengths, weight = self.views.sensors[0].sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), sample)
-        spectral = {"wavelengths": wavelengths, "weight": weight, "matrix": colour_matrix(wavelengths)}
+        sample = dr.opaque(mi.Float, mix(self.seed, iteration, WAVELENGTH) / 2**32)
+        wavelengths, weight = self.views.sensors[0].sample_wavelengths(
+            dr.zeros(mi.SurfaceInteraction3f), sample
+        )
+        spectral = {
+            "wavelengths": wavelengths,
+            "weight": weight,
+            "matrix": colour_matrix(wavelengths),
+        }
         dr.make_opaque(spectral)
         return spectral
 
     def _run(self, iteration):
         seed, spectral = self._seed(iteration, PATHS), self._spectral(iteration)
-        layers = [self._part(first, seed, spectral) for first in range(0, self.views.paths, self.paths)]
+        layers = [
+            self._part(first, seed, spectral) for first in range(0, self.views.paths, self.paths)
+        ]
         self.accumulator.add(*(sum(layer[1:], layer[0]) for layer in zip(*layers)), iteration)
 
     def estimate(self):
@@ -259,7 +378,9 @@ class MultiViewSession(IterativeSession):
         numbers = dr.arange(mi.UInt32, self.paths) + dr.opaque(mi.UInt32, first)
         dr.eval(numbers)
         while True:
-            pivots, radiance, lines, found = self._first_pass(self.scene, self._tables, numbers, seed, spectral)
+            pivots, radiance, lines, found = self._first_pass(
+                self.scene, self._tables, numbers, seed, spectral
+            )
             connections, more = None, mi.UInt32(0)
             if self.views.count > 1:
                 dr.eval(pivots, radiance, lines, found)
@@ -267,14 +388,30 @@ class MultiViewSession(IterativeSession):
                 dr.eval(sights, more)
                 common = dr.zeros(mi.Float, self.paths)
                 if self.traits.has_null_media:
-                    agreed = self._agreement_pass(self.scene, self._tables, pivots, lines, sights, numbers, seed)
+                    agreed = self._agreement_pass(
+                        self.scene, self._tables, pivots, lines, sights, numbers, seed
+                    )
                     common, lines["log_density"], pivots["tint"] = agreed
                 dr.eval(common, lines, pivots)
-                connections = self._connection_pass(self.scene, self._tables, pivots, lines, sights, common, numbers, seed)
+                connections = self._connection_pass(
+                    self.scene, self._tables, pivots, lines, sights, common, numbers, seed
+                )
                 dr.eval(connections)
-            suffixes, value = self._suffix_pass(self.scene, self._tables, pivots, connections, numbers, seed)
+            suffixes, value = self._suffix_pass(
+                self.scene, self._tables, pivots, connections, numbers, seed
+            )
             dr.eval(suffixes, value)
-            layers = self._splat_pass(self.scene, self._tables, pivots, radiance, connections, suffixes, value, numbers, spectral)
+            layers = self._splat_pass(
+                self.scene,
+                self._tables,
+                pivots,
+                radiance,
+                connections,
+                suffixes,
+                value,
+                numbers,
+                spectral,
+            )
             dr.eval(layers)
             needed = int(dr.maximum(dr.max(found), dr.max(more))[0])
             if needed <= self.slots:
@@ -282,7 +419,10 @@ class MultiViewSession(IterativeSession):
             self.slots = needed
             self._freeze()
         if connections is not None:
-            for name, kind in (("reached", connections["ratio"] > 0), ("lost", connections["ratio"] < 0)):
+            for name, kind in (
+                ("reached", connections["ratio"] > 0),
+                ("lost", connections["ratio"] < 0),
+            ):
                 self._counts[name] += mi.UInt64(dr.sum(dr.select(kind, mi.UInt32(1), mi.UInt32(0))))
             self._counts["tried"] += self.paths * (self.views.count - 1)
             dr.schedule(self._counts)
@@ -290,7 +430,8 @@ class MultiViewSession(IterativeSession):
 
     @property
     def statistics(self):
-        """Connections `tried` so far, how many `reached` their view, and how many a shift has `lost`."""
+        """Connections `tried` so far, how many `reached` their view, and how many a shift has
+        `lost`."""
         return {name: int(count[0]) for name, count in self._counts.items()}
 
     # ------------------------------------------------------------------ results
@@ -311,35 +452,46 @@ class MultiViewSession(IterativeSession):
         images, first = [], 0
         pictures = self.accumulator.pictures(self.integrator.variance)
         for sensor, members in zip(self.views.groups, self.views.members):
-            image = self._fill(sensor.film(), pictures[first:first + members]).develop()
+            image = self._fill(sensor.film(), pictures[first : first + members]).develop()
             width = self.views.sizes[first][0]
-            images += [image[:, i * width:(i + 1) * width] for i in range(members)]
+            images += [image[:, i * width : (i + 1) * width] for i in range(members)]
             first += members
         dr.eval(images)
         return images
 
     def _fill(self, film, pictures):
         """Writes pictures side by side into a film."""
-        write_film(self._emptied(film), pictures[0] if len(pictures) == 1 else dr.concat(pictures, axis=1))
+        write_film(
+            self._emptied(film), pictures[0] if len(pictures) == 1 else dr.concat(pictures, axis=1)
+        )
         return film
 
     def fill_film(self):
         """Hands what has been rendered so far to the sensor's film, side by side for a `batch`."""
-        self._fill(self.sensor.film(), self.accumulator.pictures(self.integrator.variance)[:self.views.members[0]])
+        self._fill(
+            self.sensor.film(),
+            self.accumulator.pictures(self.integrator.variance)[: self.views.members[0]],
+        )
 
 
 def render_views(scene, integrator=None, spp=0, seed=0):
-    """Renders all views of `scene` together: the children of its `batch` sensors, and its other sensors, in their order.
+    """Renders all views of `scene` together: the children of its `batch` sensors, and its other
+    sensors, in their order.
 
-    `integrator` is a `volpath_multiview` (default: the scene's own if it is one, else one with its default parameters), `spp` the samples per
-    pixel (0: the most that a sensor's sampler asks for). Returns a list of tensors (height, width, channels), one a view, as each view's film
-    develops it; films may differ in size. Raises `UnsupportedScene` for what cannot be rendered.
+    `integrator` is a `volpath_multiview` (default: the scene's own if it is one, else one with its
+    default parameters), `spp` the samples per pixel (0: the most that a sensor's sampler asks for).
+    Returns a list of tensors (height, width, channels), one a view, as each view's film develops
+    it; films may differ in size. Raises `UnsupportedScene` for what cannot be rendered.
     """
     if integrator is None:
         own = scene.integrator()
-        integrator = own if hasattr(own, "views_session") else mi.load_dict({"type": "volpath_multiview"})
+        integrator = (
+            own if hasattr(own, "views_session") else mi.load_dict({"type": "volpath_multiview"})
+        )
     if not hasattr(integrator, "views_session"):
-        raise UnsupportedScene(f"render_views: the integrator must be a volpath_multiview, not {integrator.class_name()}")
+        raise UnsupportedScene(
+            f"render_views: the integrator must be a volpath_multiview, not {integrator.class_name()}"
+        )
     with dr.suspend_grad():
         spp = spp or max((sensor.sampler().sample_count() for sensor in scene.sensors()), default=1)
         session = integrator.views_session(scene, seed, spp)

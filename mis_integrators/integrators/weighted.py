@@ -6,13 +6,14 @@ import drjit as dr
 import mitsuba as mi
 
 from ..paths.camera_pass import STATE, trace_camera_paths
-from ..photons.gather import gather_photons, vertex_section
 from ..paths.light_pass import trace_light_paths
+from ..photons.gather import gather_photons, vertex_section
 from .bdpm import BDPM, BDPMSession
 
 
 class WeightedBDPM(BDPM):
-    """Base of the integrators that merge at the smooth camera vertices `first_vertex` to `first_vertex + strategies - 1`."""
+    """Base of the integrators that merge at the smooth camera vertices `first_vertex` to
+    `first_vertex + strategies - 1`."""
 
     first_vertex = 0
 
@@ -26,7 +27,8 @@ class WeightedSession(BDPMSession):
     """Iterations of a `WeightedBDPM`. A subclass makes the weights."""
 
     weighted_pilot = False
-    """Whether the pilot of the automatic radius renders under the weights, made for `usual_radius()`; else it merges at the first vertex."""
+    """Whether the pilot of the automatic radius renders under the weights, made for
+    `usual_radius()`; else it merges at the first vertex."""
 
     def __init__(self, integrator, scene, sensor, seed, iterations):
         self._weighted = False
@@ -34,17 +36,21 @@ class WeightedSession(BDPMSession):
 
     @property
     def last_vertex(self):
-        return self.integrator.first_vertex + (self.integrator.strategies - 1 if self._weighted else 0)
+        return self.integrator.first_vertex + (
+            self.integrator.strategies - 1 if self._weighted else 0
+        )
 
     def mixes(self):
         """Whether the scene has paths that several strategies make."""
         return True
 
     def prepare(self, spectral):
-        """Makes what the weights need, once: before the pilot of the radius if that is weighted, else after it."""
+        """Makes what the weights need, once: before the pilot of the radius if that is weighted,
+        else after it."""
 
     def weights(self, merging):
-        """The weights (hooks as in `trace_camera_paths` and `trace_light_paths`); `merging` is what the method of that name returns."""
+        """The weights (hooks as in `trace_camera_paths` and `trace_light_paths`); `merging` is what
+        the method of that name returns."""
         raise TypeError(f"{type(self).__name__} does not define weights")
 
     def merging(self, radii):
@@ -52,20 +58,30 @@ class WeightedSession(BDPMSession):
         raise TypeError(f"{type(self).__name__} does not define merging")
 
     def weigher(self, weights, kind, level, vertices, photon_map):
-        """What weighs the photons of a map, of one kind, at the vertices of one strategy (`weigh` of `gather_photons`); None where a vertex
-        weighs all of them alike: caustic ones as its direct light, others by the first word of its state. Caustic photons are merged at all
+        """What weighs the photons of a map, of one kind, at the vertices of one strategy (`weigh`
+        of `gather_photons`); None where a vertex weighs all of them alike: caustic ones as its
+        direct light, others by the first word of its state. Caustic photons are merged at all
         vertices at once (`level` is None)."""
         if kind == "caustic" or level == self.integrator.strategies - 1:
             return None
         notebook, state = weights.notebook(), [vertices[name] for name in STATE]
 
         def weigh(index, f, p, back, active):
-            return weights.merging(level, state, f, p, notebook.read(level, photon_map.notes, photon_map.place_of_notes(index, active), active))
+            return weights.merging(
+                level,
+                state,
+                f,
+                p,
+                notebook.read(
+                    level, photon_map.notes, photon_map.place_of_notes(index, active), active
+                ),
+            )
+
         return weigh
 
     def set_up(self):
         if not self.weighted_pilot:
-            super().set_up()                     # may render already, to measure time, and so come here
+            super().set_up()  # may render already, to measure time, and so come here
         if not self._weighted and self.kinds() and self.mixes():
             self.prepare(super()._spectral(0))
             self._weighted, self.one_vertex = True, False
@@ -74,7 +90,11 @@ class WeightedSession(BDPMSession):
         super().set_up()
 
     def _vertex_room(self, paths):
-        return super()._vertex_room(paths) if not self._weighted else paths * (2 if self.traits.has_mixed else 1)
+        return (
+            super()._vertex_room(paths)
+            if not self._weighted
+            else paths * (2 if self.traits.has_mixed else 1)
+        )
 
     def _spectral(self, iteration):
         spectral = super()._spectral(iteration)
@@ -88,18 +108,51 @@ class WeightedSession(BDPMSession):
         if not self._weighted:
             return super()._trace_light(scene, sensor, tables, seed, spectral)
         notebook = self.weights(spectral["merging"]).notebook() if self.has_indirect else None
-        return trace_light_paths(scene, self.lights, self.traits, seed, self.light_paths, self.photon_capacity, spectral["wavelengths"],
-                                 sensor.shutter_open(), sensor.shutter_open_time(), self.integrator.max_depth, self.integrator.rr_depth,
-                                 notebook=notebook)
+        return trace_light_paths(
+            scene,
+            self.lights,
+            self.traits,
+            seed,
+            self.light_paths,
+            self.photon_capacity,
+            spectral["wavelengths"],
+            sensor.shutter_open(),
+            sensor.shutter_open_time(),
+            self.integrator.max_depth,
+            self.integrator.rr_depth,
+            notebook=notebook,
+        )
 
-    def _trace_camera(self, scene, sensor, seed, first, stride, paths, together, capacity, spectral):
+    def _trace_camera(
+        self, scene, sensor, seed, first, stride, paths, together, capacity, spectral
+    ):
         if not self._weighted:
-            return super()._trace_camera(scene, sensor, seed, first, stride, paths, together, capacity, spectral)
+            return super()._trace_camera(
+                scene, sensor, seed, first, stride, paths, together, capacity, spectral
+            )
         integrator = self.integrator
-        return trace_camera_paths(scene, sensor, integrator, self.lights, self.traits, seed, first, stride, paths, together,
-                                  spectral["sample"], integrator.first_vertex + integrator.strategies - 1, integrator.max_depth,
-                                  integrator.rr_depth, integrator.hide_emitters, capacity, self.has_caustics, self.has_indirect, False,
-                                  self.weights(spectral["merging"]))
+        return trace_camera_paths(
+            scene,
+            sensor,
+            integrator,
+            self.lights,
+            self.traits,
+            seed,
+            first,
+            stride,
+            paths,
+            together,
+            spectral["sample"],
+            integrator.first_vertex + integrator.strategies - 1,
+            integrator.max_depth,
+            integrator.rr_depth,
+            integrator.hide_emitters,
+            capacity,
+            self.has_caustics,
+            self.has_indirect,
+            False,
+            self.weights(spectral["merging"]),
+        )
 
     def _gather(self, photon_map, vertices, kind, radii, spectral, grey=False):
         if not self._weighted:
@@ -113,7 +166,16 @@ class WeightedSession(BDPMSession):
         totals = [dr.zeros(mi.Float if grey else mi.Spectrum, width) for _ in radii]
         for level in range(integrator.strategies):
             first = (level + integrator.first_vertex) * section
-            merged = self._merge(kind, level, photon_map, vertex_section(vertices, first, section), weights, radii, spectral, grey)
+            merged = self._merge(
+                kind,
+                level,
+                photon_map,
+                vertex_section(vertices, first, section),
+                weights,
+                radii,
+                spectral,
+                grey,
+            )
             for total, values in zip(totals, merged):
                 dr.scatter(total, values, dr.arange(mi.UInt32, section) + first)
         dr.eval(totals)
@@ -124,11 +186,25 @@ class WeightedSession(BDPMSession):
         weigh = self.weigher(weights, kind, level, vertices, photon_map)
         if weigh is None:
             vertices = _scaled(vertices, "share" if kind == "caustic" else STATE[0])
-        return gather_photons(self.traits, photon_map, vertices, radii, spectral["wavelengths"], self.light_paths, self.integrator.max_depth,
-                              only_last=kind == "indirect", grey=grey, weigh=weigh)
+        return gather_photons(
+            self.traits,
+            photon_map,
+            vertices,
+            radii,
+            spectral["wavelengths"],
+            self.light_paths,
+            self.integrator.max_depth,
+            only_last=kind == "indirect",
+            grey=grey,
+            weigh=weigh,
+        )
 
 
 def _scaled(vertices, weight):
     """The vertices with one of their weights as a scale of what they gather."""
     used = dr.max(vertices["throughput"]) > 0
-    return {**vertices, "throughput": dr.select(used, vertices["throughput"], 0), "scale": dr.select(used, vertices[weight], 0)}
+    return {
+        **vertices,
+        "throughput": dr.select(used, vertices["throughput"], 0),
+        "scale": dr.select(used, vertices[weight], 0),
+    }

@@ -1,10 +1,12 @@
 """Where light from infinitely far away should start so that it reaches what the camera sees.
 
-A sun, a sky or an environment map sends its sub-paths through the disk of the whole scene's bounding sphere; through a window,
-almost none would enter. A pilot of camera paths asks from which directions, and through which part of the plane across each
-direction, the places that matter are lit. Sub-paths then start mostly there: a histogram over (direction cell, position cell), and one over
-the faces of the box around the lit places (`entrances`), mixed with the plain densities, which keeps every estimate unbiased however poor the pilot.
-The latter also tells next-event estimation where the windows are, if that makes less noise.
+A sun, a sky or an environment map sends its sub-paths through the disk of the whole scene's
+bounding sphere; through a window, almost none would enter. A pilot of camera paths asks from which
+directions, and through which part of the plane across each direction, the places that matter are
+lit. Sub-paths then start mostly there: a histogram over (direction cell, position cell), and one
+over the faces of the box around the lit places (`entrances`), mixed with the plain densities, which
+keeps every estimate unbiased however poor the pilot. The latter also tells next-event estimation
+where the windows are, if that makes less noise.
 """
 
 from __future__ import annotations
@@ -15,13 +17,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..paths.camera_rays import sample_camera_ray
-from .portals import Entrances
-from .histograms import draw_cell, in_square_cell, smoothed, square_cell
 from ..core.packing import from_numpy
 from ..core.random import next_2d, streams
 from ..core.spectra import channel_mean
 from ..core.traits import scene_bounds
+from ..paths.camera_rays import sample_camera_ray
+from .histograms import draw_cell, in_square_cell, smoothed, square_cell
+from .portals import Entrances
 
 POLAR_CELLS = 16
 AZIMUTH_CELLS = 32
@@ -30,7 +32,8 @@ POSITION_CELLS = 64
 DEFENSIVE_SHARE = 0.1
 """Share of sub-paths that start anywhere on the scene's disk."""
 ENOUGH_RECORDS = 256
-"""Records of a direction cell at which its own histogram has as large a share as the one over the faces of the box, which serves all of them."""
+"""Records of a direction cell at which its own histogram has as large a share as the one over the
+faces of the box, which serves all of them."""
 PILOT_PATHS = 65536
 PILOT_BOUNCES = 4
 TESTS = 2
@@ -74,13 +77,18 @@ def cell_direction(cell, sample):
 
 
 def _weighted_box(points, weights, tail):
-    """Low and high corner of the box that leaves the share `tail` of the weight outside at each end of each axis."""
+    """Low and high corner of the box that leaves the share `tail` of the weight outside at each end
+    of each axis."""
     corners = []
     for axis in points:
         order = np.argsort(axis)
         share = np.cumsum(weights[order]) / weights.sum()
-        corners.append((axis[order[np.searchsorted(share, tail)]],
-                        axis[order[min(np.searchsorted(share, 1 - tail), len(order) - 1)]]))
+        corners.append(
+            (
+                axis[order[np.searchsorted(share, tail)]],
+                axis[order[min(np.searchsorted(share, 1 - tail), len(order) - 1)]],
+            )
+        )
     return np.array(corners).T
 
 
@@ -92,9 +100,13 @@ def _sees_sky(scene, ray, active):
     reached = mi.Bool(active)
     left = mi.UInt32(PASS_THROUGH)
     while dr.hint(pending, label="sky test"):
-        hit = scene.ray_intersect(ray, mi.RayFlags.Minimal, coherent=False, reorder=False, active=pending)
+        hit = scene.ray_intersect(
+            ray, mi.RayFlags.Minimal, coherent=False, reorder=False, active=pending
+        )
         flags = hit.bsdf().flags()
-        through = mi.has_flag(flags, mi.BSDFFlags.Null) | mi.has_flag(flags, mi.BSDFFlags.DeltaTransmission)
+        through = mi.has_flag(flags, mi.BSDFFlags.Null) | mi.has_flag(
+            flags, mi.BSDFFlags.DeltaTransmission
+        )
         left -= 1
         pending &= hit.is_valid()
         reached &= ~pending | (through & (left > 0))
@@ -104,18 +116,24 @@ def _sees_sky(scene, ray, active):
 
 
 def _aimed_density(entrances, own_pdf, p, towards, active=True):
-    """Density per solid angle of directions from `p` of which, near the entrances, the `AIMED_SHARE` is aimed at these; all others have density `own_pdf`."""
+    """Density per solid angle of directions from `p` of which, near the entrances, the
+    `AIMED_SHARE` is aimed at these; all others have density `own_pdf`."""
     near = active & entrances.near(p)
-    mixed = (1 - AIMED_SHARE) * own_pdf + AIMED_SHARE * entrances.direction_density(p, towards, near)
+    mixed = (1 - AIMED_SHARE) * own_pdf + AIMED_SHARE * entrances.direction_density(
+        p, towards, near
+    )
     return dr.select(near, mixed, own_pdf)
 
 
 def _worth_aiming(entrances, p, d, light, density, own):
-    """Whether direct light is less noisy with the `AIMED_SHARE` of its directions aimed at the entrances.
+    """Whether direct light is less noisy with the `AIMED_SHARE` of its directions aimed at the
+    entrances.
 
-    Records (NumPy arrays): places `p` and directions `d` (3, n) to environments that a shadow ray reaches, `light` from there, densities per solid angle with which
-    they were drawn, and with which the emitter's own sampler draws them. At a place, light has the second moment of its ratio to the density of its
-    direction; here that is taken relative to the light, so that dark places count as much as bright ones.
+    Records (NumPy arrays): places `p` and directions `d` (3, n) to environments that a shadow ray
+    reaches, `light` from there, densities per solid angle with which they were drawn, and with
+    which the emitter's own sampler draws them. At a place, light has the second moment of its ratio
+    to the density of its direction; here that is taken relative to the light, so that dark places
+    count as much as bright ones.
     """
     if len(light) < FEWEST_RECORDS:
         return False
@@ -124,7 +142,8 @@ def _worth_aiming(entrances, p, d, light, density, own):
 
 
 class Place(NamedTuple):
-    """Surfaces that camera paths have met: their BSDFs, the paths' throughput, and where they scatter smoothly."""
+    """Surfaces that camera paths have met: their BSDFs, the paths' throughput, and where they
+    scatter smoothly."""
 
     si: mi.SurfaceInteraction3f
     bsdf: mi.BSDFPtr
@@ -133,12 +152,14 @@ class Place(NamedTuple):
 
 
 class EnvironmentGuide:
-    """Densities of position and direction for infinite emitters (`environment` and `directional` kinds).
+    """Densities of position and direction for infinite emitters (`environment` and `directional`
+    kinds).
 
-    Attributes: `center`, `radius` of the scene's bounding sphere; `focus_center`, `focus_radius` of the lit places that the
-    pilot met; `entrances` of the light of environments (`None` where the pilot saw next to none); `direction_share`, the share of environment sub-paths
-    whose direction comes from the emitter's own sampler; `aims`, whether next-event estimation in the box around the lit places aims at the
-    entrances.
+    Attributes: `center`, `radius` of the scene's bounding sphere; `focus_center`, `focus_radius` of
+    the lit places that the pilot met; `entrances` of the light of environments (`None` where the
+    pilot saw next to none); `direction_share`, the share of environment sub-paths whose direction
+    comes from the emitter's own sampler; `aims`, whether next-event estimation in the box around
+    the lit places aims at the entrances.
     """
 
     def __init__(self, scene, sensor):
@@ -164,10 +185,19 @@ class EnvironmentGuide:
 
     def tables(self):
         """Every evaluated array that the sampling routines read, for `dr.freeze` to track."""
-        arrays = [self.center, self.focus_center, self._first_row, self._pmf, self._cdf, self._guided]
+        arrays = [
+            self.center,
+            self.focus_center,
+            self._first_row,
+            self._pmf,
+            self._cdf,
+            self._guided,
+        ]
         if self.entrances is not None:
             arrays += [self._entering, *self.entrances.tables()]
-        return arrays + ([self._direction_pmf, self._direction_cdf] if self.direction_share < 1 else [])
+        return arrays + (
+            [self._direction_pmf, self._direction_cdf] if self.direction_share < 1 else []
+        )
 
     def row_of_emitter(self, index):
         """First table row of emitter `index`: the only one of a directional emitter."""
@@ -178,33 +208,55 @@ class EnvironmentGuide:
     def _learn(self, sensor):
         places = self._places(sensor)
         self._learn_directions(places)
-        records = [self._numpy(self._look(index, emitter, place, rng)) for index, emitter in self.infinite for place, rng in places
-                   for _ in range(TESTS if emitter.is_environment() else 1)]
+        records = [
+            self._numpy(self._look(index, emitter, place, rng))
+            for index, emitter in self.infinite
+            for place, rng in places
+            for _ in range(TESTS if emitter.is_environment() else 1)
+        ]
         p, d, row, weight, density, own = (np.concatenate(x, axis=-1) for x in zip(*records))
         useful = (weight > 0) & np.isfinite(weight)
-        p, d, row, weight, density, own = (x[..., useful] for x in (p, d, row, weight, density, own))
+        p, d, row, weight, density, own = (
+            x[..., useful] for x in (p, d, row, weight, density, own)
+        )
         of_sky = self._environment_rows()
-        cells = POSITION_CELLS ** 2
+        cells = POSITION_CELLS**2
         pmf = np.zeros((self.row_count, cells))
         if len(row) >= FEWEST_RECORDS:
             weight = np.minimum(weight, 20 * np.mean(weight))
             low, high = _weighted_box(p, weight, FOCUS_TAIL)
-            # An even flux is what merging wants, and heavy records (a glossy peak, a texel of the sun) guide no better than others.
+            # An even flux is what merging wants, and heavy records (a glossy peak, a texel of the
+            # sun) guide no better than others.
             light, weight = weight, np.sqrt(weight)
-            center, radius = (low + high) / 2, max(np.linalg.norm(high - low) / 2, 1e-4 * self.radius)
-            self.focus_center, self.focus_radius = mi.Point3f([float(x) for x in center]), float(radius) * 1.05
+            center, radius = (
+                (low + high) / 2,
+                max(np.linalg.norm(high - low) / 2, 1e-4 * self.radius),
+            )
+            self.focus_center, self.focus_radius = (
+                mi.Point3f([float(x) for x in center]),
+                float(radius) * 1.05,
+            )
             cell, inside = (np.array(x) for x in self._position_cell(mi.Vector3f(d), mi.Point3f(p)))
-            pmf += np.bincount((row * cells + cell)[inside], weight[inside], pmf.size).reshape(pmf.shape)
+            pmf += np.bincount((row * cells + cell)[inside], weight[inside], pmf.size).reshape(
+                pmf.shape
+            )
             entering = of_sky[row]
             if np.count_nonzero(entering) >= FEWEST_RECORDS:
+
                 def entrances(records):
                     return Entrances(low, high, p[:, records], d[:, records], weight[records])
 
                 self.entrances = entrances(entering)
-                # What half of the records have taught is tried on the others: a histogram knows those too well that it was made from.
+                # What half of the records have taught is tried on the others: a histogram knows
+                # those too well that it was made from.
                 odd = np.cumsum(entering) % 2 == 1
-                self.aims = _worth_aiming(entrances(entering & odd), *(x[..., entering & ~odd & (own > 0)] for x in (p, d, light, density, own)))
-        pmf = smoothed(pmf.reshape(-1, POSITION_CELLS, POSITION_CELLS), LEVEL_SHARES).reshape(self.row_count, cells)
+                self.aims = _worth_aiming(
+                    entrances(entering & odd),
+                    *(x[..., entering & ~odd & (own > 0)] for x in (p, d, light, density, own)),
+                )
+        pmf = smoothed(pmf.reshape(-1, POSITION_CELLS, POSITION_CELLS), LEVEL_SHARES).reshape(
+            self.row_count, cells
+        )
         total = pmf.sum(axis=1)
         pmf /= np.maximum(total, 1e-300)[:, None]
         self._pmf = from_numpy(mi.Float, pmf.ravel())
@@ -212,7 +264,9 @@ class EnvironmentGuide:
         guided = np.where(total > 0, 1 - DEFENSIVE_SHARE, 0.0)
         if self.entrances is not None:
             met = np.bincount(row, minlength=self.row_count)
-            entering = np.where(of_sky, (1 - DEFENSIVE_SHARE) * ENOUGH_RECORDS / (ENOUGH_RECORDS + met), 0.0)
+            entering = np.where(
+                of_sky, (1 - DEFENSIVE_SHARE) * ENOUGH_RECORDS / (ENOUGH_RECORDS + met), 0.0
+            )
             guided -= np.where(guided > 0, entering, 0)
             self._entering = from_numpy(mi.Float, entering)
         self._guided = from_numpy(mi.Float, guided)
@@ -223,11 +277,12 @@ class EnvironmentGuide:
         for index, emitter in self.infinite:
             if emitter.is_environment():
                 first = int(np.array(self._first_row)[index])
-                rows[first:first + DIRECTION_CELLS] = True
+                rows[first : first + DIRECTION_CELLS] = True
         return rows
 
     def _learn_directions(self, places):
-        """Direction cells by (radiance without its sharp peaks) x (share of the places that see the sky there)."""
+        """Direction cells by (radiance without its sharp peaks) x (share of the places that see the
+        sky there)."""
         environment = next(((i, e) for i, e in self.infinite if e.is_environment()), None)
         if environment is None:
             return
@@ -244,16 +299,24 @@ class EnvironmentGuide:
         draws = 64
         cell = dr.arange(mi.UInt32, DIRECTION_CELLS * draws) // draws
         rng = streams(dr.arange(mi.UInt32, DIRECTION_CELLS * draws), mi.UInt32(0x64697273))
-        smooth = self._radiance(emitter, cell_direction(cell, next_2d(rng))).numpy().reshape(-1, draws)
-        smooth = np.minimum(smooth, 4 * np.median(smooth, axis=1, keepdims=True) + 1e-6 * smooth.mean()).mean(axis=1)
+        smooth = (
+            self._radiance(emitter, cell_direction(cell, next_2d(rng))).numpy().reshape(-1, draws)
+        )
+        smooth = np.minimum(
+            smooth, 4 * np.median(smooth, axis=1, keepdims=True) + 1e-6 * smooth.mean()
+        ).mean(axis=1)
         smooth_power = smooth * reach * (4 * np.pi / DIRECTION_CELLS)
-        ds, weight = emitter.sample_direction(self._point(self.center, mi.Float(0)), next_2d(streams(cell, mi.UInt32(1))))
+        ds, weight = emitter.sample_direction(
+            self._point(self.center, mi.Float(0)), next_2d(streams(cell, mi.UInt32(1)))
+        )
         drawn = np.array(direction_cell(ds.d))
         weight = np.nan_to_num(np.broadcast_to(np.array(channel_mean(weight)), drawn.shape))
         total_power = np.bincount(drawn, weights=weight, minlength=DIRECTION_CELLS) / len(drawn)
         if smooth_power.sum() <= 0:
             return
-        self.direction_share = float(np.clip(1 - smooth_power.sum() / max((total_power * reach).sum(), 1e-30), 0.25, 0.9))
+        self.direction_share = float(
+            np.clip(1 - smooth_power.sum() / max((total_power * reach).sum(), 1e-30), 0.25, 0.9)
+        )
         pmf = smooth_power / smooth_power.sum()
         self._direction_pmf = from_numpy(mi.Float, pmf)
         self._direction_cdf = from_numpy(mi.Float, np.cumsum(pmf))
@@ -279,10 +342,13 @@ class EnvironmentGuide:
         return channel_mean(emitter.eval(si, active)) + dr.zeros(mi.Float, dr.width(towards))
 
     def _places(self, sensor):
-        """Places that matter: the first surfaces of camera paths, a list of `(Place, random numbers)`."""
+        """Places that matter: the first surfaces of camera paths, a list of `(Place, random
+        numbers)`."""
         rng = streams(dr.arange(mi.UInt32, PILOT_PATHS), mi.UInt32(0x67756964))
         wavelength_sample = 0.5
-        ray, throughput = sample_camera_ray(sensor, sensor.shutter_open(), wavelength_sample, next_2d(rng), next_2d(rng))
+        ray, throughput = sample_camera_ray(
+            sensor, sensor.shutter_open(), wavelength_sample, next_2d(rng), next_2d(rng)
+        )
         throughput = mi.Spectrum(throughput) + dr.zeros(mi.Spectrum, PILOT_PATHS)
         active = dr.full(mi.Bool, True, PILOT_PATHS)
         places = []
@@ -291,7 +357,9 @@ class EnvironmentGuide:
             active &= si.is_valid()
             bsdf = si.bsdf()
             smooth = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-            own = streams(dr.arange(mi.UInt32, PILOT_PATHS), dr.opaque(mi.UInt32, 0x706c6163 + bounce))          # a literal would have kernels made anew
+            own = streams(
+                dr.arange(mi.UInt32, PILOT_PATHS), dr.opaque(mi.UInt32, 0x706C6163 + bounce)
+            )  # a literal would have kernels made anew
             places.append((Place(si, bsdf, throughput, smooth), own))
             bs, value = bsdf.sample(mi.BSDFContext(), si, rng.next_float32(), next_2d(rng), active)
             throughput = throughput * value
@@ -302,23 +370,35 @@ class EnvironmentGuide:
 
     @staticmethod
     def _response(place, towards, active):
-        return channel_mean(place.bsdf.eval(mi.BSDFContext(), place.si, place.si.to_local(towards), active))
+        return channel_mean(
+            place.bsdf.eval(mi.BSDFContext(), place.si, place.si.to_local(towards), active)
+        )
 
     def _scatters(self, place, towards):
         """On which lanes the place scatters light that comes from there."""
         return place.smooth & (self._response(place, towards, place.smooth) > 0)
 
     def _look(self, index, emitter, place, rng):
-        """Records (p, direction to the light, table row, weight, density, own density) of a place each, where sub-paths of the emitter would come from; the
-        weight estimates what light from there adds to the image. The densities of the direction, and of the emitter's own sampler there, are zero but for
-        environments; the latter also where next-event estimation has something in its way."""
+        """Records (p, direction to the light, table row, weight, density, own density) of a place
+        each, where sub-paths of the emitter would come from; the weight estimates what light from
+        there adds to the image. The densities of the direction, and of the emitter's own sampler
+        there, are zero but for environments; the latter also where next-event estimation has
+        something in its way."""
         pdf = own = dr.zeros(mi.Float, PILOT_PATHS)
         if emitter.is_environment():
-            towards, pdf, row, _ = self.sample_direction(emitter, mi.UInt32(index), place.si, next_2d(rng), rng.next_float32(), place.smooth)
-            light = self._radiance(emitter, towards, place.smooth) * dr.select(pdf > 0, dr.rcp(pdf), 0)
+            towards, pdf, row, _ = self.sample_direction(
+                emitter, mi.UInt32(index), place.si, next_2d(rng), rng.next_float32(), place.smooth
+            )
+            light = self._radiance(emitter, towards, place.smooth) * dr.select(
+                pdf > 0, dr.rcp(pdf), 0
+            )
         else:
             ds, irradiance = emitter.sample_direction(place.si, next_2d(rng), place.smooth)
-            towards, light, row = ds.d, channel_mean(irradiance), self.row_of_emitter(mi.UInt32(index))
+            towards, light, row = (
+                ds.d,
+                channel_mean(irradiance),
+                self.row_of_emitter(mi.UInt32(index)),
+            )
         response = self._response(place, towards, place.smooth)
         ray = place.si.spawn_ray(towards)
         reached = _sees_sky(self.scene, ray, place.smooth & (response > 0) & (light > 0))
@@ -327,63 +407,84 @@ class EnvironmentGuide:
             ds.d = towards
             direct = reached & ~self.scene.ray_test(ray, reached)
             own = dr.select(direct, emitter.pdf_direction(place.si, ds, direct), 0)
-        weight = dr.select(reached, light * channel_mean(place.throughput) * dr.minimum(response, 1), 0)
-        return (place.si.p, *(x + dr.zeros(type(x), PILOT_PATHS) for x in (towards, row, weight, pdf, own)))
+        weight = dr.select(
+            reached, light * channel_mean(place.throughput) * dr.minimum(response, 1), 0
+        )
+        return (
+            place.si.p,
+            *(x + dr.zeros(type(x), PILOT_PATHS) for x in (towards, row, weight, pdf, own)),
+        )
 
     # ------------------------------------------------------------------ densities
 
     def _position_cell(self, towards, p):
-        """Cell of the focus grid that a line along `towards` through `p` crosses, and whether it crosses the grid."""
+        """Cell of the focus grid that a line along `towards` through `p` crosses, and whether it
+        crosses the grid."""
         frame = mi.Frame3f(towards)
         offset = (p - self.focus_center) * (1 / self.focus_radius)
         u, v = dr.dot(offset, frame.s), dr.dot(offset, frame.t)
-        return square_cell(0.5 * (u + 1), 0.5 * (v + 1), POSITION_CELLS), (dr.abs(u) <= 1) & (dr.abs(v) <= 1)
+        return square_cell(0.5 * (u + 1), 0.5 * (v + 1), POSITION_CELLS), (dr.abs(u) <= 1) & (
+            dr.abs(v) <= 1
+        )
 
     def position_density(self, towards, row, p, active=True):
         """Density per unit area (across `towards`) of sub-paths along the line through `p`."""
         cell, inside = self._position_cell(towards, p)
         guided = dr.gather(mi.Float, self._guided, row, active)
-        probability = dr.gather(mi.Float, self._pmf, row * POSITION_CELLS ** 2 + cell, active & inside)
+        probability = dr.gather(
+            mi.Float, self._pmf, row * POSITION_CELLS**2 + cell, active & inside
+        )
         cell_area = (2 * self.focus_radius / POSITION_CELLS) ** 2
         offset = p - self.center
         offset -= towards * dr.dot(offset, towards)
-        on_disk = dr.squared_norm(offset) <= self.radius ** 2
+        on_disk = dr.squared_norm(offset) <= self.radius**2
         density = guided * probability / cell_area
         if self.entrances is not None:
             entering = self._entering_share(towards, row, active)
             density += entering * self.entrances.density(towards, p, active)
             guided += entering
-        return density + dr.select(on_disk, (1 - guided) / (dr.pi * self.radius ** 2), 0)
+        return density + dr.select(on_disk, (1 - guided) / (dr.pi * self.radius**2), 0)
 
     def _entering_share(self, towards, row, active):
-        """Share of the sub-paths of a row that start where faces are lit; none where these look away."""
-        return dr.select(self.entrances.lit(towards), dr.gather(mi.Float, self._entering, row, active), 0)
+        """Share of the sub-paths of a row that start where faces are lit; none where these look
+        away."""
+        return dr.select(
+            self.entrances.lit(towards), dr.gather(mi.Float, self._entering, row, active), 0
+        )
 
     def sample_position(self, towards, row, sample, jitter, extra, active):
         """Origin of a sub-path that travels against `towards`, and its density per unit area.
 
-        `extra` chooses among the histogram, the faces of the box and the plain disk; `jitter` (a second pair of uniform numbers, or None) places
-        the origin inside its cell, else `sample`'s own leftover digits do.
+        `extra` chooses among the histogram, the faces of the box and the plain disk; `jitter` (a
+        second pair of uniform numbers, or None) places the origin inside its cell, else `sample`'s
+        own leftover digits do.
         """
         frame = mi.Frame3f(towards)
         guided = dr.gather(mi.Float, self._guided, row, active)
         use_grid = extra < guided
-        cells = POSITION_CELLS ** 2
+        cells = POSITION_CELLS**2
         cell, leftover = draw_cell(self._cdf, row * cells, cells, sample.x, active)
-        u, v = in_square_cell(cell, mi.Point2f(leftover, sample.y) if jitter is None else jitter, POSITION_CELLS)
-        on_grid = self.focus_center + self.focus_radius * ((2 * u - 1) * frame.s + (2 * v - 1) * frame.t)
+        u, v = in_square_cell(
+            cell, mi.Point2f(leftover, sample.y) if jitter is None else jitter, POSITION_CELLS
+        )
+        on_grid = self.focus_center + self.focus_radius * (
+            (2 * u - 1) * frame.s + (2 * v - 1) * frame.t
+        )
         disk = mi.warp.square_to_uniform_disk_concentric(sample)
         on_disk = self.center + self.radius * (disk.x * frame.s + disk.y * frame.t)
         if self.entrances is not None:
             enters = ~use_grid & (extra < guided + self._entering_share(towards, row, active))
-            on_disk = dr.select(enters, self.entrances.sample(towards, sample, jitter, active & enters), on_disk)
+            on_disk = dr.select(
+                enters, self.entrances.sample(towards, sample, jitter, active & enters), on_disk
+            )
         p = dr.select(use_grid, on_grid, on_disk)
         density = self.position_density(towards, row, p, active)
         p += towards * (1.01 * self.radius - dr.dot(p - self.center, towards))
         return p, density
 
     def sample_direction(self, emitter, index, it, sample, extra, active):
-        """Direction towards an environment, its density per solid angle, its table row, and what is left of `extra`."""
+        """Direction towards an environment, its density per solid angle, its table row, and what is
+        left of `extra`."""
         first = self.row_of_emitter(index)
         ds, _ = emitter.sample_direction(it, sample, active)
         if self.direction_share == 1.0:
@@ -391,27 +492,39 @@ class EnvironmentGuide:
         share = self.direction_share
         own = extra < share
         extra = dr.select(own, extra / share, (extra - share) / (1 - share))
-        cell, leftover = draw_cell(self._direction_cdf, mi.UInt32(0), DIRECTION_CELLS, sample.x, active)
+        cell, leftover = draw_cell(
+            self._direction_cdf, mi.UInt32(0), DIRECTION_CELLS, sample.x, active
+        )
         ds.d = dr.select(own, ds.d, cell_direction(cell, mi.Point2f(leftover, sample.y)))
-        return ds.d, self.direction_density(emitter.pdf_direction(it, ds, active), ds.d, active), first + direction_cell(ds.d), extra
+        return (
+            ds.d,
+            self.direction_density(emitter.pdf_direction(it, ds, active), ds.d, active),
+            first + direction_cell(ds.d),
+            extra,
+        )
 
     def direction_density(self, own_pdf, towards, active=True):
-        """Density per solid angle of `sample_direction`, where the environment's own sampler has density `own_pdf`."""
+        """Density per solid angle of `sample_direction`, where the environment's own sampler has
+        density `own_pdf`."""
         if self.direction_share == 1.0:
             return own_pdf
-        table_pdf = dr.gather(mi.Float, self._direction_pmf, direction_cell(towards), active) * (DIRECTION_CELLS / (4 * dr.pi))
+        table_pdf = dr.gather(mi.Float, self._direction_pmf, direction_cell(towards), active) * (
+            DIRECTION_CELLS / (4 * dr.pi)
+        )
         return self.direction_share * own_pdf + (1 - self.direction_share) * table_pdf
 
     # ------------------------------------------------------------------ direct light
 
     def direct_density(self, own_pdf, p, towards, active=True):
-        """Density per solid angle of next-event estimation of an environment from `p`, where its own sampler has density `own_pdf`."""
+        """Density per solid angle of next-event estimation of an environment from `p`, where its
+        own sampler has density `own_pdf`."""
         return _aimed_density(self.entrances, own_pdf, p, towards, active) if self.aims else own_pdf
 
     # ------------------------------------------------------------------ power
 
     def useful_power(self, power):
-        """Emitters' powers with those of infinite emitters replaced by the power that passes where the pilot saw use."""
+        """Emitters' powers with those of infinite emitters replaced by the power that passes where
+        the pilot saw use."""
         result = np.array(power, dtype=np.float64)
         count = 16384
         rng = streams(dr.arange(mi.UInt32, count), mi.UInt32(0x75736566))
@@ -419,7 +532,9 @@ class EnvironmentGuide:
             number = mi.UInt32(index)
             it = self._point(self.center, mi.Float(0))
             if emitter.is_environment():
-                towards, pdf, row, extra = self.sample_direction(emitter, number, it, next_2d(rng), rng.next_float32(), True)
+                towards, pdf, row, extra = self.sample_direction(
+                    emitter, number, it, next_2d(rng), rng.next_float32(), True
+                )
                 value = self._radiance(emitter, towards) * dr.select(pdf > 0, dr.rcp(pdf), 0)
             else:
                 ds, irradiance = emitter.sample_direction(it, mi.Point2f(0.5))
@@ -427,7 +542,9 @@ class EnvironmentGuide:
                 row, extra = self.row_of_emitter(number), rng.next_float32()
             p, density = self.sample_position(towards, row, next_2d(rng), next_2d(rng), extra, True)
             cell, inside = self._position_cell(towards, p)
-            used = inside & (dr.gather(mi.Float, self._pmf, row * POSITION_CELLS ** 2 + cell, inside) > 0)
+            used = inside & (
+                dr.gather(mi.Float, self._pmf, row * POSITION_CELLS**2 + cell, inside) > 0
+            )
             useful = float(dr.mean(dr.select(used & (density > 0), value / density, 0))[0])
             if np.isfinite(useful) and useful > 0:
                 result[index] = useful

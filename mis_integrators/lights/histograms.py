@@ -8,29 +8,33 @@ import numpy as np
 
 
 def square_cell(u, v, n: int):
-    """Number of the cell of an n x n grid over the unit square in which (u, v) lies; places outside belong to its border."""
+    """Number of the cell of an n x n grid over the unit square in which (u, v) lies; places outside
+    belong to its border."""
     column, line = (dr.clip(mi.Int32(dr.floor(x * n)), 0, n - 1) for x in (u, v))
     return mi.UInt32(line * n + column)
 
 
 def in_square_cell(cell, offset, n: int):
-    """The place (u, v) in the unit square that lies in cell `cell` of an n x n grid, at `offset` (a pair of numbers in [0, 1))."""
+    """The place (u, v) in the unit square that lies in cell `cell` of an n x n grid, at `offset` (a
+    pair of numbers in [0, 1))."""
     return (mi.Float(cell % n) + offset.x) * (1 / n), (mi.Float(cell // n) + offset.y) * (1 / n)
 
 
 def draw_cell(cdf, first, count: int, u, active=True):
-    """A cell, from uniform numbers `u` and the cumulative sums of `count` cells, which stand at places `first` and on of `cdf`; and a uniform number that is
-    left of `u`, in [0, 1)."""
-    cell = dr.binary_search(0, count - 1, lambda i: dr.gather(mi.Float, cdf, first + i, active) <= u)
+    """A cell, from uniform numbers `u` and the cumulative sums of `count` cells, which stand at
+    places `first` and on of `cdf`; and a uniform number that is left of `u`, in [0, 1)."""
+    cell = dr.binary_search(
+        0, count - 1, lambda i: dr.gather(mi.Float, cdf, first + i, active) <= u
+    )
     upper = dr.gather(mi.Float, cdf, first + cell, active)
     lower = dr.gather(mi.Float, cdf, first + cell - 1, active & (cell > 0))
     return cell, dr.clip((u - lower) / dr.maximum(upper - lower, 1e-20), 0, 0.9999999)
 
 
 def smoothed(grids, shares):
-    """Square histograms (rows, n, n) mixed with coarser versions of themselves, so that a cell that the pilot happened to miss
-    beside cells that it met is not left to the plain density (whose few samples would carry huge flux). `shares`: of full, half, quarter, ...
-    resolution."""
+    """Square histograms (rows, n, n) mixed with coarser versions of themselves, so that a cell that
+    the pilot happened to miss beside cells that it met is not left to the plain density (whose few
+    samples would carry huge flux). `shares`: of full, half, quarter, ... resolution."""
     rows, n, _ = grids.shape
     result = shares[0] * grids
     for level, share in enumerate(shares[1:], start=1):
@@ -38,7 +42,7 @@ def smoothed(grids, shares):
         coarse = grids.reshape(rows, n // size, size, n // size, size).sum(axis=(2, 4))
         padded = np.pad(coarse, ((0, 0), (1, 1), (1, 1)))
         m = n // size
-        spread = sum(padded[:, i:i + m, j:j + m] for i in range(3) for j in range(3)) / 9
-        mixed = (0.5 * coarse + 0.5 * spread) / size ** 2
+        spread = sum(padded[:, i : i + m, j : j + m] for i in range(3) for j in range(3)) / 9
+        mixed = (0.5 * coarse + 0.5 * spread) / size**2
         result = result + share * np.repeat(np.repeat(mixed, size, axis=1), size, axis=2)
     return result

@@ -1,26 +1,32 @@
-"""Where transport and Veach's heuristics meet: the balance or power heuristic over the strategies of `bdpm_balance`.
+"""Where transport and Veach's heuristics meet: the balance or power heuristic over the strategies
+of `bdpm_balance`.
 
-A joint path has the smooth vertices z_0, z_1, ..., counted from the camera. Strategy i merges a photon at z_i, for i below the number of
-strategies; direct light at the last vertex is one more strategy, if the path is short enough. Densities, per projected solid angle:
+A joint path has the smooth vertices z_0, z_1, ..., counted from the camera. Strategy i merges a
+photon at z_i, for i below the number of strategies; direct light at the last vertex is one more
+strategy, if the path is short enough. Densities, per projected solid angle:
 
     p_i   of the camera path at z_i for the direction to z_{i+1}
     q_i   of the light sub-path at z_{i+1} for the direction to z_i
 
-A merge takes camera and light sub-paths that end in the same disk, so its density is the product of theirs and of the disk's area pi R^2,
-and light sub-paths are its samples (Georgiev et al., Light transport simulation with vertex connection and merging (2012),
-doi 10.1145/2366145.2366211; pi R^2 N_F there is eta_VM). Between neighbours all but one vertex cancels, the geometric term too:
+A merge takes camera and light sub-paths that end in the same disk, so its density is the product of
+theirs and of the disk's area pi R^2, and light sub-paths are its samples (Georgiev et al., Light
+transport simulation with vertex connection and merging (2012), doi 10.1145/2366145.2366211; pi R^2
+N_F there is eta_VM). Between neighbours all but one vertex cancels, the geometric term too:
 
     merging at z_i : merging at z_{i+1}                        =  q_i / p_i
     merging at z_i : direct light at z_{i+1}                   =  pi R^2 N_F rho_e q_i / p_i
     merging at z_i : merging a caustic photon at z_{i+1}       =  (R / R_caustic)^2 q_i / p_i
 
-rho_e [1/m^2] is the density, as an area density at z_{i+1}, with which light sub-paths start there over that with which next-event estimation
-finds the point of the light (`Lights.emission_ratio` times the cosine). Next-event estimation and BSDF sampling count as one technique, with
-the density of the former; the camera pass divides the light between them. All camera paths of a pixel make all strategies, each path once, so
-their number cancels. That strategies share their sub-paths Veach's theory does not see: the optimal weights do.
+rho_e [1/m^2] is the density, as an area density at z_{i+1}, with which light sub-paths start there
+over that with which next-event estimation finds the point of the light (`Lights.emission_ratio`
+times the cosine). Next-event estimation and BSDF sampling count as one technique, with the density
+of the former; the camera pass divides the light between them. All camera paths of a pixel make all
+strategies, each path once, so their number cancels. That strategies share their sub-paths Veach's
+theory does not see: the optimal weights do.
 
-The weights are functions of the joint path alone, with its own vertices up to the merge radius. Not in them: Russian roulette, the choices at delta
-surfaces (alike from both sides), and the defensive directions of light sub-paths at bump and normal maps. They cost noise, never light.
+The weights are functions of the joint path alone, with its own vertices up to the merge radius. Not
+in them: Russian roulette, the choices at delta surfaces (alike from both sides), and the defensive
+directions of light sub-paths at bump and normal maps. They cost noise, never light.
 """
 
 from __future__ import annotations
@@ -28,9 +34,9 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from ..core.packing import bits_float, float_bits
 from ..paths.camera_pass import STATE
 from ..paths.light_starts import seen_from
-from ..core.packing import bits_float, float_bits
 from ..weights.heuristics import add_ratio, bounded_power, weight
 
 SMALLEST = 1e-20
@@ -43,10 +49,12 @@ def ratio(a, b):
 
 
 class HeuristicWeights:
-    """Weights of `strategies` merging strategies, the first at camera vertex 0, with Veach's exponent `beta`.
+    """Weights of `strategies` merging strategies, the first at camera vertex 0, with Veach's
+    exponent `beta`.
 
-    `disk_paths`: pi R^2 N_F of indirect photons [m^2]; `caustic_share`: that over the same of caustic photons. Both of width one.
-    Sums, as of `add_ratio`, are of the strategies on one side of a vertex's own merging.
+    `disk_paths`: pi R^2 N_F of indirect photons [m^2]; `caustic_share`: that over the same of
+    caustic photons. Both of width one. Sums, as of `add_ratio`, are of the strategies on one side
+    of a vertex's own merging.
     """
 
     def __init__(self, lights, disk_paths, caustic_share, strategies, beta):
@@ -57,8 +65,11 @@ class HeuristicWeights:
 
     @staticmethod
     def onwards(si, bsdf, wo, mask):
-        """Density of the camera path that arrives from `si.wi` and goes on to `wo`, per projected solid angle."""
-        return bsdf.pdf(mi.BSDFContext(), si, wo, mask) * dr.rcp(dr.maximum(dr.abs(wo.z), SMALLEST_COSINE))
+        """Density of the camera path that arrives from `si.wi` and goes on to `wo`, per projected
+        solid angle."""
+        return bsdf.pdf(mi.BSDFContext(), si, wo, mask) * dr.rcp(
+            dr.maximum(dr.abs(wo.z), SMALLEST_COSINE)
+        )
 
     @staticmethod
     def of_light(si, bsdf, wo, mask):
@@ -67,19 +78,23 @@ class HeuristicWeights:
         return pdf * dr.rcp(dr.maximum(dr.abs(wo.z), SMALLEST_COSINE))
 
     def expected_photons(self, ref, ds, mask):
-        """pi R^2 N_F rho_e: light sub-paths that start from the light `ds` into the merge disk at `ref`, for each time that next-event
-        estimation finds it."""
-        return self.disk_paths * dr.abs(dr.dot(ref.n, ds.d)) * self.lights.emission_ratio(ref, ds, mask)
+        """pi R^2 N_F rho_e: light sub-paths that start from the light `ds` into the merge disk at
+        `ref`, for each time that next-event estimation finds it."""
+        return (
+            self.disk_paths
+            * dr.abs(dr.dot(ref.n, ds.d))
+            * self.lights.emission_ratio(ref, ds, mask)
+        )
 
     # ------------------------------------------------------------------ camera paths (hooks of `trace_camera_paths`)
 
     def begin(self, width):
-        """State of a camera path on its way to z_i: the sum of the strategies before z_{i-1}, and p_{i-1}. The sum -1 stands for none, not even
-        z_{i-1}: `add_ratio` makes zero of it."""
+        """State of a camera path on its way to z_i: the sum of the strategies before z_{i-1}, and
+        p_{i-1}. The sum -1 stands for none, not even z_{i-1}: `add_ratio` makes zero of it."""
         return [dr.full(mi.Float, -1, width), dr.ones(mi.Float, width)]
 
     def arrived(self, state, si, bsdf, vertex, mask):
-        return state, mi.Spectrum(1)                               # not used: see direct_share
+        return state, mi.Spectrum(1)  # not used: see direct_share
 
     def leaving(self, state, si, bsdf, bs, vertex, mask):
         """State after a smooth scattering into `bs.wo`."""
@@ -87,10 +102,14 @@ class HeuristicWeights:
         seen_by_light = mi.SurfaceInteraction3f(si)
         seen_by_light.wi = mi.Vector3f(bs.wo)
         q = self.of_light(seen_by_light, bsdf, si.wi, mask)
-        return [dr.select(mask, add_ratio(total, ratio(q, p), self.beta), total), dr.select(mask, self.onwards(si, bsdf, bs.wo, mask), p)]
+        return [
+            dr.select(mask, add_ratio(total, ratio(q, p), self.beta), total),
+            dr.select(mask, self.onwards(si, bsdf, bs.wo, mask), p),
+        ]
 
     def direct_share(self, state, ref, ds, mask):
-        """Weight of the direct light that `ds` brings to the vertex `ref`; `state`: after leaving `ref` for the light."""
+        """Weight of the direct light that `ds` brings to the vertex `ref`; `state`: after leaving
+        `ref` for the light."""
         before, _ = state
         share = weight(bounded_power(self.expected_photons(ref, ds, mask), self.beta) * before, 0)
         return mi.Spectrum(dr.select(mask, share, 0))
@@ -111,8 +130,8 @@ class HeuristicWeights:
         return Notebook(self) if self.strategies > 1 else None
 
     def weigher(self, kind, level, vertices, photon_map):
-        """Weight of the photons of a map at the vertices of one strategy, `level`, or of all if the photons are caustic ones (`weigh` of
-        `gather_photons`)."""
+        """Weight of the photons of a map at the vertices of one strategy, `level`, or of all if the
+        photons are caustic ones (`weigh` of `gather_photons`)."""
         total, p_before = (vertices[name][0] for name in STATE[:2])
 
         def weigh(index, f, p, back, active):
@@ -121,16 +140,21 @@ class HeuristicWeights:
             if kind == "caustic":
                 before *= bounded_power(self.caustic_share, self.beta)
             elif level < self.strategies - 1:
-                q, deeper = self.notebook().read(level, photon_map.notes, photon_map.place_of_notes(index, active), active)
+                q, deeper = self.notebook().read(
+                    level, photon_map.notes, photon_map.place_of_notes(index, active), active
+                )
                 after = add_ratio(deeper, ratio(p, q), self.beta)
             return mi.Spectrum(weight(before, after))
+
         return weigh
 
 
 class Notebook:
-    """Notes of a light sub-path that has scattered at z_{i+1} and lands at some z_i: q_i, and for each level i, up to two before the last
-    strategy, the sum of the strategies after z_{i+1}. Before the last there is one strategy after z_i, and its sum is zero.
-    Right after the first scattering direct light is what comes next; then q_i holds its ratio's other factor, too. (Hooks of `trace_light_paths`.)
+    """Notes of a light sub-path that has scattered at z_{i+1} and lands at some z_i: q_i, and for
+    each level i, up to two before the last strategy, the sum of the strategies after z_{i+1}.
+    Before the last there is one strategy after z_i, and its sum is zero. Right after the first
+    scattering direct light is what comes next; then q_i holds its ratio's other factor, too. (Hooks
+    of `trace_light_paths`.)
     """
 
     def __init__(self, weights):
@@ -139,14 +163,21 @@ class Notebook:
 
     def begin(self):
         """That factor, the noted q (zero: has not scattered yet), the sums."""
-        return [mi.Float(self.weights.caustic_share), mi.Float(0), *[mi.Float(0) for _ in range(self.levels)]]
+        return [
+            mi.Float(self.weights.caustic_share),
+            mi.Float(0),
+            *[mi.Float(0) for _ in range(self.levels)],
+        ]
 
     def lit(self, state, si, source, straight):
-        """State at a vertex that the light of `source` reaches on the lanes `straight`: there next-event estimation competes, elsewhere caustic
-        photons do."""
+        """State at a vertex that the light of `source` reaches on the lanes `straight`: there
+        next-event estimation competes, elsewhere caustic photons do."""
         weights = self.weights
         ds = seen_from(si, source, straight)
-        return [dr.select(straight, weights.expected_photons(si, ds, straight), weights.caustic_share), *state[1:]]
+        return [
+            dr.select(straight, weights.expected_photons(si, ds, straight), weights.caustic_share),
+            *state[1:],
+        ]
 
     def scattered(self, state, si, bsdf, wo, mask):
         """State after a smooth scattering into local direction `wo`."""
@@ -155,16 +186,24 @@ class Notebook:
         seen_by_camera = mi.SurfaceInteraction3f(si)
         seen_by_camera.wi = mi.Vector3f(wo)
         p = self.weights.onwards(seen_by_camera, bsdf, si.wi, mask)
-        q = dr.maximum(self.weights.of_light(si, bsdf, wo, mask) * dr.select(first, factor, 1), SMALLEST)
-        sums_here = [dr.select(first, 0, add_ratio(deeper, ratio(p, q_before), self.weights.beta)) for deeper in (*sums[1:], mi.Float(0))]
-        return [factor] + [dr.select(mask, new, old) for new, old in zip([q, *sums_here], [q_before, *sums])]
+        q = dr.maximum(
+            self.weights.of_light(si, bsdf, wo, mask) * dr.select(first, factor, 1), SMALLEST
+        )
+        sums_here = [
+            dr.select(first, 0, add_ratio(deeper, ratio(p, q_before), self.weights.beta))
+            for deeper in (*sums[1:], mi.Float(0))
+        ]
+        return [factor] + [
+            dr.select(mask, new, old) for new, old in zip([q, *sums_here], [q_before, *sums])
+        ]
 
     def words(self, state):
         words = [float_bits(x) for x in state[1:]]
         return words + [mi.UInt32(0)] * ((2 - len(words)) if len(words) <= 2 else -len(words) % 4)
 
     def read(self, level, notes, index, active):
-        """q_level of photon `index`, merged at z_level, and the sum of the strategies after z_{level + 1}."""
+        """q_level of photon `index`, merged at z_level, and the sum of the strategies after
+        z_{level + 1}."""
         count = len(self.words(self.begin()))
         q = bits_float(dr.gather(mi.UInt32, notes, count * index, active))
         if level >= self.levels:

@@ -1,8 +1,11 @@
-"""Where transport and optimal weights meet: what the weights know of a path's vertices, on both of its halves.
+"""Where transport and optimal weights meet: what the weights know of a path's vertices, on both of
+its halves.
 
-The weights are functions of the joint path alone, one for each colour channel. At each of its vertices they use BSDF values and densities of the
-path itself, and a crude picture of the light around it: the vertex's radiance from cached irradiance, and the means over directions from
-typical neighbours. Crude weights cost noise, never light: each strategy evaluates the same functions of the same vertices.
+The weights are functions of the joint path alone, one for each colour channel. At each of its
+vertices they use BSDF values and densities of the path itself, and a crude picture of the light
+around it: the vertex's radiance from cached irradiance, and the means over directions from typical
+neighbours. Crude weights cost noise, never light: each strategy evaluates the same functions of the
+same vertices.
 """
 
 from __future__ import annotations
@@ -17,17 +20,21 @@ from ..weights import recursion
 from .neighbour_radiance import SHARES
 
 AMBIENT_SHARE = 0.02
-"""Share of the scene's mean irradiance that is taken to reach every vertex, lest one that the cache calls dark be left to a strategy
-that hardly ever makes its paths."""
+"""Share of the scene's mean irradiance that is taken to reach every vertex, lest one that the cache
+calls dark be left to a strategy that hardly ever makes its paths."""
 STEEPEST_DRIVE = 30.0
-"""Bound on the corrections 1 + G / f_0 and 1 + tau / (1 - theta), which grow without bound where the BSDF falls to zero."""
+"""Bound on the corrections 1 + G / f_0 and 1 + tau / (1 - theta), which grow without bound where
+the BSDF falls to zero."""
 LARGEST_SHARE = 2.0
-"""Bound on e drive, the weights that are left for a vertex and those beyond. Right ones exceed one where the surroundings are brighter; far
-larger ones mean that the cache does not know the vertex."""
+"""Bound on e drive, the weights that are left for a vertex and those beyond. Right ones exceed one
+where the surroundings are brighter; far larger ones mean that the cache does not know the
+vertex."""
 WEIGHT_KEPT, SELDOM = 0.4, 0.02
-"""Strategies of less than this weight are used at random, with a probability in proportion, but no smaller than the second number."""
+"""Strategies of less than this weight are used at random, with a probability in proportion, but no
+smaller than the second number."""
 TRUSTED_PHOTONS = 128
-"""Photons in a disk up to which the radiance of typical neighbours is known well enough for the means over directions."""
+"""Photons in a disk up to which the radiance of typical neighbours is known well enough for the
+means over directions."""
 SMALLEST_COSINE, SMALLEST_LOBE_COSINE = 1e-6, 0.05
 SMALLEST_DENSITY = 1e-6
 
@@ -35,19 +42,29 @@ SMALLEST_DENSITY = 1e-6
 class Node:
     """What is known of a vertex seen from its predecessor.
 
-    `f` (spectrum), `p`: BSDF value and camera density of the joint path there; `direct`, `indirect` (spectra): radiance by direct and other
-    light; `kernel`: mean BSDF value, what merging a photon there costs where the photon's own is not known; `lobe_f` (spectrum), `lobe_p`:
-    value and density in a typical direction; `noise`: what the noise of its direct light costs, in the units of `kernel`; `last` (mask):
-    strategies end here, whatever their number; `indirectly` (mask): other than direct light is what the path brings.
+    `f` (spectrum), `p`: BSDF value and camera density of the joint path there; `direct`, `indirect`
+    (spectra): radiance by direct and other light; `kernel`: mean BSDF value, what merging a photon
+    there costs where the photon's own is not known; `lobe_f` (spectrum), `lobe_p`: value and
+    density in a typical direction; `noise`: what the noise of its direct light costs, in the units
+    of `kernel`; `last` (mask): strategies end here, whatever their number; `indirectly` (mask):
+    other than direct light is what the path brings.
     """
 
-    def __init__(self, f, p, direct, indirect, kernel, lobe_f, lobe_p, noise, last, indirectly=None):
+    def __init__(
+        self, f, p, direct, indirect, kernel, lobe_f, lobe_p, noise, last, indirectly=None
+    ):
         self.f, self.p, self.direct, self.indirect, self.kernel = f, p, direct, indirect, kernel
-        self.lobe_f, self.lobe_p, self.noise, self.last, self.indirectly = lobe_f, lobe_p, noise, last, indirectly
+        self.lobe_f, self.lobe_p, self.noise, self.last, self.indirectly = (
+            lobe_f,
+            lobe_p,
+            noise,
+            last,
+            indirectly,
+        )
 
     def final_response(self, n, r):
-        """gamma where no strategy goes on: as at an inner vertex beyond which nothing is merged, so that direct light and photons have weights of
-        their own (the papers give both the same)."""
+        """gamma where no strategy goes on: as at an inner vertex beyond which nothing is merged, so
+        that direct light and photons have weights of their own (the papers give both the same)."""
         photons = self.indirect / recursion.at_least(r + self.kernel, recursion.SMALLEST)
         return recursion.inner_response(n, self.direct, r + self.noise, photons, 0, 0, 0)
 
@@ -59,8 +76,9 @@ def typical_node(direct, indirect, albedo):
 
 
 def response(level, strategies, n, r, node, albedo=None):
-    """Remainder e and carry tau of the node at z_level, 0 < level < strategies (`weights.recursion`). Means over directions are those of one
-    typical neighbour of that `albedo`; without it they are left out (local weights)."""
+    """Remainder e and carry tau of the node at z_level, 0 < level < strategies
+    (`weights.recursion`). Means over directions are those of one typical neighbour of that
+    `albedo`; without it they are left out (local weights)."""
     e_final = recursion.remainder(node.final_response(n, r))
     if level == strategies - 1 or node.last is True:
         return e_final, mi.Spectrum(0)
@@ -70,26 +88,62 @@ def response(level, strategies, n, r, node, albedo=None):
         theta, rest = recursion.kernel_share(r, node.lobe_f), recursion.kernel_rest(r, node.lobe_f)
         next_r = recursion.next_ratio(theta, node.lobe_p)
         incident = node.indirect * node.lobe_p / recursion.at_least(node.lobe_f, recursion.SMALLEST)
-        e_next, _ = response(level + 1, strategies, n, next_r, typical_node(0.5 * incident, 0.5 * incident, albedo), albedo)
+        e_next, _ = response(
+            level + 1,
+            strategies,
+            n,
+            next_r,
+            typical_node(0.5 * incident, 0.5 * incident, albedo),
+            albedo,
+        )
         first = rest * (1 - e_next)
         tau = dr.select(node.last, 0, recursion.carry(first, e_next))
-        photon_sum = incident * rest / node.lobe_p                   # a lobe of projected solid angle 1 / p
-        gamma = recursion.inner_response(n, node.direct, r + node.noise, photon_sum, rest * first, first, tau)
+        photon_sum = incident * rest / node.lobe_p  # a lobe of projected solid angle 1 / p
+        gamma = recursion.inner_response(
+            n, node.direct, r + node.noise, photon_sum, rest * first, first, tau
+        )
     return dr.select(node.last, e_final, recursion.remainder(gamma)), tau
 
 
 class OptimalWeights:
     """Weights of `strategies` merging strategies, the first at camera vertex `first`.
 
-    `full`: keep the recursion's integrals, else drop them (local weights). `cache`: an `IrradianceCache`; `surroundings`: a `Surroundings`
-    of its cells (full weights only). `n`: photons per unit of irradiance in the merge disk (a spectrum of width one). `caustic_cost`: what
-    merging a caustic photon costs in units of merging another one (width one). `mix_diffuse`: whether strategies go on beyond Lambertian
-    vertices; else the first of these is a path's last strategy.
+    `full`: keep the recursion's integrals, else drop them (local weights). `cache`: an
+    `IrradianceCache`; `surroundings`: a `Surroundings` of its cells (full weights only). `n`:
+    photons per unit of irradiance in the merge disk (a spectrum of width one). `caustic_cost`: what
+    merging a caustic photon costs in units of merging another one (width one). `mix_diffuse`:
+    whether strategies go on beyond Lambertian vertices; else the first of these is a path's last
+    strategy.
     """
 
-    def __init__(self, lights, traits, cache, surroundings, n, caustic_cost, strategies, first, camera_paths, full, mix_diffuse):
-        self.lights, self.traits, self.cache, self.surroundings, self.n, self.caustic_cost = lights, traits, cache, surroundings, n, caustic_cost
-        self.strategies, self.first, self.full, self.mix_diffuse = strategies, first, full, mix_diffuse
+    def __init__(
+        self,
+        lights,
+        traits,
+        cache,
+        surroundings,
+        n,
+        caustic_cost,
+        strategies,
+        first,
+        camera_paths,
+        full,
+        mix_diffuse,
+    ):
+        self.lights, self.traits, self.cache, self.surroundings, self.n, self.caustic_cost = (
+            lights,
+            traits,
+            cache,
+            surroundings,
+            n,
+            caustic_cost,
+        )
+        self.strategies, self.first, self.full, self.mix_diffuse = (
+            strategies,
+            first,
+            full,
+            mix_diffuse,
+        )
         self.albedo = surroundings.albedo if surroundings else None
         self.camera_paths = camera_paths if first == 0 else 1
         self.has_caustics = traits.has_delta or lights.needs_photons_for_direct_light()
@@ -100,30 +154,45 @@ class OptimalWeights:
     # ------------------------------------------------------------------ vertices
 
     def scattering(self, si, bsdf, wo, mask):
-        """BSDF value without cosine and density per projected solid angle of the camera path that goes on to `wo`."""
+        """BSDF value without cosine and density per projected solid angle of the camera path that
+        goes on to `wo`."""
         value, pdf = bsdf.eval_pdf(self.context, si, wo, mask)
         scale = dr.rcp(dr.maximum(dr.abs(wo.z), SMALLEST_COSINE))
         return value * scale, pdf * scale
 
     def lobe(self, si, bsdf, mask):
-        """Value and density of the scattering in a typical direction, by one fixed sample of the BSDF."""
-        upright = mi.Vector3f(0, 0, dr.select(mi.Frame3f.cos_theta(si.wi) > 0, mi.Float(1), mi.Float(-1)))
+        """Value and density of the scattering in a typical direction, by one fixed sample of the
+        BSDF."""
+        upright = mi.Vector3f(
+            0, 0, dr.select(mi.Frame3f.cos_theta(si.wi) > 0, mi.Float(1), mi.Float(-1))
+        )
         if not self.traits.has_rough:
             f, p = self.scattering(si, bsdf, upright, mask)
             return f, dr.maximum(p, SMALLEST_DENSITY)
         lambertian = lookup(self.traits.lambertian, bsdf, mi.Bool, mask)
         f, p = self.scattering(si, bsdf, upright, mask & lambertian)
-        bs, weight = bsdf.sample(self.smooth, si, mi.Float(0.5), mi.Point2f(0.5), mask & ~lambertian)
-        valid = mask & ~lambertian & (bs.pdf > 0) & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-        density = dr.select(valid, bs.pdf, dr.inv_pi) * dr.rcp(dr.maximum(dr.abs(dr.select(valid, bs.wo.z, 1)), SMALLEST_LOBE_COSINE))
+        bs, weight = bsdf.sample(
+            self.smooth, si, mi.Float(0.5), mi.Point2f(0.5), mask & ~lambertian
+        )
+        valid = (
+            mask & ~lambertian & (bs.pdf > 0) & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+        )
+        density = dr.select(valid, bs.pdf, dr.inv_pi) * dr.rcp(
+            dr.maximum(dr.abs(dr.select(valid, bs.wo.z, 1)), SMALLEST_LOBE_COSINE)
+        )
         f = dr.select(lambertian, f, dr.select(valid, weight, 0) * density)
         return f, dr.maximum(dr.select(lambertian, p, density), SMALLEST_DENSITY)
 
     def is_last(self, bsdf, mask):
-        """Whether strategies end at a vertex of this BSDF: photons merged there are little noisier than what a path further on would bring."""
+        """Whether strategies end at a vertex of this BSDF: photons merged there are little noisier
+        than what a path further on would bring."""
         if self.mix_diffuse or not self.traits.has_lambertian:
             return mi.Bool(False)
-        return lookup(self.traits.lambertian, bsdf, mi.Bool, mask) if self.traits.has_rough else mi.Bool(True)
+        return (
+            lookup(self.traits.lambertian, bsdf, mi.Bool, mask)
+            if self.traits.has_rough
+            else mi.Bool(True)
+        )
 
     def side(self, si):
         """The geometric normal on the side of `si.wi`."""
@@ -133,20 +202,35 @@ class OptimalWeights:
         """The `Node` of a vertex with its predecessor in direction `si.wi`."""
         known = self.cache.lookup(si.p, self.side(si), mask)
         lobe_f, lobe_p = self.lobe(si, bsdf, mask)
-        # The strongest light as if nothing stood between, scaled to what the cell has of it: sharper than the cell.
+        # The strongest light as if nothing stood between, scaled to what the cell has of it:
+        # sharper than the cell.
         sharp = mask & (known.visible_share > 0)
         ds, unoccluded = self.lights.unoccluded(si, dr.select(sharp, known.light, 0), sharp)
         wo = si.to_local(dr.select(sharp, ds.d, known.direction))
-        scale = dr.select(sharp, unoccluded * known.visible_share * dr.abs(wo.z) / recursion.at_least(channel_mean(known.direct), recursion.SMALLEST), 1)
+        scale = dr.select(
+            sharp,
+            unoccluded
+            * known.visible_share
+            * dr.abs(wo.z)
+            / recursion.at_least(channel_mean(known.direct), recursion.SMALLEST),
+            1,
+        )
         value = lobe_f
         if self.traits.has_rough:
-            lit = mask & (dr.max(known.direct) > 0) & ~lookup(self.traits.lambertian, bsdf, mi.Bool, mask)
-            towards_light = bsdf.eval(self.context, si, wo, lit) * dr.rcp(dr.maximum(dr.abs(wo.z), SMALLEST_LOBE_COSINE))
+            lit = (
+                mask
+                & (dr.max(known.direct) > 0)
+                & ~lookup(self.traits.lambertian, bsdf, mi.Bool, mask)
+            )
+            towards_light = bsdf.eval(self.context, si, wo, lit) * dr.rcp(
+                dr.maximum(dr.abs(wo.z), SMALLEST_LOBE_COSINE)
+            )
             value = dr.select(lit, towards_light, lobe_f)
         ambient = AMBIENT_SHARE * self.cache.level * lobe_f / (lobe_p * dr.pi)
         indirect = (known.second + known.later) * dr.inv_pi * lobe_f / lobe_p
         direct, kernel = value * known.direct * scale + ambient, channel_mean(lobe_f)
-        # The noise law takes direct light for exact. Its noise costs as that of photons does: n times the variance over the radiance.
+        # The noise law takes direct light for exact. Its noise costs as that of photons does: n
+        # times the variance over the radiance.
         noise = channel_mean(self.n * direct) * known.noise * dr.square(1 - known.caustic_share)
         if self.has_caustics:
             noise += self.caustic_cost * known.caustic_share * kernel
@@ -168,24 +252,35 @@ class OptimalWeights:
         return recursion.inner_weight(u, 1, recursion.kernel_share(r, node.kernel), 0)
 
     def offset(self, si, bsdf, mask):
-        """G = n F / N_B at the first strategy's vertex, its means those of the typical neighbours of its cell.
+        """G = n F / N_B at the first strategy's vertex, its means those of the typical neighbours
+        of its cell.
 
-        It is drawn towards that of local weights, zero, the more, the more photons a disk holds. Without noise of photons, deeper strategies may have
-        any weight that makes their contribution the same in all directions; but then what the cells know wrongly is all the noise that there is.
+        It is drawn towards that of local weights, zero, the more, the more photons a disk holds.
+        Without noise of photons, deeper strategies may have any weight that makes their
+        contribution the same in all directions; but then what the cells know wrongly is all the
+        noise that there is.
         """
         f, p = self.lobe(si, bsdf, mask)
         r = recursion.first_ratio(p, self.camera_paths)
         around = self.surroundings.lookup(self.cache.slot(si.p, self.side(si), mask), mask)
-        e = sum(share * response(1, self.strategies, self.n, r, typical_node(*radiance, self.albedo), self.albedo)[0]
-                for share, radiance in zip(SHARES, around))
+        e = sum(
+            share
+            * response(
+                1, self.strategies, self.n, r, typical_node(*radiance, self.albedo), self.albedo
+            )[0]
+            for share, radiance in zip(SHARES, around)
+        )
         photons = channel_mean(self.n) * self.cache.level
-        return recursion.root_offset(f * (1 - e), e) * dr.rcp(1 + dr.square(photons / TRUSTED_PHOTONS))
+        return recursion.root_offset(f * (1 - e), e) * dr.rcp(
+            1 + dr.square(photons / TRUSTED_PHOTONS)
+        )
 
     # ------------------------------------------------------------------ camera paths (hooks of `trace_camera_paths`)
 
     def begin(self, width):
-        """State of a camera path: drive and r of the vertex it arrives at; after arrival tau, and u: e drive, or the offset G at the first
-        strategy's vertex, or the photons' weight where strategies end."""
+        """State of a camera path: drive and r of the vertex it arrives at; after arrival tau, and
+        u: e drive, or the offset G at the first strategy's vertex, or the photons' weight where
+        strategies end."""
         return [mi.Spectrum(dr.full(mi.Float, value, width)) for value in (1, 1, 0, 0)]
 
     def arrived(self, state, si, bsdf, vertex, mask):
@@ -203,7 +298,9 @@ class OptimalWeights:
             here = mask & (vertex == self.first + level)
             e, carried = response(level, self.strategies, self.n, r, node, self.albedo)
             remaining = self.left(drive, e)
-            u = dr.select(here, dr.select(final, self.final_weight(remaining, r, node), remaining), u)
+            u = dr.select(
+                here, dr.select(final, self.final_weight(remaining, r, node), remaining), u
+            )
             tau = dr.select(here, carried, tau)
             share = dr.select(here, self.direct_weight(remaining, r, node), share)
         return [drive, r, u, tau], share
@@ -221,15 +318,21 @@ class OptimalWeights:
         return [drive, r, u, tau]
 
     def root_step(self, offset, f, p):
-        """Drive and r of the vertex after the first strategy's, which scattered with value f and density p."""
+        """Drive and r of the vertex after the first strategy's, which scattered with value f and
+        density p."""
         r = mi.Spectrum(recursion.first_ratio(p, self.camera_paths))
-        return recursion.bounded_drive(dr.minimum(recursion.first_drive(offset, f), STEEPEST_DRIVE), r), r
+        return recursion.bounded_drive(
+            dr.minimum(recursion.first_drive(offset, f), STEEPEST_DRIVE), r
+        ), r
 
     @staticmethod
     def step(u, tau, r, f, p):
-        """Drive and r of the next vertex, after an inner one that scattered with value f and density p."""
+        """Drive and r of the next vertex, after an inner one that scattered with value f and
+        density p."""
         next_r = recursion.next_ratio(recursion.kernel_share(r, f), p)
-        drive = dr.minimum(recursion.next_drive(1, u, tau, recursion.kernel_rest(r, f)), STEEPEST_DRIVE * dr.abs(u))
+        drive = dr.minimum(
+            recursion.next_drive(1, u, tau, recursion.kernel_rest(r, f)), STEEPEST_DRIVE * dr.abs(u)
+        )
         return recursion.bounded_drive(drive, next_r), next_r
 
     def ends(self, bsdf, vertex, mask):
@@ -245,7 +348,8 @@ class OptimalWeights:
         return dr.select(vertex > self.first, dr.clip(weight / WEIGHT_KEPT, SELDOM, 1), 1)
 
     def worth_going_on(self, state, vertex):
-        """Probability with which the path goes on from an inner vertex: the deeper weights are at most about the drive."""
+        """Probability with which the path goes on from an inner vertex: the deeper weights are at
+        most about the drive."""
         drive, _, _, _ = state
         return dr.select(vertex > self.first, dr.clip(dr.max(drive) / WEIGHT_KEPT, SELDOM, 1), 1)
 
@@ -261,12 +365,18 @@ class OptimalWeights:
         return Notebook(self) if self.strategies > 1 else None
 
     def merging(self, level, stored, f, p, passed):
-        """Weight w_{l, level} of a photon that has passed the nodes `passed` (nearest first, see `Notebook.read`), merged at a camera
-        vertex with the state `stored`, scattered there with value f and density p."""
+        """Weight w_{l, level} of a photon that has passed the nodes `passed` (nearest first, see
+        `Notebook.read`), merged at a camera vertex with the state `stored`, scattered there with
+        value f and density p."""
         u, tau, r = stored
         if level == 0:
             return 1 - self.deeper_sum(1, *self.root_step(u, f, p), passed)
-        return recursion.inner_weight(u, 1, recursion.kernel_share(r, f), self.deeper_sum(level + 1, *self.step(u, tau, r, f, p), passed))
+        return recursion.inner_weight(
+            u,
+            1,
+            recursion.kernel_share(r, f),
+            self.deeper_sum(level + 1, *self.step(u, tau, r, f, p), passed),
+        )
 
     def deeper_sum(self, level, drive, r, passed):
         """Sum of the weights of the strategies at z_level and beyond."""
@@ -282,17 +392,23 @@ class OptimalWeights:
 
 
 class Notebook:
-    """Notes of light sub-paths: what is known of the last `strategies - 1` vertices that scattered smoothly, nearest first (hooks of
-    `trace_light_paths`). Of the farthest, at which strategies end, only what `Node.final_response` and its weights ask for."""
+    """Notes of light sub-paths: what is known of the last `strategies - 1` vertices that scattered
+    smoothly, nearest first (hooks of `trace_light_paths`). Of the farthest, at which strategies
+    end, only what `Node.final_response` and its weights ask for."""
 
     def __init__(self, weights):
         self.weights = weights
         self.whole = weights.strategies - 2
 
     def _fields(self, node):
-        """A node's fields, those of the farthest one first. The kernel is negative where strategies end, the noise where the path goes on."""
-        fields = [node.direct, node.indirect, dr.select(node.last, -1 - node.kernel, node.kernel),
-                  dr.select(node.indirectly, -1 - node.noise, node.noise)]
+        """A node's fields, those of the farthest one first. The kernel is negative where strategies
+        end, the noise where the path goes on."""
+        fields = [
+            node.direct,
+            node.indirect,
+            dr.select(node.last, -1 - node.kernel, node.kernel),
+            dr.select(node.indirectly, -1 - node.noise, node.noise),
+        ]
         if self.whole:
             fields += [node.f, node.p]
             if self.weights.full:
@@ -303,15 +419,40 @@ class Notebook:
     def _node(direct, indirect, kernel, noise, f=None, p=None, lobe_f=None, lobe_p=None):
         """The node of fields read back."""
         last, indirectly = kernel < 0, noise < 0
-        return Node(f, p, direct, indirect, dr.select(last, -1 - kernel, kernel), lobe_f, lobe_p, dr.select(indirectly, -1 - noise, noise),
-                    last, indirectly)
+        return Node(
+            f,
+            p,
+            direct,
+            indirect,
+            dr.select(last, -1 - kernel, kernel),
+            lobe_f,
+            lobe_p,
+            dr.select(indirectly, -1 - noise, noise),
+            last,
+            indirectly,
+        )
 
     def begin(self):
-        def nothing():                                            # a vertex that does not exist has negative radiance
+        def nothing():  # a vertex that does not exist has negative radiance
             zero = mi.Spectrum(0)
-            return self._fields(Node(zero, mi.Float(0), mi.Spectrum(-1), mi.Spectrum(0), mi.Float(0), zero, mi.Float(1), mi.Float(0),
-                                     mi.Bool(False), mi.Bool(False)))
-        return [[type(x)(x) for x in nothing()] for _ in range(self.whole)] + [[type(x)(x) for x in nothing()[:4]]]
+            return self._fields(
+                Node(
+                    zero,
+                    mi.Float(0),
+                    mi.Spectrum(-1),
+                    mi.Spectrum(0),
+                    mi.Float(0),
+                    zero,
+                    mi.Float(1),
+                    mi.Float(0),
+                    mi.Bool(False),
+                    mi.Bool(False),
+                )
+            )
+
+        return [[type(x)(x) for x in nothing()] for _ in range(self.whole)] + [
+            [type(x)(x) for x in nothing()[:4]]
+        ]
 
     def scattered(self, state, si, bsdf, wo, mask):
         view = mi.SurfaceInteraction3f(si)
@@ -334,22 +475,38 @@ class Notebook:
         return words + [mi.UInt32(0)] * ((2 - len(words)) if len(words) <= 2 else -len(words) % 4)
 
     def read(self, level, notes, index, active):
-        """The vertices that photon `index`, merged at z_level, has passed: `Node`s, nearest first, as many as there are strategies beyond that
-        level. Those that do not exist come after one that direct light ends."""
+        """The vertices that photon `index`, merged at z_level, has passed: `Node`s, nearest first,
+        as many as there are strategies beyond that level. Those that do not exist come after one
+        that direct light ends."""
         template = self.begin()
         count = len(self.words(template))
-        template = template[:self.whole + 1 - level]
+        template = template[: self.whole + 1 - level]
         template[-1] = template[-1][:4]
-        needed = sum(dr.size_v(mi.Spectrum) if dr.depth_v(field) > 1 else 1 for fields in template for field in fields)
+        needed = sum(
+            dr.size_v(mi.Spectrum) if dr.depth_v(field) > 1 else 1
+            for fields in template
+            for field in fields
+        )
         words = []
         for part in range(-(-needed // 4)):
-            words += list(dr.gather(mi.Vector2u if count == 2 else mi.Vector4u, notes, max(count // 4, 1) * index + part, active))
+            words += list(
+                dr.gather(
+                    mi.Vector2u if count == 2 else mi.Vector4u,
+                    notes,
+                    max(count // 4, 1) * index + part,
+                    active,
+                )
+            )
         passed = []
         for fields in template:
             values = []
             for field in fields:
                 size = dr.size_v(mi.Spectrum) if dr.depth_v(field) > 1 else 1
                 mine, words = words[:size], words[size:]
-                values.append(mi.Spectrum([bits_float(w) for w in mine]) if dr.depth_v(field) > 1 else bits_float(mine[0]))
+                values.append(
+                    mi.Spectrum([bits_float(w) for w in mine])
+                    if dr.depth_v(field) > 1
+                    else bits_float(mine[0])
+                )
             passed.append(self._node(*values))
         return passed

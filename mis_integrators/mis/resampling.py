@@ -1,16 +1,20 @@
 """Where resampled connections and their weights meet.
 
-Hooks of `transport.subpaths` and `transport.camera_vertices`, and what resampling makes of each technique of a joint path. All techniques of a path
-evaluate one function: a technique that joins a light sub-path Y to the camera vertex z is taken to draw it with
+Hooks of `transport.subpaths` and `transport.camera_vertices`, and what resampling makes of each
+technique of a joint path. All techniques of a path evaluate one function: a technique that joins a
+light sub-path Y to the camera vertex z is taken to draw it with
 
     q/p = (a + c) r + b  if a cache point of z sees what z sees, else  c r + b,    r = f_y rho G softened,    G softened = G d^2 / (d^2 + h^2)
 
-where the parts are the cached pmfs' visible, blind and uniform ones (`proposals`), and the second case has a probability e. The four numbers of z and the
-lengths' shares Q_s/Q are looked up by place and by the side from which the light comes (`CacheGrid.row`); they are averages over the N_c cache points
-there, made once from the light sub-paths of the first iteration (which weights by densities alone). So the weights depend neither on an iteration's own
-light sub-paths nor on its pmfs, and the sum of the techniques stays unbiased. h is the spacing of the cache points: the cached pmf, made for their places,
-does not know that G has a pole at z. Left out are visibility (the ends of a joint path see each other), the camera's BSDF of `f_y_f_yz`, the guess of
-the weight that the pmfs contain (`guessed_weight`), and delta functions' weights; colours enter by channel means.
+where the parts are the cached pmfs' visible, blind and uniform ones (`proposals`), and the second
+case has a probability e. The four numbers of z and the lengths' shares Q_s/Q are looked up by place
+and by the side from which the light comes (`CacheGrid.row`); they are averages over the N_c cache
+points there, made once from the light sub-paths of the first iteration (which weights by densities
+alone). So the weights depend neither on an iteration's own light sub-paths nor on its pmfs, and the
+sum of the techniques stays unbiased. h is the spacing of the cache points: the cached pmf, made for
+their places, does not know that G has a pole at z. Left out are visibility (the ends of a joint
+path see each other), the camera's BSDF of `f_y_f_yz`, the guess of the weight that the pmfs contain
+(`guessed_weight`), and delta functions' weights; colours enter by channel means.
 """
 
 from __future__ import annotations
@@ -19,12 +23,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..core.packing import from_numpy
+from ..core.spectra import channel_mean
+from ..paths.light_starts import seen_from
 from ..resampling.cache_points import least_columns
 from ..resampling.light_vertices import END
-from ..paths.light_starts import seen_from
-from ..core.packing import from_numpy
 from ..resampling.proposals import BLIND_SHARE, uniform_share
-from ..core.spectra import channel_mean
 from ..weights import bidirectional as theory
 from ..weights import resampling
 
@@ -33,21 +37,25 @@ LENGTHS = 16
 MANY = 100
 """Light sub-paths from which on Q_s / (M Q), at most 1 / M, is not worth a lookup."""
 UNEXPECTED = 0.1
-"""A cache point's light is unexpected if the points around it have less than this share of its own pmf for it."""
+"""A cache point's light is unexpected if the points around it have less than this share of its own
+pmf for it."""
 LEAST_DOUBT = 0.05
 """Some of the light may always be unexpected."""
 LINES = 64
-"""Cache points that are compared with all others at once: their distances fit in a processor's cache."""
+"""Cache points that are compared with all others at once: their distances fit in a processor's
+cache."""
 LEAST_GAIN, MOST_GAIN = 1.0, 2.0
-"""A draw counts as so many connections to a light sub-path of its own. A cache that promises more is not to be believed (fireflies). Where it promises
-less, a heuristic that goes by second moments would hand paths to techniques that are noisier: what is drawn seldom is mostly small. That is so the
-more, the more there is to draw from: with a single light sub-path the formula stands."""
+"""A draw counts as so many connections to a light sub-path of its own. A cache that promises more
+is not to be believed (fireflies). Where it promises less, a heuristic that goes by second moments
+would hand paths to techniques that are noisier: what is drawn seldom is mostly small. That is so
+the more, the more there is to draw from: with a single light sub-path the formula stands."""
 
 
 class ResampledWeights:
-    """`lights`, `grid` (a `CacheGrid`), `records` (float, four a row: a, b, c, e), `shares` (float, `LENGTHS` a row), M light sub-paths, N draws; `aware`: whether
-    the weights know of the resampling (else every technique has the density of its path alone); `ratio`: N_t, light sub-paths that are joined to
-    the sensor over camera paths, of all the film."""
+    """`lights`, `grid` (a `CacheGrid`), `records` (float, four a row: a, b, c, e), `shares` (float,
+    `LENGTHS` a row), M light sub-paths, N draws; `aware`: whether the weights know of the
+    resampling (else every technique has the density of its path alone); `ratio`: N_t, light
+    sub-paths that are joined to the sensor over camera paths, of all the film."""
 
     states = END
 
@@ -68,16 +76,26 @@ class ResampledWeights:
         return geometry * dr.rcp(1 + self.grid.squared_spacing * dr.rcp(squared))
 
     def gain(self, r, row, s, active=True):
-        """p_t / p of the technique that joins a light sub-path of `s` vertices, which sends r = q*/p, to a camera vertex of that row."""
+        """p_t / p of the technique that joins a light sub-path of `s` vertices, which sends r =
+        q*/p, to a camera vertex of that row."""
         if not self.aware:
             return mi.Float(1)
         record = dr.gather(mi.Vector4f, self.records, row, active)
         share = mi.Float(0)
         if self.M < MANY:
-            share = dr.gather(mi.Float, self.shares, row * LENGTHS + dr.minimum(dr.maximum(s, 1), LENGTHS) - 1, active)
+            share = dr.gather(
+                mi.Float,
+                self.shares,
+                row * LENGTHS + dr.minimum(dr.maximum(s, 1), LENGTHS) - 1,
+                active,
+            )
         spare = record.z * r + record.y
         ratio = resampling.doubtful_ratio(record.x * r + spare, spare, record.w)
-        return dr.clip(resampling.gain(ratio, share, self.M, self.N), LEAST_GAIN * (1 - 1 / self.M), MOST_GAIN * self.N)
+        return dr.clip(
+            resampling.gain(ratio, share, self.M, self.N),
+            LEAST_GAIN * (1 - 1 / self.M),
+            MOST_GAIN * self.N,
+        )
 
     # ------------------------------------------------------------------ hooks of the light sub-paths
 
@@ -92,17 +110,34 @@ class ResampledWeights:
         start = self.lights.start_density(si, ds, active)
         across = self.lights.forward_density(si, ds, active)
         made = across * dr.abs(dr.dot(si.n, ds.d))
-        strength = dr.select(self.lights.untold(ds.emitter, active), self.lights.total_power, channel_mean(flux))
+        strength = dr.select(
+            self.lights.untold(ds.emitter, active), self.lights.total_power, channel_mean(flux)
+        )
         row = self.row(si.p, dr.mulsign(si.n, dr.dot(si.n, ds.d)))
-        better = self.gain(strength * self.softened(made, dr.select(infinite, dr.inf, dr.square(ds.dist))), row, mi.UInt32(1), active)
+        better = self.gain(
+            strength * self.softened(made, dr.select(infinite, dr.inf, dr.square(ds.dist))),
+            row,
+            mi.UInt32(1),
+            active,
+        )
         met = self.lights.can_be_met(ds.emitter, active)
-        return [dr.select(reachable, better * theory.reciprocal(made), 0),
-                dr.select(reachable & met, theory.reciprocal(start * across), 0), strength]
+        return [
+            dr.select(reachable, better * theory.reciprocal(made), 0),
+            dr.select(reachable & met, theory.reciprocal(start * across), 0),
+            strength,
+        ]
 
     def left(self, state, p_forward, p_back, delta, scattered):
         near, far, strength = state
-        return [near, dr.select(delta, far, theory.far_of(near + p_back * far, p_forward)),
-                dr.select(delta, strength, dr.minimum(strength * scattered * theory.reciprocal(p_forward), theory.LARGEST))]
+        return [
+            near,
+            dr.select(delta, far, theory.far_of(near + p_back * far, p_forward)),
+            dr.select(
+                delta,
+                strength,
+                dr.minimum(strength * scattered * theory.reciprocal(p_forward), theory.LARGEST),
+            ),
+        ]
 
     def arrived(self, state, density, si, squared, depth):
         row = self.row(si.p, dr.mulsign(si.n, dr.dot(si.n, si.to_world(si.wi))))
@@ -118,31 +153,39 @@ class ResampledWeights:
 
 
 def guessed_weight(z, sent):
-    """Weight that joining the cache point `z` (a record of a camera vertex) to a light vertex that sends `sent` would have among itself, the
-    techniques nearer to the light, if the surface at `z` is diffuse, and the one next to the camera; all as if nothing was resampled.
+    """Weight that joining the cache point `z` (a record of a camera vertex) to a light vertex that
+    sends `sent` would have among itself, the techniques nearer to the light, if the surface at `z`
+    is diffuse, and the one next to the camera; all as if nothing was resampled.
 
-    What is drawn should be proportional to weight times contribution. By q* alone long light sub-paths matter as much as direct light, though
-    each of them is one of many ways to make its path."""
+    What is drawn should be proportional to weight times contribution. By q* alone long light
+    sub-paths matter as much as direct light, though each of them is one of many ways to make its
+    path."""
     cosine = dr.abs(dr.dot(z["n"], sent.d))
-    return dr.rcp(1 + dr.minimum(cosine * (dr.inv_pi * sent.behind + sent.across * z["near"]), theory.LARGEST))
+    return dr.rcp(
+        1 + dr.minimum(cosine * (dr.inv_pi * sent.behind + sent.across * z["near"]), theory.LARGEST)
+    )
 
 
 def around(p, n, neighbors, normal_cost):
-    """Places of the other cache points that each of C is nearest to (C x `neighbors`, or as many as there are): those that `CacheGrid` would mix
-    with it. NumPy arrays `p`, `n` (C x 3); `normal_cost` as of `CacheGrid` [length^2]."""
+    """Places of the other cache points that each of C is nearest to (C x `neighbors`, or as many as
+    there are): those that `CacheGrid` would mix with it. NumPy arrays `p`, `n` (C x 3);
+    `normal_cost` as of `CacheGrid` [length^2]."""
     p, n = (p - p.mean(axis=0)).astype(np.float32), n.astype(np.float32)
-    squared, count = np.sum(p ** 2, axis=1), min(neighbors, len(p) - 1)
+    squared, count = np.sum(p**2, axis=1), min(neighbors, len(p) - 1)
     near = np.empty((len(p), count), dtype=np.intp)
     for first in range(0, len(p), LINES):
         some = np.arange(first, min(first + LINES, len(p)))
-        cost = squared - 2 * p[some] @ p.T - np.float32(normal_cost) * n[some] @ n.T         # but for what is the same in a row
+        cost = (
+            squared - 2 * p[some] @ p.T - np.float32(normal_cost) * n[some] @ n.T
+        )  # but for what is the same in a row
         cost[some - first, some] = np.inf
         near[some] = least_columns(cost, count)
     return near
 
 
 def doubt(near, r, seen):
-    """How much of a cache point's light comes from light vertices that the cache points around it, `near`, do not expect: a number each (C).
+    """How much of a cache point's light comes from light vertices that the cache points around it,
+    `near`, do not expect: a number each (C).
 
     NumPy arrays `r`, `seen` (C x light vertices, as for `cumulative_sums`)."""
     if not near.shape[1]:
@@ -154,15 +197,20 @@ def doubt(near, r, seen):
 
 
 def ignorant(grid):
-    """`(records, shares)` of the rows that have every draw count as one connection, where nothing is known of Q and Q_s."""
-    return tuple(from_numpy(mi.Float, np.tile(values, grid.rows)) for values in ([0.0, 1.0, 0.0, 0.0], np.ones(LENGTHS)))
+    """`(records, shares)` of the rows that have every draw count as one connection, where nothing
+    is known of Q and Q_s."""
+    return tuple(
+        from_numpy(mi.Float, np.tile(values, grid.rows))
+        for values in ([0.0, 1.0, 0.0, 0.0], np.ones(LENGTHS))
+    )
 
 
 def tabulate(grid, Q_s, Q_blind, doubts, ends_s):
     """`(records, shares)` of the rows, as `ResampledWeights` takes them.
 
-    NumPy arrays: `Q_s` (C x LENGTHS), integrals at the C cache points, visibility included; `Q_blind` (C), of all lengths, visibility not; `doubts`
-    (C); `ends_s` (LENGTHS): light vertices that a light sub-path has of each length on average.
+    NumPy arrays: `Q_s` (C x LENGTHS), integrals at the C cache points, visibility included;
+    `Q_blind` (C), of all lengths, visibility not; `doubts` (C); `ends_s` (LENGTHS): light vertices
+    that a light sub-path has of each length on average.
     """
     near = np.array(grid.table).reshape(-1, grid.neighbors)
 
@@ -174,10 +222,13 @@ def tabulate(grid, Q_s, Q_blind, doubts, ends_s):
     blind = np.where(Q > 0, BLIND_SHARE, 1)
     ends = max(ends_s.sum(), 1e-9)
     uniform = np.where(Q_blind > 0, own, 1)[near].mean(axis=1)
-    # What a darker neighbour has least of is what matters here: 1/Q of the mean, not the mean of 1/Q.
+    # What a darker neighbour has least of is what matters here: 1/Q of the mean, not the mean of
+    # 1/Q.
     a = ((1 - own) * (1 - blind))[near].mean(axis=1) * inverse(Q[near].mean(axis=1))
     c = ((1 - own) * blind)[near].mean(axis=1) * inverse(Q_blind[near].mean(axis=1))
     e = np.clip(doubts[near].mean(axis=1), LEAST_DOUBT, 1)
-    shares = (Q_s * inverse(Q)[:, None])[near].mean(axis=1) + (~(Q > 0))[near].mean(axis=1)[:, None] * (ends_s / ends)
+    shares = (Q_s * inverse(Q)[:, None])[near].mean(axis=1) + (~(Q > 0))[near].mean(axis=1)[
+        :, None
+    ] * (ends_s / ends)
     records = np.stack([a, uniform / ends, c, e], axis=1)
     return tuple(from_numpy(mi.Float, values.ravel()) for values in (records, shares))

@@ -1,7 +1,8 @@
-"""Where transport and the heuristics of connections meet: Veach's weights as the state of sub-paths (see `weights.bidirectional`).
+"""Where transport and the heuristics of connections meet: Veach's weights as the state of sub-paths
+(see `weights.bidirectional`).
 
-The weights are functions of the joint path alone. Not in them: Russian roulette, and the choices at delta surfaces, taken as alike from both
-sides. They cost noise, never light.
+The weights are functions of the joint path alone. Not in them: Russian roulette, and the choices at
+delta surfaces, taken as alike from both sides. They cost noise, never light.
 """
 
 from __future__ import annotations
@@ -17,7 +18,8 @@ from ..weights import bidirectional as theory
 class ConnectionWeights:
     """Hooks of `transport.subpaths`, and the weights of joined sub-paths.
 
-    `beta`: Veach's exponent; `ratio`: light sub-paths over camera paths, of the whole crop window; `eta` [m^2]: pi R^2 N of merging, or 0.
+    `beta`: Veach's exponent; `ratio`: light sub-paths over camera paths, of the whole crop window;
+    `eta` [m^2]: pi R^2 N of merging, or 0.
     """
 
     states = STATES
@@ -36,13 +38,21 @@ class ConnectionWeights:
         ds = seen_from(si, source, active)
         cosine = dr.maximum(dr.abs(dr.dot(si.n, ds.d)), 1e-6)
         direct = self.lights.pdf_direct(si, ds, active)
-        near, far = theory.light_start(cosine * self.lights.emission_ratio(si, ds, active), direct * dr.rcp(cosine))
+        near, far = theory.light_start(
+            cosine * self.lights.emission_ratio(si, ds, active), direct * dr.rcp(cosine)
+        )
         flags = ds.emitter.flags()
-        met = ~(mi.has_flag(flags, mi.EmitterFlags.DeltaPosition) | mi.has_flag(flags, mi.EmitterFlags.DeltaDirection))
+        met = ~(
+            mi.has_flag(flags, mi.EmitterFlags.DeltaPosition)
+            | mi.has_flag(flags, mi.EmitterFlags.DeltaDirection)
+        )
         return [dr.select(reachable, near, 0), dr.select(reachable & met, far, 0)]
 
     def seen(self, density, active):
-        return [dr.select(active & (density > 0), theory.camera_start(density, self.ratio), 0), mi.Float(0)]
+        return [
+            dr.select(active & (density > 0), theory.camera_start(density, self.ratio), 0),
+            mi.Float(0),
+        ]
 
     def left(self, state, p_forward, p_back, delta, scattered=None):
         near, far = state
@@ -68,10 +78,13 @@ class ConnectionWeights:
         """Weight of a `Connection` of two kept vertices."""
         a_light = self._nearer([light[name] for name in self.states], connection.back_at_light)
         a_camera = self._nearer([camera[name] for name in self.states], connection.back_at_camera)
-        return theory.connection(connection.density_at_light, a_light, connection.density_at_camera, a_camera, self.beta)
+        return theory.connection(
+            connection.density_at_light, a_light, connection.density_at_camera, a_camera, self.beta
+        )
 
     def merged(self, camera, state, back_at_light, back_at_camera):
-        """Weight of merging a camera vertex with a light vertex of that `state` (arguments as of `weigh` of `transport.merging.merge`)."""
+        """Weight of merging a camera vertex with a light vertex of that `state` (arguments as of
+        `weigh` of `transport.merging.merge`)."""
         a_light = theory.nearer(*state, back_at_light, self.beta)
         a_camera = theory.nearer(camera["near"], camera["far"], back_at_camera, self.beta)
         return theory.merging(a_light, a_camera, self.eta, self.beta)

@@ -1,6 +1,8 @@
-"""Camera sub-paths as nothing but vertices: where light sub-paths are joined to them afterwards, and the emission that they meet.
+"""Camera sub-paths as nothing but vertices: where light sub-paths are joined to them afterwards,
+and the emission that they meet.
 
-A vertex remembers the step that led to it, from the last vertex that scattered smoothly (its `parent`): weights walk back along these steps.
+A vertex remembers the step that led to it, from the last vertex that scattered smoothly (its
+`parent`): weights walk back along these steps.
 """
 
 from __future__ import annotations
@@ -8,40 +10,52 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from .camera_pass import behind_emitters, start_camera_paths, with_gaps, within_crop
-from .vertex import Junction, scattered_mean
-from .sensor import Lens
 from ..core.packing import Store
 from ..core.random import next_2d
 from ..core.records import Layout
-from .roulette import russian_roulette
 from ..core.spectra import channel_mean
+from .camera_pass import behind_emitters, start_camera_paths, with_gaps, within_crop
+from .roulette import russian_roulette
+from .sensor import Lens
 from .subpaths import NO_PARENT, keep_vertex, new_vertices, vertex_layout
+from .vertex import Junction, scattered_mean
 
 STEP = ("near", "geometry", "forward", "back", "scattered", "row")
-"""What vertices and hits remember of the step from their parent: one over the area density with which it was made [m^2] (over that per solid angle [sr] for
-hits; zero where a delta function scattered on the way); the geometric term [1/m^2] (hits: the cosine at the parent), as `soften` leaves it;
-densities per projected solid angle at the parent, of the camera's side for this step and of the light's for the one before; the parent's BSDF,
-channel mean [1/sr]; its row (see `soften`)."""
+"""What vertices and hits remember of the step from their parent: one over the area density with
+which it was made [m^2] (over that per solid angle [sr] for hits; zero where a delta function
+scattered on the way); the geometric term [1/m^2] (hits: the cosine at the parent), as `soften`
+leaves it; densities per projected solid angle at the parent, of the camera's side for this step and
+of the light's for the one before; the parent's BSDF, channel mean [1/sr]; its row (see
+`soften`)."""
 HIT = ("light_mean", "start", "across")
-"""What a hit knows besides: `Lights.start_density` and `forward_density` of the emitter's point, and its light, channel mean, over the former."""
-
+"""What a hit knows besides: `Lights.start_density` and `forward_density` of the emitter's point,
+and its light, channel mean, over the former."""
 
 
 def hit_layout():
-    """Fields of a hit of an emitter beyond the first vertex: `value` (throughput included), number of the path, `depth` in segments, `parent`, and the
-    fields of `STEP` and `HIT`."""
-    return Layout({"value": mi.Spectrum, "path": mi.UInt32, **{name: mi.Float for name in STEP}, "depth": mi.UInt32, "parent": mi.UInt32,
-                   **{name: mi.Float for name in HIT}})
+    """Fields of a hit of an emitter beyond the first vertex: `value` (throughput included), number
+    of the path, `depth` in segments, `parent`, and the fields of `STEP` and `HIT`."""
+    return Layout(
+        {
+            "value": mi.Spectrum,
+            "path": mi.UInt32,
+            **dict.fromkeys(STEP, mi.Float),
+            "depth": mi.UInt32,
+            "parent": mi.UInt32,
+            **dict.fromkeys(HIT, mi.Float),
+        }
+    )
 
 
 def not_left(width):
-    """What `leave` returns before anything was left: densities of both sides, BSDF, row and cosine of the last vertex that scattered smoothly."""
+    """What `leave` returns before anything was left: densities of both sides, BSDF, row and cosine
+    of the last vertex that scattered smoothly."""
     return [dr.ones(mi.Float, width), *[dr.zeros(mi.Float, width) for _ in range(4)]]
 
 
 def leave(soften, left, si, value, p_forward, p_back, wo, mask):
-    """After the lanes `mask` have scattered smoothly towards `wo`: what the next vertex must know of this one."""
+    """After the lanes `mask` have scattered smoothly towards `wo`: what the next vertex must know
+    of this one."""
     cosine = dr.dot(si.n, wo)
     row = mi.Float(soften.row(si.p, dr.mulsign(si.n, cosine)))
     new = [p_forward, p_back, scattered_mean(value, si.n, wo), row, dr.abs(cosine)]
@@ -49,7 +63,8 @@ def leave(soften, left, si, value, p_forward, p_back, wo, mask):
 
 
 def step_to_vertex(soften, left, density, cosine, squared):
-    """The fields of `STEP` at a vertex that was sampled with `density` per solid angle (zero: by a delta function) and meets the ray under `cosine`."""
+    """The fields of `STEP` at a vertex that was sampled with `density` per solid angle (zero: by a
+    delta function) and meets the ray under `cosine`."""
     forward, back, scattered, row, there = left
     near = dr.select(density > 0, squared * dr.rcp(dr.maximum(density * cosine, 1e-20)), 0)
     geometry = soften.softened(there * cosine * dr.rcp(squared), squared)
@@ -57,49 +72,96 @@ def step_to_vertex(soften, left, density, cosine, squared):
 
 
 def step_to_hit(lights, soften, left, density, origin, ds, light, squared, mask):
-    """The fields of `STEP` and `HIT` of emission `light` met in the point or direction `ds`, seen from the vertex `origin`."""
+    """The fields of `STEP` and `HIT` of emission `light` met in the point or direction `ds`, seen
+    from the vertex `origin`."""
     forward, back, scattered, row, there = left
     start = lights.start_density(origin, ds, mask)
     geometry = soften.softened(there, squared)
     near = dr.select(density > 0, dr.rcp(dr.maximum(density, 1e-20)), 0)
-    return dict(zip((*STEP, *HIT), (near, geometry, forward, back, scattered, row, channel_mean(light) * dr.rcp(dr.maximum(start, 1e-20)), start,
-                                    lights.forward_density(origin, ds, mask))))
+    return dict(
+        zip(
+            (*STEP, *HIT),
+            (
+                near,
+                geometry,
+                forward,
+                back,
+                scattered,
+                row,
+                channel_mean(light) * dr.rcp(dr.maximum(start, 1e-20)),
+                start,
+                lights.forward_density(origin, ds, mask),
+            ),
+        )
+    )
 
 
 @dr.syntax
-def trace_camera_vertices(scene, sensor, integrator, lights, traits, soften, seed, first, skip, n_paths: int, camera_paths: int, wavelength_sample,
-                          ratio, max_depth: int, rr_depth: int, hide_emitters: bool, capacity: int, hit_capacity: int):
-    """Traces `n_paths` camera paths, numbers `first`, `first + 1`, ... of `film_samples`, but without `skip` of them after each pixel's.
+def trace_camera_vertices(
+    scene,
+    sensor,
+    integrator,
+    lights,
+    traits,
+    soften,
+    seed,
+    first,
+    skip,
+    n_paths: int,
+    camera_paths: int,
+    wavelength_sample,
+    ratio,
+    max_depth: int,
+    rr_depth: int,
+    hide_emitters: bool,
+    capacity: int,
+    hit_capacity: int,
+):
+    """Traces `n_paths` camera paths, numbers `first`, `first + 1`, ... of `film_samples`, but
+    without `skip` of them after each pixel's.
 
-    Returns `(radiance, alpha, splat position, vertices, count, hits, hit count)`: the light that the camera's rays meet at once; vertices as of
-    `subpaths.new_vertices` with the fields of `STEP`; records of `hit_layout`. Counts have width one; if they exceed the capacities the surplus is missing. The
-    first vertex has one over the density of camera rays there, over the whole crop window, times `ratio`, as its `near`, and no parent.
+    Returns `(radiance, alpha, splat position, vertices, count, hits, hit count)`: the light that
+    the camera's rays meet at once; vertices as of `subpaths.new_vertices` with the fields of
+    `STEP`; records of `hit_layout`. Counts have width one; if they exceed the capacities the
+    surplus is missing. The first vertex has one over the density of camera rays there, over the
+    whole crop window, times `ratio`, as its `near`, and no parent.
 
-    `soften.row(p, n)` numbers places, with the normal on the side of the light; `soften.softened(geometry, squared)` may change the geometric
-    term of a step that starts there, with its squared distance (infinite for environments).
+    `soften.row(p, n)` numbers places, with the normal on the side of the light;
+    `soften.softened(geometry, squared)` may change the geometric term of a step that starts there,
+    with its squared distance (infinite for environments).
     """
     first = with_gaps(first, skip, n_paths, camera_paths)
-    path, active, rng, ray, sensor_weight, splat, aperture = start_camera_paths(sensor, seed, first, 1, n_paths, camera_paths, wavelength_sample)
+    path, active, rng, ray, sensor_weight, splat, aperture = start_camera_paths(
+        sensor, seed, first, 1, n_paths, camera_paths, wavelength_sample
+    )
     lens = Lens(sensor)
     inside = within_crop(sensor.film(), splat)
     throughput = mi.Spectrum(sensor_weight)
     radiance = mi.Spectrum(0)
     depth = mi.UInt32(0)
     number = mi.UInt32(0)
-    parent = mi.UInt32(NO_PARENT)                    # the last vertex that scattered smoothly
+    parent = mi.UInt32(NO_PARENT)  # the last vertex that scattered smoothly
     eta = mi.Float(1)
-    density = mi.Float(0)                            # with which the direction was sampled, per solid angle; zero after a delta function
-    left = not_left(n_paths)                         # of the parent
-    origin = dr.zeros(mi.Interaction3f)              # the last vertex, of whichever kind
+    density = mi.Float(
+        0
+    )  # with which the direction was sampled, per solid angle; zero after a delta function
+    left = not_left(n_paths)  # of the parent
+    origin = dr.zeros(mi.Interaction3f)  # the last vertex, of whichever kind
     context = mi.BSDFContext()
-    store = Store(vertices=new_vertices(traits, capacity, STEP), room=dr.opaque(mi.UInt32, capacity), count=dr.zeros(mi.UInt32, 1),
-                  hits=hit_layout().room(hit_capacity), hit_room=dr.opaque(mi.UInt32, hit_capacity), hit_count=dr.zeros(mi.UInt32, 1))
+    store = Store(
+        vertices=new_vertices(traits, capacity, STEP),
+        room=dr.opaque(mi.UInt32, capacity),
+        count=dr.zeros(mi.UInt32, 1),
+        hits=hit_layout().room(hit_capacity),
+        hit_room=dr.opaque(mi.UInt32, hit_capacity),
+        hit_count=dr.zeros(mi.UInt32, 1),
+    )
     visible = mi.Bool((scene.environment() is not None) and not hide_emitters)
-    if dr.hint(max_depth == 0, mode='scalar'):
+    if dr.hint(max_depth == 0, mode="scalar"):
         active &= False
 
     hit = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
-    if dr.hint(hide_emitters, mode='scalar'):
+    if dr.hint(hide_emitters, mode="scalar"):
         hit, ray = behind_emitters(scene, integrator, hit, ray, active)
 
     while dr.hint(active, label="camera vertices"):
@@ -109,24 +171,34 @@ def trace_camera_vertices(scene, sensor, integrator, lights, traits, soften, see
         squared = dr.maximum(dr.squared_norm(si.p - origin.p), 1e-20)
 
         # ---- Emission met by the path
-        if dr.hint(traits.has_light_surfaces, mode='scalar'):
+        if dr.hint(traits.has_light_surfaces, mode="scalar"):
             ds = mi.DirectionSample3f(scene, si, origin)
             shown = active & (ds.emitter != None)  # noqa: E711 (array comparison)
-            if dr.hint(hide_emitters, mode='scalar'):
-                shown &= visible                     # what is behind nothing but null surfaces is hidden, too
+            if dr.hint(hide_emitters, mode="scalar"):
+                shown &= visible  # what is behind nothing but null surfaces is hidden, too
             light = ds.emitter.eval(si, shown)
             radiance[shown & (depth == 1)] += throughput * light
             met = shown & (depth > 1) & (dr.max(light * throughput) > 0)
             slot = dr.scatter_inc(store.hit_count, mi.UInt32(0), met)
             met &= slot < store.hit_room
-            values = step_to_hit(lights, soften, left, density, origin, ds, light, dr.select(si.is_valid(), squared, dr.inf), met)
+            values = step_to_hit(
+                lights,
+                soften,
+                left,
+                density,
+                origin,
+                ds,
+                light,
+                dr.select(si.is_valid(), squared, dr.inf),
+                met,
+            )
             values |= {"value": throughput * light, "path": path, "depth": depth, "parent": parent}
             hit_layout().write(store.hits, values, slot, met)
 
         active &= si.is_valid()
-        met = mi.Bool(active)                        # a surface, perhaps the last one
+        met = mi.Bool(active)  # a surface, perhaps the last one
         bsdf = si.bsdf(ray)
-        if dr.hint(max_depth > 0, mode='scalar'):
+        if dr.hint(max_depth > 0, mode="scalar"):
             active &= depth < max_depth
         smooth = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
 
@@ -134,12 +206,30 @@ def trace_camera_vertices(scene, sensor, integrator, lights, traits, soften, see
         cosine = dr.abs(dr.dot(si.n, towards))
         begin = active & (depth == 1)
         step = step_to_vertex(soften, left, density, cosine, squared)
-        if dr.hint(lens.connects, mode='scalar'):
+        if dr.hint(lens.connects, mode="scalar"):
             of_rays = cosine * lens.density(si.p, si.time, aperture, begin & inside)
-            step[0] = dr.select(begin, dr.select(of_rays > 0, ratio * dr.rcp(dr.maximum(of_rays, 1e-20)), 0), step[0])
+            step[0] = dr.select(
+                begin,
+                dr.select(of_rays > 0, ratio * dr.rcp(dr.maximum(of_rays, 1e-20)), 0),
+                step[0],
+            )
         junction = Junction.at(traits, si, bsdf, smooth)
         wanted = smooth & (dr.max(throughput) > 0)
-        slot = keep_vertex(store, junction, si, hit, towards, throughput, path, depth, number, parent, step, STEP, wanted)
+        slot = keep_vertex(
+            store,
+            junction,
+            si,
+            hit,
+            towards,
+            throughput,
+            path,
+            depth,
+            number,
+            parent,
+            step,
+            STEP,
+            wanted,
+        )
         number = dr.select(wanted, number + 1, number)
 
         # ---- Go on
@@ -155,7 +245,9 @@ def trace_camera_vertices(scene, sensor, integrator, lights, traits, soften, see
         throughput *= weight
         eta *= bs.eta
         ray = si.spawn_ray(wo)
-        throughput, active = russian_roulette(rng, throughput, dr.max(throughput), eta, depth >= rr_depth, active)
+        throughput, active = russian_roulette(
+            rng, throughput, dr.max(throughput), eta, depth >= rr_depth, active
+        )
         hit = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
 
     alpha = dr.select(visible, mi.Float(1), mi.Float(0))
@@ -163,16 +255,24 @@ def trace_camera_vertices(scene, sensor, integrator, lights, traits, soften, see
 
 
 @dr.syntax
-def sum_before(vertices, step, parent, p_made, strength, scattered, back, segments, weights, active):
-    """Sum over the techniques nearer to the camera than the one at hand, of their samples times densities, over the density of the latter.
+def sum_before(
+    vertices, step, parent, p_made, strength, scattered, back, segments, weights, active
+):
+    """Sum over the techniques nearer to the camera than the one at hand, of their samples times
+    densities, over the density of the latter.
 
-    `step`, `parent`: those of the vertex, or hit, at the camera's end; `p_made` [1/m^2]: the density with which the light's side makes it; `strength`:
-    flux, over the density of that; `scattered`, `back`: BSDF there, and density per projected solid angle with which the light's side goes on
-    to the parent; `segments`: of the joint path. `weights.gain(r, row, s, active)`: what resampling makes of the technique that joins a light sub-path of s
-    vertices, which sends r = q*/p, to a vertex of that row. Joining to the sensor (the last step, without a parent) has the gain one.
+    `step`, `parent`: those of the vertex, or hit, at the camera's end; `p_made` [1/m^2]: the
+    density with which the light's side makes it; `strength`: flux, over the density of that;
+    `scattered`, `back`: BSDF there, and density per projected solid angle with which the light's
+    side goes on to the parent; `segments`: of the joint path. `weights.gain(r, row, s, active)`:
+    what resampling makes of the technique that joins a light sub-path of s vertices, which sends r
+    = q*/p, to a vertex of that row. Joining to the sensor (the last step, without a parent) has the
+    gain one.
     """
     layout = vertex_layout(STEP)
-    near, geometry, forward, back_there, scattered_there, row = (mi.Float(step[name]) for name in STEP)
+    near, geometry, forward, back_there, scattered_there, row = (
+        mi.Float(step[name]) for name in STEP
+    )
     parent = mi.UInt32(parent)
     ratio = mi.Float(p_made)
     strength = mi.Float(strength)
@@ -182,7 +282,9 @@ def sum_before(vertices, step, parent, p_made, strength, scattered, back, segmen
     while dr.hint(active, label="techniques"):
         joined = parent != NO_PARENT
         depth = layout.read(vertices["words"], parent, active & joined, ("depth",))["depth"]
-        better = weights.gain(strength * scattered * geometry, mi.UInt32(row), segments - depth, active & joined)
+        better = weights.gain(
+            strength * scattered * geometry, mi.UInt32(row), segments - depth, active & joined
+        )
         total = dr.select(active, total + ratio * near * dr.select(joined, better, 1), total)
         ratio = dr.minimum(ratio * (back * dr.rcp(dr.maximum(forward, 1e-20))), 1e15)
         strength = dr.minimum(strength * (scattered * dr.rcp(dr.maximum(back, 1e-20))), 1e15)

@@ -1,6 +1,8 @@
-"""Joining kept vertices of light and camera sub-paths: who is joined with whom, and what a joined pair carries.
+"""Joining kept vertices of light and camera sub-paths: who is joined with whom, and what a joined
+pair carries.
 
-A pair is two places in the buffers of `subpaths`. Pairs are written out first and evaluated flat: every lane has one.
+A pair is two places in the buffers of `subpaths`. Pairs are written out first and evaluated flat:
+every lane has one.
 """
 
 from __future__ import annotations
@@ -10,23 +12,24 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from .vertex import SMALLEST_COSINE
-from .sensor import unblocked, unblocked_by_visible
 from ..core.packing import Store
 from ..core.random import vertex_streams
 from ..core.recording import lanes
 from ..core.spectra import channel_mean
+from .sensor import unblocked, unblocked_by_visible
 from .subpaths import STATES, junction_of, read_vertices, seen_normal
+from .vertex import SMALLEST_COSINE
 
 
 @dataclass
 class Connection:
     """Two sub-paths joined by a straight segment, one a lane.
 
-    `value`: radiance that the camera path's pixel gets (spectrum, throughput and flux included, of one light sub-path; visibility not);
-    `d`, `distance`: from the camera's vertex to the light's; `density_at_light`, `density_at_camera` [1/m^2]: with which the camera's end makes the
-    light's end and the other way round; `back_at_light`, `back_at_camera`: densities per projected solid angle with which the other side goes on
-    there to the vertex before.
+    `value`: radiance that the camera path's pixel gets (spectrum, throughput and flux included, of
+    one light sub-path; visibility not); `d`, `distance`: from the camera's vertex to the light's;
+    `density_at_light`, `density_at_camera` [1/m^2]: with which the camera's end makes the light's
+    end and the other way round; `back_at_light`, `back_at_camera`: densities per projected solid
+    angle with which the other side goes on there to the vertex before.
     """
 
     value: mi.Spectrum
@@ -51,37 +54,86 @@ def join(traits, camera, light, wavelengths, active):
     leaving = dr.abs(dr.dot(light["n"], d))
     landing = dr.maximum(dr.abs(dr.dot(light["n"], light["towards"])), SMALLEST_COSINE)
     geometry = leaving * dr.abs(dr.dot(camera["n"], d)) * dr.rcp(squared)
-    carried = camera["throughput"] * value * value_light * light["throughput"] * (leaving * dr.rcp(landing * squared))
-    return Connection(dr.select(active, carried, 0), d, distance, p_camera * geometry, p_light * geometry, back_at_light, back_at_camera)
+    carried = (
+        camera["throughput"]
+        * value
+        * value_light
+        * light["throughput"]
+        * (leaving * dr.rcp(landing * squared))
+    )
+    return Connection(
+        dr.select(active, carried, 0),
+        d,
+        distance,
+        p_camera * geometry,
+        p_light * geometry,
+        back_at_light,
+        back_at_camera,
+    )
 
 
 def by_path(vertices, count, lengths, capacity: int):
-    """`(start, order)`: the kept vertices of sub-path i, in the order of their `number`, are at the places `order[start[i]]`,
-    `order[start[i] + 1]`, ..."""
+    """`(start, order)`: the kept vertices of sub-path i, in the order of their `number`, are at the
+    places `order[start[i]]`, `order[start[i] + 1]`, ..."""
     start = dr.prefix_sum(lengths)
     dr.eval(start)
     index = dr.arange(mi.UInt32, capacity)
     active = index < dr.gather(mi.UInt32, count, 0)
     order = dr.zeros(mi.UInt32, capacity)
     vertex = read_vertices(vertices, index, active, ("path", "number"))
-    dr.scatter(order, index, dr.gather(mi.UInt32, start, vertex["path"], active) + vertex["number"], active)
+    dr.scatter(
+        order, index, dr.gather(mi.UInt32, start, vertex["path"], active) + vertex["number"], active
+    )
     return start, order
 
 
-LAMBERTIAN = ("p", "path", "throughput", "density", "ns", "depth", "towards", "number", "value", "n", *STATES)
+LAMBERTIAN = (
+    "p",
+    "path",
+    "throughput",
+    "density",
+    "ns",
+    "depth",
+    "towards",
+    "number",
+    "value",
+    "n",
+    *STATES,
+)
 """Fields of a vertex that a connection of Lambertian vertices needs."""
 
 
 @dr.syntax
-def list_pairs(traits, weights, camera, camera_count, camera_capacity: int, light, start, order, lengths, max_depth: int, capacity: int, level, seed):
-    """Every camera vertex with every vertex of the light sub-path of its own number (modulo theirs), as far as `max_depth` lets them.
+def list_pairs(
+    traits,
+    weights,
+    camera,
+    camera_count,
+    camera_capacity: int,
+    light,
+    start,
+    order,
+    lengths,
+    max_depth: int,
+    capacity: int,
+    level,
+    seed,
+):
+    """Every camera vertex with every vertex of the light sub-path of its own number (modulo
+    theirs), as far as `max_depth` lets them.
 
-    Pairs of Lambertian vertices are thinned out by what they would bring if nothing stood between (Russian roulette): those worth less than `level`
-    [radiance, channel mean; an array with one number a camera path] stay with a probability in proportion. Returns `(camera places, light
+    Pairs of Lambertian vertices are thinned out by what they would bring if nothing stood between
+    (Russian roulette): those worth less than `level` [radiance, channel mean; an array with one
+    number a camera path] stay with a probability in proportion. Returns `(camera places, light
     places, one over that probability, count)`.
     """
-    store = Store(camera=dr.empty(mi.UInt32, capacity), light=dr.empty(mi.UInt32, capacity), factor=dr.empty(mi.Float, capacity),
-                  room=dr.opaque(mi.UInt32, capacity), count=dr.zeros(mi.UInt32, 1))
+    store = Store(
+        camera=dr.empty(mi.UInt32, capacity),
+        light=dr.empty(mi.UInt32, capacity),
+        factor=dr.empty(mi.Float, capacity),
+        room=dr.opaque(mi.UInt32, capacity),
+        count=dr.zeros(mi.UInt32, 1),
+    )
     index = dr.arange(mi.UInt32, camera_capacity)
     active = index < dr.gather(mi.UInt32, camera_count, 0)
     z = read_vertices(camera, index, active, LAMBERTIAN)
@@ -95,10 +147,10 @@ def list_pairs(traits, weights, camera, camera_count, camera_capacity: int, ligh
         vertex = dr.gather(mi.UInt32, order, place)
         y = read_vertices(light, vertex, True, LAMBERTIAN)
         keep = mi.Bool(True)
-        if dr.hint(max_depth > 0, mode='scalar'):
+        if dr.hint(max_depth > 0, mode="scalar"):
             keep &= y["depth"] + z["depth"] + 1 <= max_depth
         chance = mi.Float(1)
-        if dr.hint(traits.has_lambertian, mode='scalar'):
+        if dr.hint(traits.has_lambertian, mode="scalar"):
             pair = join(traits, z, y, [], keep)
             worth = channel_mean(pair.value) * weights.connected(pair, z, y)
             simple = (y["density"] >= 0) & (z["density"] >= 0)
@@ -115,27 +167,56 @@ def list_pairs(traits, weights, camera, camera_count, camera_capacity: int, ligh
 
 
 SLIGHT, LEAST_CHANCE = 0.2, 0.2
-"""Camera vertices that are promised less than this share of what the brightest one of their path is are thinned out, at most to that share of them: the
-promise is one of cache points some way off."""
+"""Camera vertices that are promised less than this share of what the brightest one of their path is
+are thinned out, at most to that share of them: the promise is one of cache points some way off."""
 
 
-def list_draws(grid, expected, camera, camera_count, camera_capacity: int, paths: int, states, capacity: int, seed):
-    """The camera vertices (of `paths` sub-paths, with `states`) that are to be joined to light vertices drawn for them.
+def list_draws(
+    grid,
+    expected,
+    camera,
+    camera_count,
+    camera_capacity: int,
+    paths: int,
+    states,
+    capacity: int,
+    seed,
+):
+    """The camera vertices (of `paths` sub-paths, with `states`) that are to be joined to light
+    vertices drawn for them.
 
-    Lambertian ones are thinned out (Russian roulette) by the light that they are promised, next to their path's others: the throughput decides, mostly, and
-    shadows. `expected` (as of `cumulative_sums`): what each cache point of the `CacheGrid` promises. Returns `(places, one over the probability of staying, count)`.
+    Lambertian ones are thinned out (Russian roulette) by the light that they are promised, next to
+    their path's others: the throughput decides, mostly, and shadows. `expected` (as of
+    `cumulative_sums`): what each cache point of the `CacheGrid` promises. Returns `(places, one
+    over the probability of staying, count)`.
     """
     index = lanes(camera_capacity)
     active = index < dr.gather(mi.UInt32, camera_count, 0)
-    z = read_vertices(camera, index, active, ("p", "path", "throughput", "density", "towards", "number", "value", "n"), states)
+    z = read_vertices(
+        camera,
+        index,
+        active,
+        ("p", "path", "throughput", "density", "towards", "number", "value", "n"),
+        states,
+    )
     row = grid.row(z["p"], seen_normal(z))
     simple = active & (z["density"] >= 0)
-    promised = dr.select(simple, channel_mean(z["throughput"] * z["value"]) * grid.mean(expected, row, simple), 0)
-    brightest = dr.zeros(mi.UInt32, paths)                          # as bits: positive numbers have the same order
-    dr.scatter_reduce(dr.ReduceOp.Max, brightest, dr.reinterpret_array(mi.UInt32, promised), z["path"], simple)
+    promised = dr.select(
+        simple, channel_mean(z["throughput"] * z["value"]) * grid.mean(expected, row, simple), 0
+    )
+    brightest = dr.zeros(mi.UInt32, paths)  # as bits: positive numbers have the same order
+    dr.scatter_reduce(
+        dr.ReduceOp.Max, brightest, dr.reinterpret_array(mi.UInt32, promised), z["path"], simple
+    )
     dr.eval(brightest, promised)
-    level = SLIGHT * dr.reinterpret_array(mi.Float, dr.gather(mi.UInt32, brightest, z["path"], simple))
-    chance = dr.select(simple & (promised < level), dr.maximum(promised * dr.rcp(dr.maximum(level, 1e-30)), LEAST_CHANCE), 1)
+    level = SLIGHT * dr.reinterpret_array(
+        mi.Float, dr.gather(mi.UInt32, brightest, z["path"], simple)
+    )
+    chance = dr.select(
+        simple & (promised < level),
+        dr.maximum(promised * dr.rcp(dr.maximum(level, 1e-30)), LEAST_CHANCE),
+        1,
+    )
     keep = active & (vertex_streams(z["path"], z["number"], seed).next_float32() < chance)
     count = dr.zeros(mi.UInt32, 1)
     slot = dr.scatter_inc(count, mi.UInt32(0), keep)
@@ -155,9 +236,11 @@ def visible(scene, connection, camera, active):
 class LensConnection:
     """Light vertices joined to the sensor.
 
-    `value`: flux times importance (spectrum): its sum over light sub-paths, over their number, is the mean radiance of the pixels times their
-    share of the crop window; `film`: position in pixels; `density` [1/m^2]: area density there of camera rays through the crop window;
-    `back`: density per projected solid angle with which a camera path would go on; `active`: visible from the sensor, inside the film.
+    `value`: flux times importance (spectrum): its sum over light sub-paths, over their number, is
+    the mean radiance of the pixels times their share of the crop window; `film`: position in
+    pixels; `density` [1/m^2]: area density there of camera rays through the crop window; `back`:
+    density per projected solid angle with which a camera path would go on; `active`: visible from
+    the sensor, inside the film.
     """
 
     value: mi.Spectrum
@@ -167,7 +250,9 @@ class LensConnection:
     active: mi.Bool
 
 
-def join_sensor(scene, integrator, traits, lens, light, aperture, time, wavelengths, hide_emitters, active):
+def join_sensor(
+    scene, integrator, traits, lens, light, aperture, time, wavelengths, hide_emitters, active
+):
     """The `LensConnection` of light vertices (records as of `read_vertices`)."""
     d, distance, film, density, active = lens.connect(light["p"], time, aperture, active)
     junction = junction_of(traits, light, wavelengths, active)
@@ -180,4 +265,6 @@ def join_sensor(scene, integrator, traits, lens, light, aperture, time, waveleng
     else:
         active &= unblocked(scene, light["p"], light["n"], d, distance, active)
     density = density * leaving
-    return LensConnection(light["throughput"] * value * (density * dr.rcp(landing)), film, density, back, active)
+    return LensConnection(
+        light["throughput"] * value * (density * dr.rcp(landing)), film, density, back, active
+    )

@@ -4,11 +4,13 @@ import drjit as dr
 
 
 def russian_roulette(rng, throughput, strength, eta, begun, active):
-    """The rule of Mitsuba's `path`: the active paths that have `begun` to play go on with probability min(`strength` `eta`^2, 0.95), and their
-    throughput is divided by it. Paths without `strength` end in any case.
+    """The rule of Mitsuba's `path`: the active paths that have `begun` to play go on with
+    probability min(`strength` `eta`^2, 0.95), and their throughput is divided by it. Paths without
+    `strength` end in any case.
 
-    `strength`: how much a path still carries, the largest channel of its throughput, or of its flux over that at the start; `eta`: the product of
-    relative indices of refraction on the way, whose square undoes the compression of radiance; `begun`: usually depth >= `rr_depth`. Advances `rng`
+    `strength`: how much a path still carries, the largest channel of its throughput, or of its flux
+    over that at the start; `eta`: the product of relative indices of refraction on the way, whose
+    square undoes the compression of radiance; `begun`: usually depth >= `rr_depth`. Advances `rng`
     where a path plays. Returns `(throughput, active)`.
     """
     active = active & (strength > 0)

@@ -1,6 +1,8 @@
-"""Sensors seen from the scene: the point of the film that sees a surface point, and how densely camera rays come there.
+"""Sensors seen from the scene: the point of the film that sees a surface point, and how densely
+camera rays come there.
 
-Mitsuba's `sample_direction` knows perspective sensors, with and without a lens, but not orthographic ones, whose rays are all parallel.
+Mitsuba's `sample_direction` knows perspective sensors, with and without a lens, but not
+orthographic ones, whose rays are all parallel.
 """
 
 from __future__ import annotations
@@ -13,11 +15,13 @@ from .camera_pass import behind_emitters
 CONNECTED = ("PerspectiveCamera", "ThinLensCamera", "OrthographicCamera")
 
 SAME_POINT = 1e-4
-"""Relative difference of distances up to which a ray has met the point towards which it was sent."""
+"""Relative difference of distances up to which a ray has met the point towards which it was
+sent."""
 
 
 class Lens:
-    """What joins surface points to a sensor. Attribute `connects`: whether that is possible; other sensors are only met by camera rays."""
+    """What joins surface points to a sensor. Attribute `connects`: whether that is possible; other
+    sensors are only met by camera rays."""
 
     def __init__(self, sensor):
         self.sensor = sensor
@@ -25,18 +29,28 @@ class Lens:
         self.connects = name in CONNECTED
         self.parallel = name == "OrthographicCamera"
         if self.parallel:
-            corners = [sensor.sample_ray(0, 0.5, mi.Point2f(u, v), mi.Point2f(0.5))[0] for u, v in ((0, 0), (1, 0), (0, 1))]
-            self.origin, self.across, self.down = corners[0].o, corners[1].o - corners[0].o, corners[2].o - corners[0].o
+            corners = [
+                sensor.sample_ray(0, 0.5, mi.Point2f(u, v), mi.Point2f(0.5))[0]
+                for u, v in ((0, 0), (1, 0), (0, 1))
+            ]
+            self.origin, self.across, self.down = (
+                corners[0].o,
+                corners[1].o - corners[0].o,
+                corners[2].o - corners[0].o,
+            )
             self.axis, self.reach = corners[0].d, corners[0].maxt
         elif self.connects:
             self.axis = dr.normalize(sensor.world_transform() @ mi.Vector3f(0, 0, 1))
 
     def connect(self, p, time, aperture, active):
-        """Joins points `p` to the point of the lens that `aperture` (uniform in [0, 1]^2, as for `sample_ray`) chooses.
+        """Joins points `p` to the point of the lens that `aperture` (uniform in [0, 1]^2, as for
+        `sample_ray`) chooses.
 
-        Returns `(d, distance, film, density, valid)`: the direction to the sensor and the distance to the near clipping plane along it; the
-        position on the film in pixels, crop offset included; and the density [1/m^2], per area across `d` at `p`, of camera rays
-        through that point of the lens that are spread evenly over the crop window. `valid` is false outside the window and the clipping planes.
+        Returns `(d, distance, film, density, valid)`: the direction to the sensor and the distance
+        to the near clipping plane along it; the position on the film in pixels, crop offset
+        included; and the density [1/m^2], per area across `d` at `p`, of camera rays through that
+        point of the lens that are spread evenly over the crop window. `valid` is false outside the
+        window and the clipping planes.
         """
         film = self.sensor.film()
         offset, size = mi.ScalarVector2f(film.crop_offset()), mi.ScalarVector2f(film.crop_size())
@@ -44,9 +58,21 @@ class Lens:
             to_p = p - self.origin
             distance = dr.dot(to_p, self.axis)
             area = dr.abs(dr.dot(self.axis, dr.cross(self.across, self.down)))
-            u = dr.dot(dr.cross(to_p, self.down), self.axis) / dr.dot(dr.cross(self.across, self.down), self.axis)
-            v = dr.dot(dr.cross(self.across, to_p), self.axis) / dr.dot(dr.cross(self.across, self.down), self.axis)
-            valid = active & (distance > 0) & (distance < self.reach) & (u >= 0) & (u < 1) & (v >= 0) & (v < 1)
+            u = dr.dot(dr.cross(to_p, self.down), self.axis) / dr.dot(
+                dr.cross(self.across, self.down), self.axis
+            )
+            v = dr.dot(dr.cross(self.across, to_p), self.axis) / dr.dot(
+                dr.cross(self.across, self.down), self.axis
+            )
+            valid = (
+                active
+                & (distance > 0)
+                & (distance < self.reach)
+                & (u >= 0)
+                & (u < 1)
+                & (v >= 0)
+                & (v < 1)
+            )
             return -self.axis, distance, mi.Point2f(u, v) * size + offset, dr.rcp(area), valid
         reference = dr.zeros(mi.Interaction3f, dr.width(p))
         reference.p, reference.time = p, time
@@ -63,7 +89,8 @@ class Lens:
 
 
 def unblocked(scene, p, n, d, distance, active):
-    """Whether nothing stands between points `p` (with geometric normals `n`) and those `distance` away in direction `d`."""
+    """Whether nothing stands between points `p` (with geometric normals `n`) and those `distance`
+    away in direction `d`."""
     si = dr.zeros(mi.SurfaceInteraction3f, dr.width(p))
     si.p, si.n = p, mi.Normal3f(n)
     ray = si.spawn_ray_to(p + d * distance)
@@ -71,8 +98,9 @@ def unblocked(scene, p, n, d, distance, active):
 
 
 def unblocked_by_visible(scene, integrator, p, d, distance, active):
-    """The same towards a sensor that does not see emitters' shapes (`hide_emitters`): whether a look from there through all of them ends at the
-    point. It does not where the point lies on such a shape itself."""
+    """The same towards a sensor that does not see emitters' shapes (`hide_emitters`): whether a
+    look from there through all of them ends at the point. It does not where the point lies on such
+    a shape itself."""
     ray = mi.Ray3f(p + d * distance, -d)
     hit = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
     hit, ray = behind_emitters(scene, integrator, hit, ray, active)

@@ -1,21 +1,29 @@
 """Light and camera sub-paths whose smooth vertices are kept, so that they can be joined afterwards.
 
-Vertices of all sub-paths lie in one flat buffer each (`new_vertices`), in no particular order; `parent` leads from a vertex to the one
-before it. Delta scattering leaves no vertex, but counts as a segment; a BSDF with both parts leaves a vertex and its delta part goes on.
+Vertices of all sub-paths lie in one flat buffer each (`new_vertices`), in no particular order;
+`parent` leads from a vertex to the one before it. Delta scattering leaves no vertex, but counts as
+a segment; a BSDF with both parts leaves a vertex and its delta part goes on.
 
-What weights must know of a sub-path travels with it as a state, a list of floats. The object `weights` makes it:
+What weights must know of a sub-path travels with it as a state, a list of floats. The object
+`weights` makes it:
 
     lit(si, source, reachable, active, flux)   state of a light sub-path at its first vertex; `source`: the point of the light, as of `sample_emission`;
-                                               `reachable`: next-event estimation could bring the same light; `flux`: what the path carries
+                                               `reachable`: next-event estimation could bring the
+                                               same light; `flux`: what the path carries
     seen(density, active)                      state of a camera sub-path at its first vertex; `density` [1/m^2]: that of camera rays there (see
-                                               `Lens.connect`), zero where the vertex cannot be joined to the sensor
+                                               `Lens.connect`), zero where the vertex cannot be
+                                               joined to the sensor
     left(state, p_forward, p_back, delta, scattered)   after scattering; densities per projected solid angle with which this side goes on, and the
-                                               other side would go back; `scattered` [1/sr]: BSDF, channel mean
+                                               other side would go back; `scattered` [1/sr]: BSDF,
+                                               channel mean
     arrived(state, density, si, squared, depth)   at the next vertex, made with `density` [1/m^2]; zero where the vertex before scattered by a delta
-                                               function; its interaction, squared distance from the vertex before, and depth
+                                               function; its interaction, squared distance from the
+                                               vertex before, and depth
     met(state, direct, emission, sampled)      weight of emission that a camera path meets beyond the last vertex, sampled there with density `sampled`
-                                               per solid angle (zero: by a delta function), where next-event estimation has density `direct`; `emission`:
-                                               `Lights.emission_ratio`; state: after `left`
+                                               per solid angle (zero: by a delta function), where
+                                               next-event estimation has density `direct`;
+                                               `emission`: `Lights.emission_ratio`; state: after
+                                               `left`
     direct(state, direct, emission, sampled, p_back, delta)   weight of next-event estimation at a vertex; `emission` as an area density at the
                                                vertex, `delta`: a light that cannot be met
 """
@@ -25,44 +33,75 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from .camera_pass import behind_emitters, start_camera_paths, with_gaps, within_crop
-from .vertex import Junction, scattered_mean
-from .sensor import Lens
-from .light_pass import lane_count, scatter_light
 from ..core.packing import Store
 from ..core.random import next_2d, streams
 from ..core.records import Layout
+from .camera_pass import behind_emitters, start_camera_paths, with_gaps, within_crop
+from .light_pass import lane_count, scatter_light
 from .roulette import russian_roulette
+from .sensor import Lens
+from .vertex import Junction, scattered_mean
 
-NO_PARENT = 0xffffffff
+NO_PARENT = 0xFFFFFFFF
 STATES = ("near", "far")
 """What the buffers call the numbers of a state."""
 
 
 def vertex_layout(states=STATES):
-    """Fields of a kept vertex: position `p`, number of the sub-path `path`, `throughput` (light: flux; camera: importance) that arrives, `value` and
-    `density` as of `Junction`, the state of the weights, geometric normal `n`, direction `towards` the vertex before, `depth` in segments,
+    """Fields of a kept vertex: position `p`, number of the sub-path `path`, `throughput` (light:
+    flux; camera: importance) that arrives, `value` and `density` as of `Junction`, the state of the
+    weights, geometric normal `n`, direction `towards` the vertex before, `depth` in segments,
     shading normal `ns`, `number` among the sub-path's kept vertices."""
-    return Layout({"p": mi.Point3f, "path": mi.UInt32, "throughput": mi.Spectrum, "density": mi.Float, "ns": mi.Vector3f, "depth": mi.UInt32,
-                   "towards": mi.Vector3f, "number": mi.UInt32, "value": mi.Spectrum, "n": mi.Vector3f,
-                   **{name: mi.Float for name in states}})
+    return Layout(
+        {
+            "p": mi.Point3f,
+            "path": mi.UInt32,
+            "throughput": mi.Spectrum,
+            "density": mi.Float,
+            "ns": mi.Vector3f,
+            "depth": mi.UInt32,
+            "towards": mi.Vector3f,
+            "number": mi.UInt32,
+            "value": mi.Spectrum,
+            "n": mi.Vector3f,
+            **dict.fromkeys(states, mi.Float),
+        }
+    )
 
 
 def new_vertices(traits, capacity, states=STATES):
-    """Room for `capacity` vertices, a dictionary: `words` (records of `vertex_layout`), `parent` (the place of the vertex before, or `NO_PARENT`),
-    and where surfaces are not all Lambertian `hit`, from which the surface interaction is made again. Only the places below the count are valid."""
-    buffer = {"words": vertex_layout(states).room(capacity), "parent": dr.empty(mi.UInt32, capacity)}
+    """Room for `capacity` vertices, a dictionary: `words` (records of `vertex_layout`), `parent`
+    (the place of the vertex before, or `NO_PARENT`), and where surfaces are not all Lambertian
+    `hit`, from which the surface interaction is made again. Only the places below the count are
+    valid."""
+    buffer = {
+        "words": vertex_layout(states).room(capacity),
+        "parent": dr.empty(mi.UInt32, capacity),
+    }
     if traits.has_rough:
         buffer["hit"] = dr.empty(mi.PreliminaryIntersection3f, capacity)
     return buffer
 
 
-def keep_vertex(store, junction, si, hit, towards, throughput, path, depth, number, parent, state, states, keep):
+def keep_vertex(
+    store, junction, si, hit, towards, throughput, path, depth, number, parent, state, states, keep
+):
     """Writes a vertex into the buffer; returns the place (valid if there was room for it)."""
     slot = dr.scatter_inc(store.count, mi.UInt32(0), keep)
     keep = keep & (slot < store.room)
-    values = {"p": si.p, "n": junction.n, "ns": junction.ns, "towards": towards, "throughput": throughput, "value": junction.value,
-              "density": junction.density, "path": path, "depth": depth, "number": number, **dict(zip(states, state))}
+    values = {
+        "p": si.p,
+        "n": junction.n,
+        "ns": junction.ns,
+        "towards": towards,
+        "throughput": throughput,
+        "value": junction.value,
+        "density": junction.density,
+        "path": path,
+        "depth": depth,
+        "number": number,
+        **dict(zip(states, state)),
+    }
     vertex_layout(states).write(store.vertices["words"], values, slot, keep)
     dr.scatter(store.vertices["parent"], parent, slot, keep)
     if "hit" in store.vertices:
@@ -71,7 +110,8 @@ def keep_vertex(store, junction, si, hit, towards, throughput, path, depth, numb
 
 
 def read_vertices(vertices, index, active, only=None, states=STATES):
-    """The vertices at places `index`, a dictionary of all their fields (or those named in `only`); zero on inactive lanes."""
+    """The vertices at places `index`, a dictionary of all their fields (or those named in `only`);
+    zero on inactive lanes."""
     record = vertex_layout(states).read(vertices["words"], index, active, only)
     for name in ("parent", "hit"):
         if name in vertices and (only is None or name in only):
@@ -80,7 +120,8 @@ def read_vertices(vertices, index, active, only=None, states=STATES):
 
 
 def seen_normal(vertex):
-    """Geometric normal of vertices, as read by `read_vertices`, on the side that their sub-path came from."""
+    """Geometric normal of vertices, as read by `read_vertices`, on the side that their sub-path
+    came from."""
     return dr.mulsign(vertex["n"], dr.dot(vertex["n"], vertex["towards"]))
 
 
@@ -90,7 +131,8 @@ def _either(mask, yes, no):
 
 
 def junction_of(traits, record, wavelengths, active):
-    """The `Junction` of kept vertices, as read by `read_vertices`; without `hit` only where they are Lambertian."""
+    """The `Junction` of kept vertices, as read by `read_vertices`; without `hit` only where they
+    are Lambertian."""
     si = bsdf = None
     if "hit" in record:
         hit, d = record["hit"], -record["towards"]
@@ -103,30 +145,49 @@ def junction_of(traits, record, wavelengths, active):
 
 
 @dr.syntax
-def trace_light_subpaths(scene, lights, traits, weights, seed, n_paths: int, capacity: int, wavelengths, shutter_open: float,
-                         shutter_time: float, max_depth: int, rr_depth: int):
+def trace_light_subpaths(
+    scene,
+    lights,
+    traits,
+    weights,
+    seed,
+    n_paths: int,
+    capacity: int,
+    wavelengths,
+    shutter_open: float,
+    shutter_time: float,
+    max_depth: int,
+    rr_depth: int,
+):
     """Traces `n_paths` light sub-paths.
 
-    Returns `(vertices, count, lengths)`: the kept vertices, how many there were (width one; more than `capacity`: the surplus is missing), and the
-    number of kept vertices of each path. `throughput` is flux through the surface, for one sub-path.
+    Returns `(vertices, count, lengths)`: the kept vertices, how many there were (width one; more
+    than `capacity`: the surplus is missing), and the number of kept vertices of each path.
+    `throughput` is flux through the surface, for one sub-path.
     """
     lanes = lane_count(n_paths)
     lane = dr.arange(mi.UInt32, lanes)
     rng = streams(lane, seed)
     count, stride = dr.opaque(mi.UInt32, n_paths), dr.opaque(mi.UInt32, lanes)
-    store = Store(vertices=new_vertices(traits, capacity, weights.states), room=dr.opaque(mi.UInt32, capacity), count=dr.zeros(mi.UInt32, 1),
-                  lengths=dr.zeros(mi.UInt32, n_paths))
+    store = Store(
+        vertices=new_vertices(traits, capacity, weights.states),
+        room=dr.opaque(mi.UInt32, capacity),
+        count=dr.zeros(mi.UInt32, 1),
+        lengths=dr.zeros(mi.UInt32, n_paths),
+    )
     next_path = mi.UInt32(lane)
     path = mi.UInt32(lane)
     ray = dr.zeros(mi.Ray3f, lanes)
     flux = dr.zeros(mi.Spectrum, lanes)
-    strength = dr.zeros(mi.Float, lanes)                         # for roulette: one over the flux at the start
+    strength = dr.zeros(mi.Float, lanes)  # for roulette: one over the flux at the start
     depth = dr.zeros(mi.UInt32, lanes)
     number = dr.zeros(mi.UInt32, lanes)
     parent = dr.full(mi.UInt32, NO_PARENT, lanes)
     eta = dr.ones(mi.Float, lanes)
     state = weights.blank(lanes)
-    density = dr.zeros(mi.Float, lanes)                          # of the direction, per solid angle; zero after a delta function
+    density = dr.zeros(
+        mi.Float, lanes
+    )  # of the direction, per solid angle; zero after a delta function
     origin = dr.zeros(mi.Point3f, lanes)
     active = dr.full(mi.Bool, False, lanes)
 
@@ -137,7 +198,7 @@ def trace_light_subpaths(scene, lights, traits, weights, seed, n_paths: int, cap
         unreachable = mi.Bool(False)
         if begin:
             time = mi.Float(shutter_open)
-            if dr.hint(shutter_time > 0, mode='scalar'):
+            if dr.hint(shutter_time > 0, mode="scalar"):
                 time += rng.next_float32() * shutter_time
             ray, flux, unreachable, source = lights.sample_emission(rng, time, wavelengths)
             strength = dr.rcp(dr.maximum(dr.max(flux), 1e-38))
@@ -160,43 +221,90 @@ def trace_light_subpaths(scene, lights, traits, weights, seed, n_paths: int, cap
         first = active & begin
         squared = dr.maximum(dr.squared_norm(si.p - origin), 1e-20)
         arrival = density * dr.abs(dr.dot(si.n, towards)) * dr.rcp(squared)
-        state = _either(first, weights.lit(si, source, ~unreachable, first, flux), weights.arrived(state, arrival, si, squared, depth))
+        state = _either(
+            first,
+            weights.lit(si, source, ~unreachable, first, flux),
+            weights.arrived(state, arrival, si, squared, depth),
+        )
         smooth = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
         junction = Junction.at(traits, si, bsdf, smooth)
-        slot = keep_vertex(store, junction, si, hit, towards, flux, path, depth, number, parent, state, weights.states, smooth)
+        slot = keep_vertex(
+            store,
+            junction,
+            si,
+            hit,
+            towards,
+            flux,
+            path,
+            depth,
+            number,
+            parent,
+            state,
+            weights.states,
+            smooth,
+        )
         number = dr.select(smooth, number + 1, number)
         parent = dr.select(smooth, slot, parent)
         dr.scatter(store.lengths, number, path, smooth)
 
         # ---- Go on: a vertex on the next surface needs one more segment, and the sensor one after it
-        if dr.hint(max_depth > 0, mode='scalar'):
+        if dr.hint(max_depth > 0, mode="scalar"):
             active &= depth + 2 <= max_depth
         bs, delta, weight, wo, active = scatter_light(traits, si, bsdf, rng, active)
         value, p_back, p_forward = junction.between(wo, towards, active & ~delta)
-        state = _either(active, weights.left(state, p_forward, p_back, delta, scattered_mean(value, si.n, towards)), state)
+        state = _either(
+            active,
+            weights.left(state, p_forward, p_back, delta, scattered_mean(value, si.n, towards)),
+            state,
+        )
         density = dr.select(delta, 0, p_forward * dr.abs(dr.dot(si.n, wo)))
         origin = mi.Point3f(si.p)
         flux *= weight
         eta *= bs.eta
         ray = si.spawn_ray(wo)
 
-        flux, active = russian_roulette(rng, flux, dr.max(flux) * strength, eta, depth >= rr_depth, active)
+        flux, active = russian_roulette(
+            rng, flux, dr.max(flux) * strength, eta, depth >= rr_depth, active
+        )
 
     return store.vertices, store.count, store.lengths
 
 
 @dr.syntax
-def trace_camera_subpaths(scene, sensor, integrator, lights, traits, weights, seed, first, skip, n_paths: int, camera_paths: int, wavelength_sample,
-                          max_depth: int, rr_depth: int, hide_emitters: bool, capacity: int, ledger=None, shortest: int = 2):
-    """Traces `n_paths` camera paths, numbers `first`, `first + 1`, ... of `film_samples`, but without `skip` of them after each pixel's, with the light
-    that they meet and that next-event estimation finds at each smooth vertex, weighted.
+def trace_camera_subpaths(
+    scene,
+    sensor,
+    integrator,
+    lights,
+    traits,
+    weights,
+    seed,
+    first,
+    skip,
+    n_paths: int,
+    camera_paths: int,
+    wavelength_sample,
+    max_depth: int,
+    rr_depth: int,
+    hide_emitters: bool,
+    capacity: int,
+    ledger=None,
+    shortest: int = 2,
+):
+    """Traces `n_paths` camera paths, numbers `first`, `first + 1`, ... of `film_samples`, but
+    without `skip` of them after each pixel's, with the light that they meet and that next-event
+    estimation finds at each smooth vertex, weighted.
 
-    Returns `(radiance, alpha, splat position, vertices, count)`: the kept vertices are those that a light sub-path, of at least `shortest` segments
-    with what joins the two, may be joined with; `count` as in `trace_light_subpaths`. `ledger`, if given, learns every contribution:
-    `met(path, depth, value, share, mask)` and `direct(...)`, with the length of the joint path in segments, and the weight apart.
+    Returns `(radiance, alpha, splat position, vertices, count)`: the kept vertices are those that a
+    light sub-path, of at least `shortest` segments with what joins the two, may be joined with;
+    `count` as in `trace_light_subpaths`. `ledger`, if given, learns every contribution: `met(path,
+    depth, value, share, mask)` and `direct(...)`, with the length of the joint path in segments,
+    and the weight apart.
     """
     first = with_gaps(first, skip, n_paths, camera_paths)
-    path, active, rng, ray, sensor_weight, splat, aperture = start_camera_paths(sensor, seed, first, 1, n_paths, camera_paths, wavelength_sample)
+    path, active, rng, ray, sensor_weight, splat, aperture = start_camera_paths(
+        sensor, seed, first, 1, n_paths, camera_paths, wavelength_sample
+    )
     lens = Lens(sensor)
     inside = within_crop(sensor.film(), splat)
     throughput = mi.Spectrum(sensor_weight)
@@ -206,16 +314,22 @@ def trace_camera_subpaths(scene, sensor, integrator, lights, traits, weights, se
     parent = mi.UInt32(NO_PARENT)
     eta = mi.Float(1)
     state = weights.blank(n_paths)
-    density = mi.Float(0)                            # with which the direction was sampled, per solid angle; zero after a delta function
-    origin = dr.zeros(mi.Interaction3f)              # the last vertex, of whichever kind
+    density = mi.Float(
+        0
+    )  # with which the direction was sampled, per solid angle; zero after a delta function
+    origin = dr.zeros(mi.Interaction3f)  # the last vertex, of whichever kind
     context = mi.BSDFContext()
-    store = Store(vertices=new_vertices(traits, capacity, weights.states), room=dr.opaque(mi.UInt32, capacity), count=dr.zeros(mi.UInt32, 1))
+    store = Store(
+        vertices=new_vertices(traits, capacity, weights.states),
+        room=dr.opaque(mi.UInt32, capacity),
+        count=dr.zeros(mi.UInt32, 1),
+    )
     visible = mi.Bool((scene.environment() is not None) and not hide_emitters)
-    if dr.hint(max_depth == 0, mode='scalar'):
+    if dr.hint(max_depth == 0, mode="scalar"):
         active &= False
 
     hit = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
-    if dr.hint(hide_emitters, mode='scalar'):
+    if dr.hint(hide_emitters, mode="scalar"):
         hit, ray = behind_emitters(scene, integrator, hit, ray, active)
 
     while dr.hint(active, label="camera sub-paths"):
@@ -224,23 +338,28 @@ def trace_camera_subpaths(scene, sensor, integrator, lights, traits, weights, se
         towards = -ray.d
 
         # ---- Emission met by the path
-        if dr.hint(traits.has_light_surfaces, mode='scalar'):
+        if dr.hint(traits.has_light_surfaces, mode="scalar"):
             ds = mi.DirectionSample3f(scene, si, origin)
             shown = active & (ds.emitter != None)  # noqa: E711 (array comparison)
-            if dr.hint(hide_emitters, mode='scalar'):
-                shown &= visible                     # what is behind nothing but null surfaces is hidden, too
+            if dr.hint(hide_emitters, mode="scalar"):
+                shown &= visible  # what is behind nothing but null surfaces is hidden, too
             later = shown & (depth > 1)
-            share = weights.met(state, lights.pdf_direct(origin, ds, later), lights.emission_ratio(origin, ds, later), density)
+            share = weights.met(
+                state,
+                lights.pdf_direct(origin, ds, later),
+                lights.emission_ratio(origin, ds, later),
+                density,
+            )
             share = dr.select(later, share, 1)
             light = throughput * ds.emitter.eval(si, shown)
             radiance[shown] += light * share
-            if dr.hint(ledger is not None, mode='scalar'):
+            if dr.hint(ledger is not None, mode="scalar"):
                 ledger.met(path, depth, light, share, shown)
 
         active &= si.is_valid()
-        met = mi.Bool(active)                        # a surface, perhaps the last one
+        met = mi.Bool(active)  # a surface, perhaps the last one
         bsdf = si.bsdf(ray)
-        if dr.hint(max_depth > 0, mode='scalar'):
+        if dr.hint(max_depth > 0, mode="scalar"):
             active &= depth < max_depth
         smooth = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
 
@@ -248,31 +367,56 @@ def trace_camera_subpaths(scene, sensor, integrator, lights, traits, weights, se
         cosine = dr.abs(dr.dot(si.n, towards))
         begin = active & (depth == 1)
         of_rays = mi.Float(0)
-        if dr.hint(lens.connects, mode='scalar'):
+        if dr.hint(lens.connects, mode="scalar"):
             of_rays = cosine * lens.density(si.p, si.time, aperture, begin & inside)
         squared = dr.maximum(dr.squared_norm(si.p - origin.p), 1e-20)
         arrival = density * cosine * dr.rcp(squared)
-        state = _either(begin, weights.seen(of_rays, begin), weights.arrived(state, arrival, si, squared, depth))
+        state = _either(
+            begin, weights.seen(of_rays, begin), weights.arrived(state, arrival, si, squared, depth)
+        )
         junction = Junction.at(traits, si, bsdf, smooth)
 
         # ---- Direct light
-        if dr.hint(not lights.dark, mode='scalar'):
+        if dr.hint(not lights.dark, mode="scalar"):
             ds, light, light_pdf = lights.sample_direct(si, rng, smooth)
             reached = smooth & (dr.max(light) > 0)
-            direction = dr.select(reached, ds.d, mi.Vector3f(0, 0, 1))             # elsewhere it may not even be a number
+            direction = dr.select(
+                reached, ds.d, mi.Vector3f(0, 0, 1)
+            )  # elsewhere it may not even be a number
             response, p_camera, p_light = junction.between(towards, direction, reached)
             facing = dr.abs(dr.dot(si.n, direction))
-            share = weights.direct(state, light_pdf, facing * lights.emission_ratio(si, ds, reached), p_camera * facing, p_light, ds.delta)
+            share = weights.direct(
+                state,
+                light_pdf,
+                facing * lights.emission_ratio(si, ds, reached),
+                p_camera * facing,
+                p_light,
+                ds.delta,
+            )
             light = throughput * response * light
             radiance[reached] += light * share
-            if dr.hint(ledger is not None, mode='scalar'):
+            if dr.hint(ledger is not None, mode="scalar"):
                 ledger.direct(path, depth + 1, light, share, reached)
 
         # ---- Keep the vertex
         wanted = smooth & (dr.max(throughput) > 0)
-        if dr.hint(max_depth > 0, mode='scalar'):
+        if dr.hint(max_depth > 0, mode="scalar"):
             wanted &= depth + shortest <= max_depth
-        slot = keep_vertex(store, junction, si, hit, towards, throughput, path, depth, number, parent, state, weights.states, wanted)
+        slot = keep_vertex(
+            store,
+            junction,
+            si,
+            hit,
+            towards,
+            throughput,
+            path,
+            depth,
+            number,
+            parent,
+            state,
+            weights.states,
+            wanted,
+        )
         number = dr.select(wanted, number + 1, number)
         parent = dr.select(wanted, slot, parent)
 
@@ -282,13 +426,25 @@ def trace_camera_subpaths(scene, sensor, integrator, lights, traits, weights, se
         visible |= met & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
         wo = si.to_world(bs.wo)
         value, p_forward, p_back = junction.between(towards, wo, active & ~delta)
-        state = _either(active, weights.left(state, p_forward, p_back, delta, scattered_mean(value, si.n, wo)), state)
+        state = _either(
+            active,
+            weights.left(state, p_forward, p_back, delta, scattered_mean(value, si.n, wo)),
+            state,
+        )
         density = dr.select(delta, 0, p_forward * dr.abs(dr.dot(si.n, wo)))
         origin = mi.Interaction3f(si)
         throughput *= weight
         eta *= bs.eta
         ray = si.spawn_ray(wo)
-        throughput, active = russian_roulette(rng, throughput, dr.max(throughput), eta, depth >= rr_depth, active)
+        throughput, active = russian_roulette(
+            rng, throughput, dr.max(throughput), eta, depth >= rr_depth, active
+        )
         hit = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
 
-    return radiance, dr.select(visible, mi.Float(1), mi.Float(0)), splat, store.vertices, store.count
+    return (
+        radiance,
+        dr.select(visible, mi.Float(1), mi.Float(0)),
+        splat,
+        store.vertices,
+        store.count,
+    )

@@ -1,8 +1,9 @@
 """How much surface a merge disk really covers.
 
-Near a wall, or where a floor ends, part of the disk around a vertex holds no surface on which photons could land, and
-density estimation over the whole disk comes out dark: a bias that falls only in proportion to the radius, while that of curvature
-falls with its square. A few short probe rays estimate the covered share of the disk, by which the estimate is divided.
+Near a wall, or where a floor ends, part of the disk around a vertex holds no surface on which
+photons could land, and density estimation over the whole disk comes out dark: a bias that falls
+only in proportion to the radius, while that of curvature falls with its square. A few short probe
+rays estimate the covered share of the disk, by which the estimate is divided.
 """
 
 from __future__ import annotations
@@ -10,26 +11,27 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from .gather import SAME_SURFACE_COSINE, SAME_SURFACE_OFFSET
 from ..core.random import vertex_streams
+from .gather import SAME_SURFACE_COSINE, SAME_SURFACE_OFFSET
 
 PROBES = 8
 OUTER = PROBES // 2
-"""Probes of the outer half of the disk, which are made first, a quarter turn apart: where they all find surface there is no edge, and the others are
-not made."""
+"""Probes of the outer half of the disk, which are made first, a quarter turn apart: where they all
+find surface there is no edge, and the others are not made."""
 HEIGHT = 0.25
 """Probes start this share of the radius above the vertex, or halfway to what is closer."""
 SMALLEST_SHARE = 0.4
-"""Right at a wall half of the disk is left. Smaller estimates come from clutter that the probes meet as often as from corners,
-and would brighten more than they mend."""
-OWN_STREAM = 0x70726f62
+"""Right at a wall half of the disk is left. Smaller estimates come from clutter that the probes
+meet as often as from corners, and would brighten more than they mend."""
+OWN_STREAM = 0x70726F62
 """Keeps the probes' random numbers apart from those of the camera paths, which share their seed."""
 
 
 @dr.syntax
 def covered_share(scene, vertices, radius, seed, active):
-    """Estimated share, in [0.4, 1], of the disk of `radius` around each vertex that lies on surface seen from just above the
-    vertex and like its own (same tests as for photons). `vertices` as in `new_vertex_buffer`; width as theirs."""
+    """Estimated share, in [0.4, 1], of the disk of `radius` around each vertex that lies on surface
+    seen from just above the vertex and like its own (same tests as for photons). `vertices` as in
+    `new_vertex_buffer`; width as theirs."""
     ray = mi.Ray3f(vertices["ray_o"], vertices["ray_d"])
     si = vertices["hit"].compute_surface_interaction(ray, mi.RayFlags.Minimal, active)
     normal = mi.Vector3f(dr.mulsign(si.n, -dr.dot(si.n, ray.d)))
@@ -38,19 +40,31 @@ def covered_share(scene, vertices, radius, seed, active):
     turn, shift = rng.next_float32() * dr.two_pi, rng.next_float32()
     above = mi.Ray3f(si.spawn_ray(normal))
     above.maxt = 2 * HEIGHT * radius
-    height = 0.5 * dr.minimum(scene.ray_intersect_preliminary(above, coherent=False, active=active).t, above.maxt)
+    height = 0.5 * dr.minimum(
+        scene.ray_intersect_preliminary(above, coherent=False, active=active).t, above.maxt
+    )
     start = si.p + normal * height
     covered, probe = mi.UInt32(0), mi.UInt32(0)
     while dr.hint(active & (probe < PROBES), label="coverage probes"):
         distance = radius * dr.sqrt((mi.Float(PROBES - 1 - probe) + shift) * (1 / PROBES))
-        sine, cosine = dr.sincos(turn + dr.two_pi / OUTER * (mi.Float(probe) + dr.select(probe < OUTER, 0, 0.5)))
+        sine, cosine = dr.sincos(
+            turn + dr.two_pi / OUTER * (mi.Float(probe) + dr.select(probe < OUTER, 0, 0.5))
+        )
         towards = distance * (cosine * frame.s + sine * frame.t) - height * normal
-        hit = scene.ray_intersect(mi.Ray3f(start, dr.normalize(towards)), mi.RayFlags.Minimal, coherent=False, reorder=False,
-                                  active=active)
+        hit = scene.ray_intersect(
+            mi.Ray3f(start, dr.normalize(towards)),
+            mi.RayFlags.Minimal,
+            coherent=False,
+            reorder=False,
+            active=active,
+        )
         offset = hit.p - si.p
-        same = hit.is_valid() & (dr.dot(hit.n, si.n) > SAME_SURFACE_COSINE) & \
-            (dr.abs(dr.dot(offset, normal)) < SAME_SURFACE_OFFSET * radius) & \
-            (dr.squared_norm(offset) < dr.square(1.3 * radius))
+        same = (
+            hit.is_valid()
+            & (dr.dot(hit.n, si.n) > SAME_SURFACE_COSINE)
+            & (dr.abs(dr.dot(offset, normal)) < SAME_SURFACE_OFFSET * radius)
+            & (dr.squared_norm(offset) < dr.square(1.3 * radius))
+        )
         covered += dr.select(same, 1, 0)
         probe += 1
         if (probe == OUTER) & (covered == OUTER):

@@ -5,11 +5,11 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from ..paths.camera_pass import LAST_VERTEX
 from ..core.packing import unpack_depth, unpack_direction, unpack_normal
-from .grid import for_each_photon, read_power
 from ..core.spectra import channel_mean
 from ..core.traits import lookup
+from ..paths.camera_pass import LAST_VERTEX
+from .grid import for_each_photon, read_power
 
 SAME_SURFACE_COSINE = 0.7
 """Photons merge only with vertices whose geometric normals differ by less than 45 degrees."""
@@ -17,22 +17,35 @@ SAME_SURFACE_OFFSET = 0.5
 """... and that lie closer than this share of the radius along the normal (steps, thin objects)."""
 SAME_PLANE_COSINE_SQUARED = 0.9999
 LARGEST_COSINE_RATIO = 4.0
-"""Bound on shading over geometric cosine of a photon's direction, which grazing light on smoothed meshes would exceed."""
+"""Bound on shading over geometric cosine of a photon's direction, which grazing light on smoothed
+meshes would exceed."""
 
 
-def gather_photons(traits, photon_map, vertices, radii, wavelengths, light_paths, max_depth: int, only_last: bool,
-                   grey: bool = False, weigh=None):
-    """Radiance that the photons of `photon_map` bring to the camera paths of `vertices`, for each radius of the list `radii`
-    (ascending; each of width one, or one a vertex), from one visit of the photons within the largest.
+def gather_photons(
+    traits,
+    photon_map,
+    vertices,
+    radii,
+    wavelengths,
+    light_paths,
+    max_depth: int,
+    only_last: bool,
+    grey: bool = False,
+    weigh=None,
+):
+    """Radiance that the photons of `photon_map` bring to the camera paths of `vertices`, for each
+    radius of the list `radii` (ascending; each of width one, or one a vertex), from one visit of
+    the photons within the largest.
 
-    Constant kernel on a disk: the sum over photons of f x flux, over (pi radius^2 x light sub-paths). Flux through the surface
-    carries the geometric cosine where the photon landed, `path`'s scattering integral the shading one at the vertex, hence the
-    ratio of the two.
-    `weigh(index, f, p, back, active)`, if given, is the weight (a spectrum) of photon `index` of the map where the vertex scatters it with value f (a
-    spectrum, without cosine) and a camera path would go there with density p per projected solid angle; `back()` computes the density with
-    which a light sub-path would go on from there to the vertex before.
-    Returns a list with a `Spectrum` of the vertices' width for each radius, throughput included; with `grey` the mean over its
-    channels (fewer sums to keep for many radii).
+    Constant kernel on a disk: the sum over photons of f x flux, over (pi radius^2 x light
+    sub-paths). Flux through the surface carries the geometric cosine where the photon landed,
+    `path`'s scattering integral the shading one at the vertex, hence the ratio of the two.
+    `weigh(index, f, p, back, active)`, if given, is the weight (a spectrum) of photon `index` of
+    the map where the vertex scatters it with value f (a spectrum, without cosine) and a camera path
+    would go there with density p per projected solid angle; `back()` computes the density with
+    which a light sub-path would go on from there to the vertex before. Returns a list with a
+    `Spectrum` of the vertices' width for each radius, throughput included; with `grey` the mean
+    over its channels (fewer sums to keep for many radii).
     """
     ray = mi.Ray3f(vertices["ray_o"], vertices["ray_d"], 0, wavelengths)
     throughput, depth = vertices["throughput"], vertices["depth"]
@@ -62,18 +75,22 @@ def gather_photons(traits, photon_map, vertices, radii, wavelengths, light_paths
     def visit(index, record, offset, distance_squared, hit, totals):
         normal = unpack_normal(record.w)
         alike = dr.dot(normal, si.n)
-        hit &= (alike > 0) & (dr.square(alike) > SAME_SURFACE_COSINE ** 2 * dr.squared_norm(normal))
+        hit &= (alike > 0) & (dr.square(alike) > SAME_SURFACE_COSINE**2 * dr.squared_norm(normal))
         if max_depth > 0:
             hit &= unpack_depth(record.w) + depth <= max_depth
         flux, packed = read_power(photon_map.power, index, hit)
         towards = unpack_direction(packed)
         if traits.has_rough:
             towards = dr.normalize(towards)
-        wo = si.to_local(towards)                         # a Lambertian needs only the ratio of its cosines
+        wo = si.to_local(towards)  # a Lambertian needs only the ratio of its cosines
         cosine = dr.dot(si.n, towards)
         length_squared = dr.squared_norm(normal)
-        flat = dr.square(alike) > SAME_PLANE_COSINE_SQUARED * length_squared       # then without the stored normal's rounding
-        landing = dr.select(flat, dr.abs(cosine), dr.abs(dr.dot(normal, towards)) * dr.rsqrt(length_squared))
+        flat = (
+            dr.square(alike) > SAME_PLANE_COSINE_SQUARED * length_squared
+        )  # then without the stored normal's rounding
+        landing = dr.select(
+            flat, dr.abs(cosine), dr.abs(dr.dot(normal, towards)) * dr.rsqrt(length_squared)
+        )
         landing = dr.maximum(dr.maximum(landing, dr.abs(wo.z) * (1 / LARGEST_COSINE_RATIO)), 1e-6)
         value = mi.Spectrum(0)
         if traits.has_lambertian:
@@ -87,29 +104,52 @@ def gather_photons(traits, photon_map, vertices, radii, wavelengths, light_paths
                 rough, pdf = bsdf.eval_pdf(context, si, wo, hit & ~lambertian)
                 scale = dr.rcp(dr.maximum(dr.abs(wo.z), 1e-6))
                 value = dr.select(lambertian, value, rough)
-                f, p = dr.select(lambertian, lambert_f, rough * scale), dr.select(lambertian, lambert_p, pdf * scale)
+                f, p = (
+                    dr.select(lambertian, lambert_f, rough * scale),
+                    dr.select(lambertian, lambert_p, pdf * scale),
+                )
 
             def back():
                 if not traits.has_rough:
                     return lambert_p
                 view = mi.SurfaceInteraction3f(si)
                 view.wi = mi.Vector3f(wo)
-                pdf = bsdf.pdf(mi.BSDFContext(mi.TransportMode.Importance), view, si.wi, hit & ~lambertian)
-                return dr.select(lambertian, lambert_p, pdf * dr.rcp(dr.maximum(dr.abs(facing), 1e-6)))
+                pdf = bsdf.pdf(
+                    mi.BSDFContext(mi.TransportMode.Importance), view, si.wi, hit & ~lambertian
+                )
+                return dr.select(
+                    lambertian, lambert_p, pdf * dr.rcp(dr.maximum(dr.abs(facing), 1e-6))
+                )
 
             value *= dr.select(dr.max(value) > 0, weigh(index, f, p, back, hit), 0)
         value *= flux * dr.rcp(landing)
         if grey:
             value = channel_mean(value * factor)
         height = dr.abs(dr.dot(offset, si.n))
-        return tuple(total + dr.select(hit & (distance_squared < dr.square(radius)) & (height < SAME_SURFACE_OFFSET * radius),
-                                       value, 0)
-                     for total, radius in zip(totals, radii))
+        return tuple(
+            total
+            + dr.select(
+                hit
+                & (distance_squared < dr.square(radius))
+                & (height < SAME_SURFACE_OFFSET * radius),
+                value,
+                0,
+            )
+            for total, radius in zip(totals, radii)
+        )
 
     zero = mi.Float(0) if grey else mi.Spectrum(0)
-    totals = for_each_photon(photon_map, si.p, radii[-1], active, visit, tuple(type(zero)(zero) for _ in radii))
-    return [dr.select(active, (total if grey else total * factor) / (dr.pi * dr.square(radius) * light_paths), 0)
-            for total, radius in zip(totals, radii)]
+    totals = for_each_photon(
+        photon_map, si.p, radii[-1], active, visit, tuple(type(zero)(zero) for _ in radii)
+    )
+    return [
+        dr.select(
+            active,
+            (total if grey else total * factor) / (dr.pi * dr.square(radius) * light_paths),
+            0,
+        )
+        for total, radius in zip(totals, radii)
+    ]
 
 
 def vertex_section(vertices, first, count: int):
@@ -119,11 +159,19 @@ def vertex_section(vertices, first, count: int):
 
 
 def mean_photon_count(photon_map, vertices, radius):
-    """Photons within `radius` of a vertex, on average over the used vertices (a number; what a gather costs)."""
+    """Photons within `radius` of a vertex, on average over the used vertices (a number; what a
+    gather costs)."""
     active = dr.max(vertices["throughput"]) > 0
     p = vertices["ray_o"] + vertices["ray_d"] * vertices["hit"].t
-    (count,) = for_each_photon(photon_map, p, radius, active,
-                               lambda index, record, offset, distance_squared, hit, counts:
-                               (counts[0] + dr.select(hit, mi.UInt32(1), 0),), (mi.UInt32(0),))
+    (count,) = for_each_photon(
+        photon_map,
+        p,
+        radius,
+        active,
+        lambda index, record, offset, distance_squared, hit, counts: (
+            counts[0] + dr.select(hit, mi.UInt32(1), 0),
+        ),
+        (mi.UInt32(0),),
+    )
     used = int(dr.count(active)[0])
     return float(dr.sum(mi.Float(count))[0]) / used if used else 0.0

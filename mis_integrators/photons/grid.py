@@ -1,8 +1,10 @@
-"""The photon map: photons sorted by the cells of a spatial grid, and the query that visits those within a radius.
+"""The photon map: photons sorted by the cells of a spatial grid, and the query that visits those
+within a radius.
 
-Cells are numbered along x, then y, then z, modulo the size of a table: small grids fit it, larger ones wrap around. The cells of one
-row (equal y and z) are neighbours in memory, so a query reads one contiguous range of photons a row. Rows that share their place
-with others are told apart by the photons' own positions, so that no photon is visited twice.
+Cells are numbered along x, then y, then z, modulo the size of a table: small grids fit it, larger
+ones wrap around. The cells of one row (equal y and z) are neighbours in memory, so a query reads
+one contiguous range of photons a row. Rows that share their place with others are told apart by the
+photons' own positions, so that no photon is visited twice.
 """
 
 from __future__ import annotations
@@ -10,8 +12,8 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from ..paths.light_pass import photon_words
 from ..core.packing import bits_float, unpack_caustic
+from ..paths.light_pass import photon_words
 
 RUN = 32
 """Photons of a row that a query tests at once: one bit of a word each."""
@@ -20,12 +22,14 @@ KEPT_RUNS = 4
 
 
 def table_size(capacity):
-    """Table entries (a power of two) for `capacity` photons: two or more each, so that small grids fit."""
+    """Table entries (a power of two) for `capacity` photons: two or more each, so that small grids
+    fit."""
     return 1 << max(10, min(24, (2 * max(capacity, 2) - 1).bit_length()))
 
 
 def longest_row(size):
-    """Cells that a row may have: the table goes on for as many entries, so that no row wraps around within itself."""
+    """Cells that a row may have: the table goes on for as many entries, so that no row wraps around
+    within itself."""
     return size // 4
 
 
@@ -38,7 +42,8 @@ def smallest_cell(bbox, capacity):
 class Grid:
     """Cells of edge `cell` (width one) over a bounding box, with two cells of margin.
 
-    Odd numbers of columns and rows keep layers apart when numbers wrap around a table whose size is a power of two.
+    Odd numbers of columns and rows keep layers apart when numbers wrap around a table whose size is
+    a power of two.
     """
 
     def __init__(self, bbox, cell, size):
@@ -52,7 +57,8 @@ class Grid:
         return mi.Vector3i(dr.floor((p - self.origin) / self.cell)) + 2
 
     def row_number(self, y, z):
-        """A number that tells row (y, z) from all others of the box, and rows near one another in any."""
+        """A number that tells row (y, z) from all others of the box, and rows near one another in
+        any."""
         return mi.UInt32(z) * self.lines + mi.UInt32(y)
 
     def row(self, y, z):
@@ -61,16 +67,26 @@ class Grid:
 
 
 class PhotonMap:
-    """Sorted photons: a `grid`, `start` (first photon of each table entry), `surface` and `power` as in `trace_light_paths`. Its `notes` stay
-    where light sub-paths left them, for few of them are ever read: `place` tells of each sorted photon where."""
+    """Sorted photons: a `grid`, `start` (first photon of each table entry), `surface` and `power`
+    as in `trace_light_paths`. Its `notes` stay where light sub-paths left them, for few of them are
+    ever read: `place` tells of each sorted photon where."""
 
     def __init__(self, grid, start, surface, power, notes=None, place=None):
-        self.grid, self.start, self.surface, self.power, self.notes, self.place = grid, start, surface, power, notes, place
+        self.grid, self.start, self.surface, self.power, self.notes, self.place = (
+            grid,
+            start,
+            surface,
+            power,
+            notes,
+            place,
+        )
 
     def arrays(self):
         """What a recorded function can take; `with_grid` makes the map of it again."""
         arrays = {"start": self.start, "surface": self.surface, "power": self.power}
-        return arrays if self.notes is None else {**arrays, "notes": self.notes, "place": self.place}
+        return (
+            arrays if self.notes is None else {**arrays, "notes": self.notes, "place": self.place}
+        )
 
     def place_of_notes(self, index, active):
         """Where among the `notes` those of photon `index` are."""
@@ -85,8 +101,8 @@ class PhotonMap:
 def build_photon_map(surface, power, count, bbox, cell, capacity: int, kind: str, notes=None):
     """Sorts photons into a grid of cells of edge `cell` (width one) over `bbox`.
 
-    `kind`: "all", "caustic" or "indirect" selects the photons; `notes` (None: there are none) stay unsorted. Three passes over the
-    photons: count, prefix sum, scatter.
+    `kind`: "all", "caustic" or "indirect" selects the photons; `notes` (None: there are none) stay
+    unsorted. Three passes over the photons: count, prefix sum, scatter.
     """
     size = table_size(capacity)
     grid = Grid(bbox, cell, size)
@@ -97,7 +113,9 @@ def build_photon_map(surface, power, count, bbox, cell, capacity: int, kind: str
         active &= unpack_caustic(record.w) == (kind == "caustic")
     p = mi.Point3f(bits_float(record.x), bits_float(record.y), bits_float(record.z))
     coordinates = grid.coordinates(p)
-    slot = grid.row(coordinates.y, coordinates.z) + dr.minimum(mi.UInt32(coordinates.x), longest_row(size) - 4)
+    slot = grid.row(coordinates.y, coordinates.z) + dr.minimum(
+        mi.UInt32(coordinates.x), longest_row(size) - 4
+    )
     counts = dr.zeros(mi.UInt32, size + longest_row(size))
     rank = dr.scatter_inc(counts, slot, active)
     dr.eval(counts, rank, slot)
@@ -117,44 +135,62 @@ def build_photon_map(surface, power, count, bbox, cell, capacity: int, kind: str
 
 
 def _moved(source, words, capacity, index, target, active):
-    """Records of `words` words (2, or a multiple of 4) copied from places `index` to places `target`."""
+    """Records of `words` words (2, or a multiple of 4) copied from places `index` to places
+    `target`."""
     result = dr.empty(mi.UInt32, words * capacity)
     packet = mi.Vector2u if words == 2 else mi.Vector4u
     parts = max(words // 4, 1)
     for part in range(parts):
-        dr.scatter(result, dr.gather(packet, source, parts * index + part, active), parts * target + part, active)
+        dr.scatter(
+            result,
+            dr.gather(packet, source, parts * index + part, active),
+            parts * target + part,
+            active,
+        )
     return result
 
 
 def read_power(power, index, active):
-    """Flux (a `Spectrum`, for one light sub-path) and packed direction of the photons `index` of an array of power records."""
+    """Flux (a `Spectrum`, for one light sub-path) and packed direction of the photons `index` of an
+    array of power records."""
     words = photon_words()
     if words == 2:
         record = dr.gather(mi.Vector2u, power, index, active)
         return mi.Spectrum(bits_float(record.x)), record.y
     if words == 4:
         record = dr.gather(mi.Vector4u, power, index, active)
-        return mi.Spectrum(bits_float(record.x), bits_float(record.y), bits_float(record.z)), record.w
+        return mi.Spectrum(
+            bits_float(record.x), bits_float(record.y), bits_float(record.z)
+        ), record.w
     record = dr.gather(mi.Vector4u, power, 2 * index, active)
     direction = dr.gather(mi.UInt32, power, 8 * index + 4, active)
     return mi.Spectrum(*[bits_float(record[i]) for i in range(4)]), direction
 
 
 def for_each_photon(photon_map, p, radius, active, visit, state):
-    """Calls `visit(index, record, offset, distance_squared, hit, state) -> state` for photons within `radius` of `p`.
+    """Calls `visit(index, record, offset, distance_squared, hit, state) -> state` for photons
+    within `radius` of `p`.
 
-    Lanes of a CPU's SIMD unit wait for one another in every loop, and two photons in three of the cells around `p` miss, so what is dear to do with
-    a hit must not go in step with the misses. Row by row of cells, runs of up to `RUN` photons are tested for distance only; the hits of a run
-    are kept as a word of bits. Once a lane keeps `KEPT_RUNS` runs with hits, or has seen all rows, the hits of all of these are visited.
-    `hit` marks the lanes whose photon belongs to the row that has been read (another one may share its place); `record` holds the photon's
-    surface words, `offset` is its position minus `p`. `state` is a tuple of Dr.Jit arrays.
+    Lanes of a CPU's SIMD unit wait for one another in every loop, and two photons in three of the
+    cells around `p` miss, so what is dear to do with a hit must not go in step with the misses. Row
+    by row of cells, runs of up to `RUN` photons are tested for distance only; the hits of a run are
+    kept as a word of bits. Once a lane keeps `KEPT_RUNS` runs with hits, or has seen all rows, the
+    hits of all of these are visited. `hit` marks the lanes whose photon belongs to the row that has
+    been read (another one may share its place); `record` holds the photon's surface words, `offset`
+    is its position minus `p`. `state` is a tuple of Dr.Jit arrays.
     """
     grid = photon_map.grid
     inverse = dr.rcp(grid.cell)
     local = (p - grid.origin) * inverse
     reach = radius * inverse * 1.0001
-    first_y, last_y = mi.Int32(dr.floor(local.y - reach)) + 2, mi.Int32(dr.floor(local.y + reach)) + 2
-    first_z, last_z = mi.Int32(dr.floor(local.z - reach)) + 2, mi.Int32(dr.floor(local.z + reach)) + 2
+    first_y, last_y = (
+        mi.Int32(dr.floor(local.y - reach)) + 2,
+        mi.Int32(dr.floor(local.y + reach)) + 2,
+    )
+    first_z, last_z = (
+        mi.Int32(dr.floor(local.z - reach)) + 2,
+        mi.Int32(dr.floor(local.z + reach)) + 2,
+    )
     last_z = dr.select(active, last_z, first_z - 1)
     radius_squared = dr.square(radius)
 
@@ -165,15 +201,23 @@ def for_each_photon(photon_map, p, radius, active, visit, state):
 
     def test(index, bit, hits):
         _, _, offset = read(index)
-        return index + 1, bit << 1, hits | dr.select(dr.squared_norm(offset) < radius_squared, bit, 0)
+        return (
+            index + 1,
+            bit << 1,
+            hits | dr.select(dr.squared_norm(offset) < radius_squared, bit, 0),
+        )
 
     def search(y, z, start, end, runs):
         first, last = _photons_of_row(photon_map, y, z, local, reach)
-        on = start < end                                      # still in a row that is longer than a run
+        on = start < end  # still in a row that is longer than a run
         start, end = dr.select(on, start, first), dr.select(on, end, last)
         until = dr.minimum(start + RUN, end)
-        *_, hits = dr.while_loop((mi.UInt32(start), mi.UInt32(1), mi.UInt32(0)), lambda index, bit, hits: index < until, test,
-                                 label="photons tested")
+        *_, hits = dr.while_loop(
+            (mi.UInt32(start), mi.UInt32(1), mi.UInt32(0)),
+            lambda index, bit, hits: index < until,
+            test,
+            label="photons tested",
+        )
         runs = _chosen(hits != 0, [(start, hits, grid.row_number(y, z)), *runs[:-1]], runs)
         done, wrap = until >= end, y >= last_y
         y, z = dr.select(done, dr.select(wrap, first_y, y + 1), y), dr.select(done & wrap, z + 1, z)
@@ -184,15 +228,28 @@ def for_each_photon(photon_map, p, radius, active, visit, state):
         index = start + dr.tzcnt(hits)
         record, position, offset = read(index)
         own = grid.coordinates(position)
-        state = visit(index, record, offset, dr.squared_norm(offset), grid.row_number(own.y, own.z) == row, state)
+        state = visit(
+            index,
+            record,
+            offset,
+            dr.squared_norm(offset),
+            grid.row_number(own.y, own.z) == row,
+            state,
+        )
         hits &= hits - 1
         return _chosen(hits == 0, [*runs[1:], _no_run()], [(start, hits, row), *runs[1:]]), state
 
     def search_and_meet(y, z, start, end, state):
         runs = [_no_run() for _ in range(KEPT_RUNS)]
-        y, z, start, end, runs = dr.while_loop((y, z, start, end, runs), lambda y, z, start, end, runs: (z <= last_z) & (runs[-1][1] == 0), search,
-                                               label="rows")
-        _, state = dr.while_loop((runs, state), lambda runs, state: runs[0][1] != 0, meet, label="photons met")
+        y, z, start, end, runs = dr.while_loop(
+            (y, z, start, end, runs),
+            lambda y, z, start, end, runs: (z <= last_z) & (runs[-1][1] == 0),
+            search,
+            label="rows",
+        )
+        _, state = dr.while_loop(
+            (runs, state), lambda runs, state: runs[0][1] != 0, meet, label="photons met"
+        )
         return y, z, start, end, state
 
     begin = mi.Int32(first_y), mi.Int32(first_z), mi.UInt32(0), mi.UInt32(0), state
@@ -206,11 +263,15 @@ def _no_run():
 
 def _chosen(condition, these, others):
     """`dr.select` for lists of runs."""
-    return [tuple(dr.select(condition, a, b) for a, b in zip(this, other)) for this, other in zip(these, others)]
+    return [
+        tuple(dr.select(condition, a, b) for a, b in zip(this, other))
+        for this, other in zip(these, others)
+    ]
 
 
 def _photons_of_row(photon_map, y, z, local, reach):
-    """First photon, and the one after the last, of the cells of row (y, z) within `reach` of `local` (both in cells)."""
+    """First photon, and the one after the last, of the cells of row (y, z) within `reach` of
+    `local` (both in cells)."""
     grid = photon_map.grid
     longest = longest_row(grid.size)
     low_y, low_z = mi.Float(y - 2), mi.Float(z - 2)
@@ -222,5 +283,7 @@ def _photons_of_row(photon_map, y, z, local, reach):
     last_x = dr.clip(mi.Int32(dr.floor(local.x + half)) + 2, -1, longest - 4)
     base = grid.row(y, z)
     near = (left > -1e-3) & (last_x >= first_x)
-    return (dr.gather(mi.UInt32, photon_map.start, base + mi.UInt32(first_x), near),
-            dr.gather(mi.UInt32, photon_map.start, base + mi.UInt32(last_x) + 1, near))
+    return (
+        dr.gather(mi.UInt32, photon_map.start, base + mi.UInt32(first_x), near),
+        dr.gather(mi.UInt32, photon_map.start, base + mi.UInt32(last_x) + 1, near),
+    )

@@ -1,7 +1,9 @@
-"""Irradiance on the scene's surfaces, kept in cells: a crude, deterministic picture of where light is.
+"""Irradiance on the scene's surfaces, kept in cells: a crude, deterministic picture of where light
+is.
 
-Made once from the photons of a dense light pass. Each cell of a grid keeps what lands around the mean position of its photons; what
-asks for the irradiance of a point reads the point's cell and no photons.
+Made once from the photons of a dense light pass. Each cell of a grid keeps what lands around the
+mean position of its photons; what asks for the irradiance of a point reads the point's cell and no
+photons.
 """
 
 from __future__ import annotations
@@ -10,15 +12,25 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .gather import SAME_SURFACE_COSINE
-from ..core.packing import bits_float, float_bits, gather_words, rounded_up, unpack_caustic, unpack_depth, unpack_direction, unpack_normal
-from .grid import build_photon_map, for_each_photon, read_power, smallest_cell
+from ..core.packing import (
+    bits_float,
+    float_bits,
+    gather_words,
+    rounded_up,
+    unpack_caustic,
+    unpack_depth,
+    unpack_direction,
+    unpack_normal,
+)
 from ..core.random import streams
 from ..core.spectra import channel_mean
+from .gather import SAME_SURFACE_COSINE
+from .grid import build_photon_map, for_each_photon, read_power, smallest_cell
 
 PHOTONS_A_CELL = 32
 GATHER_RADIUS = 2.0
-"""Radius within which photons count for a cell, in units of its edge: noise of the cells costs more than their blur does."""
+"""Radius within which photons count for a cell, in units of its edge: noise of the cells costs more
+than their blur does."""
 TRIAL_SHARE = 1 / 64
 """Edge of the first, trial cells as a share of the scene's diagonal."""
 LARGEST_SHARE = 0.2
@@ -28,38 +40,53 @@ MOST_LIGHTS = 64
 """Emitters tried as the strongest of a cell."""
 DIRECT_SAMPLES = 32
 UNSEEN_NOISE = 200.0
-"""Relative variance of next-event estimation that is assumed where none of the samples meets light."""
+"""Relative variance of next-event estimation that is assumed where none of the samples meets
+light."""
 OWN_STREAM = 0x64697265
 
 
 class Irradiance:
-    """What a cell knows. Spectra: `direct` (irradiance by direct light and caustics), `second` (by light scattered once), `later` (more
-    often). `direction`: mean direction from which the direct part comes. `slot`: the cell's number. `light`: number of the
-    emitter that brings most of the direct part, `visible_share`: how much of that emitter's unoccluded light the direct part is (0: none
-    is known). `noise`: relative variance of next-event estimation with one sample. `caustic_share`: share of caustics in the direct part."""
+    """What a cell knows. Spectra: `direct` (irradiance by direct light and caustics), `second` (by
+    light scattered once), `later` (more often). `direction`: mean direction from which the direct
+    part comes. `slot`: the cell's number. `light`: number of the emitter that brings most of the
+    direct part, `visible_share`: how much of that emitter's unoccluded light the direct part is (0:
+    none is known). `noise`: relative variance of next-event estimation with one sample.
+    `caustic_share`: share of caustics in the direct part."""
 
-    def __init__(self, direct, second, later, direction, slot, light, visible_share, noise, caustic_share):
+    def __init__(
+        self, direct, second, later, direction, slot, light, visible_share, noise, caustic_share
+    ):
         self.direct, self.second, self.later, self.direction = direct, second, later, direction
-        self.slot, self.light, self.visible_share, self.noise, self.caustic_share = slot, light, visible_share, noise, caustic_share
+        self.slot, self.light, self.visible_share, self.noise, self.caustic_share = (
+            slot,
+            light,
+            visible_share,
+            noise,
+            caustic_share,
+        )
 
 
 def colours():
-    """Channels that are kept apart: those of rgb; in spectral variants, whose wavelengths change, the mean stands for all."""
+    """Channels that are kept apart: those of rgb; in spectral variants, whose wavelengths change,
+    the mean stands for all."""
     return 1 if mi.is_spectral else dr.size_v(mi.Spectrum)
 
 
 class IrradianceCache:
     """Irradiance by cell.
 
-    Attributes: `cell` (edge of the cells, width one), `photon_flux` (flux of a typical photon that is merged, for one light sub-path, a list of one
-    number a channel; `caustic_flux` that of caustic ones, `typical_flux` its mean over channels), `mean` (irradiance of a typical lit point;
-    `level` is the same as an array of width one: numbers would be literals of kernels, compiled anew for each scene and seed),
-    `center` and `facing` (mean position and normal of the photons of each cell, from cell number 1 on).
+    Attributes: `cell` (edge of the cells, width one), `photon_flux` (flux of a typical photon that
+    is merged, for one light sub-path, a list of one number a channel; `caustic_flux` that of
+    caustic ones, `typical_flux` its mean over channels), `mean` (irradiance of a typical lit point;
+    `level` is the same as an array of width one: numbers would be literals of kernels, compiled
+    anew for each scene and seed), `center` and `facing` (mean position and normal of the photons of
+    each cell, from cell number 1 on).
     """
 
     def __init__(self, scene, lights, surface, power, count, light_paths, bounds, wavelengths):
-        """`surface`, `power`, `count`: photons as `trace_light_paths` stores them, direct light's included; `light_paths`: how many
-        sub-paths made them, all of the same `wavelengths` (empty in rgb and mono variants)."""
+        """`surface`, `power`, `count`: photons as `trace_light_paths` stores them, direct light's
+        included; `light_paths`: how many sub-paths made them, all of the same `wavelengths` (empty
+        in rgb and mono variants)."""
         self.origin, self.wavelengths = mi.Point3f(bounds.min), wavelengths
         self.words = 12 if colours() == 1 else 16
         capacity = dr.width(surface) // 4
@@ -69,10 +96,17 @@ class IrradianceCache:
         position = mi.Point3f(bits_float(record.x), bits_float(record.y), bits_float(record.z))
         flux, packed = read_power(power, index, stored)
         normal = unpack_normal(record.w)
-        normal = mi.Normal3f(dr.normalize(dr.mulsign(normal, dr.dot(normal, unpack_direction(packed)))))
+        normal = mi.Normal3f(
+            dr.normalize(dr.mulsign(normal, dr.dot(normal, unpack_direction(packed))))
+        )
         straight = unpack_caustic(record.w)
-        flux_of = {kind: [_typical(dr.select(stored & mask, value, 0)) for value in self._channels(flux)]
-                   for kind, mask in (("indirect", ~straight), ("caustic", straight & (unpack_depth(record.w) > 1)))}
+        flux_of = {
+            kind: [_typical(dr.select(stored & mask, value, 0)) for value in self._channels(flux)]
+            for kind, mask in (
+                ("indirect", ~straight),
+                ("caustic", straight & (unpack_depth(record.w) > 1)),
+            )
+        }
         self.photon_flux = flux_of["indirect"] if any(flux_of["indirect"]) else flux_of["caustic"]
         self.caustic_flux = flux_of["caustic"]
         self.typical_flux = sum(self.photon_flux) / len(self.photon_flux)
@@ -82,22 +116,33 @@ class IrradianceCache:
         self.mean, self.level = 0.0, dr.opaque(mi.Float, 0)
         if dr.width(self.center):
             reach = dr.maximum(GATHER_RADIUS * self.cell, smallest_cell(bounds, capacity))
-            self._gather(scene, lights, build_photon_map(surface, power, count, bounds, reach, capacity, "all"), light_paths)
+            self._gather(
+                scene,
+                lights,
+                build_photon_map(surface, power, count, bounds, reach, capacity, "all"),
+                light_paths,
+            )
 
     @staticmethod
     def _channels(flux):
         return [channel_mean(flux)] if colours() == 1 else [flux[i] for i in range(colours())]
 
     def _choose_cells(self, position, normal, stored, count, bounds):
-        """Sets the cells' size so that those which hold photons hold `PHOTONS_A_CELL` on average; returns each photon's place."""
+        """Sets the cells' size so that those which hold photons hold `PHOTONS_A_CELL` on average;
+        returns each photon's place."""
         diagonal = max(float(dr.norm(bounds.extents())), 1e-30)
         volume = np.prod([float(bounds.max[i] - bounds.min[i]) + 0.01 * diagonal for i in range(3)])
-        smallest = (6 * volume / (1 << INDEX_BITS)) ** (1 / 3)              # smaller cells would share entries of the index
+        smallest = (6 * volume / (1 << INDEX_BITS)) ** (
+            1 / 3
+        )  # smaller cells would share entries of the index
         cell = TRIAL_SHARE * diagonal
         for trial in range(3):
             cell = min(max(cell, smallest), LARGEST_SHARE * diagonal)
             self.cell = dr.opaque(mi.Float, cell)
-            self.columns, self.lines = (dr.opaque(mi.UInt32, int((bounds.max[i] - bounds.min[i]) / cell) + 3 | 1) for i in (0, 1))
+            self.columns, self.lines = (
+                dr.opaque(mi.UInt32, int((bounds.max[i] - bounds.min[i]) / cell) + 3 | 1)
+                for i in (0, 1)
+            )
             place = self._place(position, normal)
             counts = dr.zeros(mi.UInt32, 1 << INDEX_BITS)
             dr.scatter_inc(counts, place, stored)
@@ -107,10 +152,14 @@ class IrradianceCache:
 
     def _sum_cells(self, position, normal, place, stored):
         cells = dr.width(self._occupied)
-        self.center, self.facing, self.index = dr.zeros(mi.Point3f, cells), dr.zeros(mi.Vector3f, cells), dr.zeros(mi.UInt32, 1 << INDEX_BITS)
+        self.center, self.facing, self.index = (
+            dr.zeros(mi.Point3f, cells),
+            dr.zeros(mi.Vector3f, cells),
+            dr.zeros(mi.UInt32, 1 << INDEX_BITS),
+        )
         if cells == 0:
             return
-        number = dr.arange(mi.UInt32, cells) + 1                            # cell 0 is the empty one
+        number = dr.arange(mi.UInt32, cells) + 1  # cell 0 is the empty one
         dr.scatter(self.index, number, self._occupied)
         del self._occupied
         slot = dr.gather(mi.UInt32, self.index, place, stored)
@@ -119,9 +168,13 @@ class IrradianceCache:
             dr.scatter_add(sums, mi.Float(value), 8 * slot + offset, stored)
         dr.eval(sums)
         scale = dr.rcp(dr.gather(mi.Float, sums, 8 * number))
-        self.center = mi.Point3f(*[dr.gather(mi.Float, sums, 8 * number + i) * scale for i in (1, 2, 3)])
+        self.center = mi.Point3f(
+            *[dr.gather(mi.Float, sums, 8 * number + i) * scale for i in (1, 2, 3)]
+        )
         facing = mi.Vector3f(*[dr.gather(mi.Float, sums, 8 * number + i) for i in (4, 5, 6)])
-        self.facing = dr.select(dr.squared_norm(facing) > 0, dr.normalize(facing), mi.Vector3f(0, 0, 1))
+        self.facing = dr.select(
+            dr.squared_norm(facing) > 0, dr.normalize(facing), mi.Vector3f(0, 0, 1)
+        )
         dr.eval(self.center, self.facing)
 
     def _gather(self, scene, lights, photon_map, light_paths):
@@ -133,30 +186,56 @@ class IrradianceCache:
             flux, packed = read_power(photon_map.power, index, hit)
             towards = dr.normalize(unpack_direction(packed))
             normal = unpack_normal(record.w)
-            hit &= (dr.dot(towards, facing) > 0) & (dr.square(dr.dot(normal, facing)) > SAME_SURFACE_COSINE ** 2 * dr.squared_norm(normal))
+            hit &= (dr.dot(towards, facing) > 0) & (
+                dr.square(dr.dot(normal, facing)) > SAME_SURFACE_COSINE**2 * dr.squared_norm(normal)
+            )
             straight = hit & unpack_caustic(record.w)
             soon = hit & ~straight & (unpack_depth(record.w) <= 2)
-            added = [dr.select(kind, value, 0) for kind in (straight, soon, hit & ~straight & ~soon) for value in self._channels(flux)]
+            added = [
+                dr.select(kind, value, 0)
+                for kind in (straight, soon, hit & ~straight & ~soon)
+                for value in self._channels(flux)
+            ]
             added += [dr.select(straight, channel_mean(flux) * x, 0) for x in towards]
             added += [dr.select(straight & (unpack_depth(record.w) > 1), channel_mean(flux), 0)]
             return tuple(old + new for old, new in zip(totals, added))
 
-        totals = for_each_photon(photon_map, self.center, GATHER_RADIUS * self.cell, mi.Bool(True), visit,
-                                 tuple(mi.Float(0) for _ in range(3 * channels + 4)))
+        totals = for_each_photon(
+            photon_map,
+            self.center,
+            GATHER_RADIUS * self.cell,
+            mi.Bool(True),
+            visit,
+            tuple(mi.Float(0) for _ in range(3 * channels + 4)),
+        )
         area = dr.rcp(dr.pi * dr.square(GATHER_RADIUS * self.cell) * light_paths)
-        irradiance = [total * area for total in totals[:3 * channels]]
-        direction = mi.Vector3f(*totals[3 * channels:-1])
+        irradiance = [total * area for total in totals[: 3 * channels]]
+        direction = mi.Vector3f(*totals[3 * channels : -1])
         direction *= dr.rsqrt(dr.maximum(dr.squared_norm(direction), 1e-30))
         straight = sum(irradiance[:channels]) / channels
-        caustic_share = dr.select(straight > 0, dr.minimum(totals[-1] * area / dr.maximum(straight, 1e-30), 1), 0)
+        caustic_share = dr.select(
+            straight > 0, dr.minimum(totals[-1] * area / dr.maximum(straight, 1e-30), 1), 0
+        )
         dr.eval(irradiance, direction, caustic_share)
         light, visible_share = self._strongest_light(scene, lights, straight)
         number = dr.arange(mi.UInt32, dr.width(self.center)) + 1
-        for offset, value in enumerate((*irradiance, *direction, _pack_light(light, visible_share), self._direct_noise(lights),
-                                          caustic_share)):
+        for offset, value in enumerate(
+            (
+                *irradiance,
+                *direction,
+                _pack_light(light, visible_share),
+                self._direct_noise(lights),
+                caustic_share,
+            )
+        ):
             dr.scatter(self.table, mi.Float(value), self.words * number + offset)
-        # A cell that no photon met: dark, or hardly touched by a surface, which is worse to get wrong. As bright as others are.
-        dr.scatter(self.table, mi.Float([_mean(value) for value in irradiance]), dr.arange(mi.UInt32, 3 * channels))
+        # A cell that no photon met: dark, or hardly touched by a surface, which is worse to get
+        # wrong. As bright as others are.
+        dr.scatter(
+            self.table,
+            mi.Float([_mean(value) for value in irradiance]),
+            dr.arange(mi.UInt32, 3 * channels),
+        )
         dr.eval(self.table)
         self.mean = _mean(sum(irradiance)) / channels
         self.level = dr.opaque(mi.Float, self.mean)
@@ -167,29 +246,46 @@ class IrradianceCache:
         return si
 
     def _strongest_light(self, scene, lights, direct):
-        """The emitter that brings most direct light to each cell's center, and the share of its unoccluded light that the cell has."""
+        """The emitter that brings most direct light to each cell's center, and the share of its
+        unoccluded light that the cell has."""
         best, light = mi.Float(0), mi.UInt32(0)
-        near = [i for i, kind in enumerate(lights.kinds) if kind in ("point", "spot", "area", "directional")]
+        near = [
+            i
+            for i, kind in enumerate(lights.kinds)
+            if kind in ("point", "spot", "area", "directional")
+        ]
         si = self._facing_surface(self.center, self.facing)
         for index in near[:MOST_LIGHTS]:
             ds, value = lights.unoccluded(si, mi.UInt32(index), mi.Bool(True))
             value *= dr.maximum(dr.dot(ds.d, self.facing), 0)
-            value = dr.select((value > 0) & ~scene.ray_test(si.spawn_ray_to(ds.p), value > 0), value, 0)
+            value = dr.select(
+                (value > 0) & ~scene.ray_test(si.spawn_ray_to(ds.p), value > 0), value, 0
+            )
             light = dr.select(value > best, mi.UInt32(index), light)
             best = dr.maximum(best, value)
             dr.eval(best, light)
         return light, dr.select(best > 0, dr.minimum(direct / dr.maximum(best, 1e-30), 2), 0)
 
     def _direct_noise(self, lights):
-        """Relative variance of next-event estimation at each cell's center, from `DIRECT_SAMPLES` samples."""
+        """Relative variance of next-event estimation at each cell's center, from `DIRECT_SAMPLES`
+        samples."""
         cells = dr.width(self.center)
         number = dr.arange(mi.UInt32, cells * DIRECT_SAMPLES)
         facing = dr.gather(mi.Vector3f, self.facing, number // DIRECT_SAMPLES)
-        si = self._facing_surface(dr.gather(mi.Point3f, self.center, number // DIRECT_SAMPLES), facing)
-        ds, weight, _ = lights.sample_direct(si, streams(number, mi.UInt32(OWN_STREAM)), mi.Bool(True))
+        si = self._facing_surface(
+            dr.gather(mi.Point3f, self.center, number // DIRECT_SAMPLES), facing
+        )
+        ds, weight, _ = lights.sample_direct(
+            si, streams(number, mi.UInt32(OWN_STREAM)), mi.Bool(True)
+        )
         value = channel_mean(weight) * dr.maximum(dr.dot(ds.d, facing), 0)
-        mean, square = dr.block_sum(value, DIRECT_SAMPLES) / DIRECT_SAMPLES, dr.block_sum(dr.square(value), DIRECT_SAMPLES) / DIRECT_SAMPLES
-        noise = (square / dr.maximum(dr.square(mean), 1e-30) - 1) * (DIRECT_SAMPLES / (DIRECT_SAMPLES - 1))
+        mean, square = (
+            dr.block_sum(value, DIRECT_SAMPLES) / DIRECT_SAMPLES,
+            dr.block_sum(dr.square(value), DIRECT_SAMPLES) / DIRECT_SAMPLES,
+        )
+        noise = (square / dr.maximum(dr.square(mean), 1e-30) - 1) * (
+            DIRECT_SAMPLES / (DIRECT_SAMPLES - 1)
+        )
         return dr.select(mean > 0, dr.maximum(noise, 0), UNSEEN_NOISE)
 
     def tables(self):
@@ -197,16 +293,23 @@ class IrradianceCache:
         return [self.index, self.table, self.cell, self.columns, self.lines, self.level]
 
     def _place(self, p, n):
-        """Entry of the index for point `p` on a surface with unit normal `n`: cells along x, y, z times six directions."""
+        """Entry of the index for point `p` on a surface with unit normal `n`: cells along x, y, z
+        times six directions."""
         q = mi.Vector3u(mi.Vector3i(dr.floor((p - self.origin) / self.cell)) + 1)
-        axis = dr.select((dr.abs(n.x) > dr.abs(n.y)) & (dr.abs(n.x) > dr.abs(n.z)), mi.UInt32(0),
-                         dr.select(dr.abs(n.y) > dr.abs(n.z), mi.UInt32(1), mi.UInt32(2)))
+        axis = dr.select(
+            (dr.abs(n.x) > dr.abs(n.y)) & (dr.abs(n.x) > dr.abs(n.z)),
+            mi.UInt32(0),
+            dr.select(dr.abs(n.y) > dr.abs(n.z), mi.UInt32(1), mi.UInt32(2)),
+        )
         along = dr.select(axis == 0, n.x, dr.select(axis == 1, n.y, n.z))
         side = 2 * axis + dr.select(along > 0, mi.UInt32(0), mi.UInt32(1))
-        return (((q.z * self.lines + q.y) * self.columns + q.x) * 6 + side) & ((1 << INDEX_BITS) - 1)
+        return (((q.z * self.lines + q.y) * self.columns + q.x) * 6 + side) & (
+            (1 << INDEX_BITS) - 1
+        )
 
     def slot(self, p, n, active=True):
-        """Number of the cell of point `p` on the side to which the unit normal `n` points; 0 if nothing is known of it."""
+        """Number of the cell of point `p` on the side to which the unit normal `n` points; 0 if
+        nothing is known of it."""
         return dr.gather(mi.UInt32, self.index, self._place(p, n), active)
 
     def lookup(self, p, n, active=True):
@@ -214,9 +317,13 @@ class IrradianceCache:
         slot = self.slot(p, n, active)
         words = gather_words(self.table, self.words, slot, active)
         channels = colours()
-        spectra = [mi.Spectrum(words[i * channels]) if channels == 1 else mi.Spectrum(words[i * channels:(i + 1) * channels])
-                   for i in range(3)]
-        rest = words[3 * channels:]
+        spectra = [
+            mi.Spectrum(words[i * channels])
+            if channels == 1
+            else mi.Spectrum(words[i * channels : (i + 1) * channels])
+            for i in range(3)
+        ]
+        rest = words[3 * channels :]
         light, visible_share = _unpack_light(rest[3])
         return Irradiance(*spectra, mi.Vector3f(*rest[:3]), slot, light, visible_share, *rest[4:6])
 
@@ -227,17 +334,20 @@ def _mean(values):
 
 
 def _typical(flux):
-    """Mean of a photon's flux, weighted by itself: what the variance of a sum of photons over their sum is."""
+    """Mean of a photon's flux, weighted by itself: what the variance of a sum of photons over their
+    sum is."""
     flux = np.array(flux, dtype=np.float64)
     total = flux.sum()
-    return float((flux ** 2).sum() / total) if total > 0 else 0.0
+    return float((flux**2).sum() / total) if total > 0 else 0.0
 
 
 def _pack_light(light, visible_share):
     """An emitter's number (14 bits) and a number in [0, 2] in the bits of an ordinary float32."""
-    return bits_float(mi.UInt32(1 << 30) | (light << 16) | mi.UInt32(dr.round(visible_share * 32767)))
+    return bits_float(
+        mi.UInt32(1 << 30) | (light << 16) | mi.UInt32(dr.round(visible_share * 32767))
+    )
 
 
 def _unpack_light(word):
     bits = float_bits(word)
-    return (bits >> 16) & 0x3fff, mi.Float(bits & 0xffff) / 32767
+    return (bits >> 16) & 0x3FFF, mi.Float(bits & 0xFFFF) / 32767

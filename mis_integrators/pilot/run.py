@@ -1,4 +1,5 @@
-"""The pilot of `bdpm`: a few iterations on a subset of the pixels, from which the merge radii and the number of camera paths follow."""
+"""The pilot of `bdpm`: a few iterations on a subset of the pixels, from which the merge radii and
+the number of camera paths follow."""
 
 from __future__ import annotations
 
@@ -12,11 +13,21 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..paths.camera_pass import film_sample_count, film_size
-from ..photons.gather import mean_photon_count
-from .radius import LARGEST_SHARE, Expected, best_radius, expect, ladder, middling, relative_weights, steadied, usual_mean
 from ..core.recording import lanes
 from ..core.spectra import channel_mean
+from ..paths.camera_pass import film_sample_count, film_size
+from ..photons.gather import mean_photon_count
+from .radius import (
+    LARGEST_SHARE,
+    Expected,
+    best_radius,
+    expect,
+    ladder,
+    middling,
+    relative_weights,
+    steadied,
+    usual_mean,
+)
 
 PILOT_PATHS = 4096
 FEWEST_ITERATIONS, FEWEST_TIMED_ITERATIONS, MOST_ITERATIONS = 4, 3, 16
@@ -30,10 +41,11 @@ UNPLANNED_ITERATIONS = 64
 MOST_PHOTONS = 160
 """Photons a vertex within the largest radius that is tried."""
 FEWEST_PHOTONS, WIDER = 1, 4
-"""Photons a vertex within the largest radius, fewer than which tell nothing (the camera may see one point only): then radii so many times larger are
-tried, up to those that suit the whole scene."""
+"""Photons a vertex within the largest radius, fewer than which tell nothing (the camera may see one
+point only): then radii so many times larger are tried, up to those that suit the whole scene."""
 GATHER_COST = 0.013
-"""Cost of one gathered photon a vertex, in units of an iteration's light and camera passes (0.006 to 0.018 on the bundled scenes)."""
+"""Cost of one gathered photon a vertex, in units of an iteration's light and camera passes (0.006
+to 0.018 on the bundled scenes)."""
 PROBE_COST = 0.15
 """Cost of the coverage probes, in the same units (0.03 to 0.25)."""
 LIKE_A_PILOT = 1.5
@@ -41,23 +53,27 @@ LIKE_A_PILOT = 1.5
 TOO_SLOW = 1.5
 """An iteration that takes so many times the guess is not believed to be typical."""
 CAMERA_SHARE = 0.35
-"""Share of the same units that each camera path of a pixel takes, until it is known (0.1 to 0.5 on the bundled scenes)."""
+"""Share of the same units that each camera path of a pixel takes, until it is known (0.1 to 0.5 on
+the bundled scenes)."""
 LEAST_CAMERA_SHARE, MOST_CAMERA_SHARE = 0.1, 0.8
 NUMBERS_OF_PATHS = (1, 2, 4, 8)
 """Camera paths a pixel and iteration that are considered."""
 WORTH_TRYING = 0.92
-"""Two camera paths are tried where the best number is expected to make the error smaller by this factor, if a camera path costs the least that it may."""
+"""Two camera paths are tried where the best number is expected to make the error smaller by this
+factor, if a camera path costs the least that it may."""
 LONG = 16
 """... in renders of so many iterations at least."""
 WORTH_CHANGING = 0.95
 """Another number than was tried must make it smaller by this factor."""
 USUAL_PHOTONS = 10
-"""Photons a gather at which an iteration counts as one planned iteration: larger gathers must pay for themselves."""
+"""Photons a gather at which an iteration counts as one planned iteration: larger gathers must pay
+for themselves."""
 
 
 def choose_radii(session):
-    """Sets `session.radii` and `session.corrected` for each kind of photon map that the session needs; returns what is expected of them (a
-    `Forecast`), or `None` where there are no photons to gather."""
+    """Sets `session.radii` and `session.corrected` for each kind of photon map that the session
+    needs; returns what is expected of them (a `Forecast`), or `None` where there are no photons to
+    gather."""
     session.radii = {}
     if not session.kinds():
         return None
@@ -69,7 +85,10 @@ def choose_radii(session):
         pilot.iterate(done)
         now = time.perf_counter()
         if session.seconds is not None:
-            over = now - started > PILOT_SHARE * session.seconds and done + 1 >= FEWEST_TIMED_ITERATIONS
+            over = (
+                now - started > PILOT_SHARE * session.seconds
+                and done + 1 >= FEWEST_TIMED_ITERATIONS
+            )
         else:
             over = done + 1 >= max(PILOT_SHARE * count, FEWEST_ITERATIONS)
         if over or pilot.ladder is None:
@@ -93,13 +112,16 @@ def choose_radii(session):
 
 
 def may_choose_camera_paths(session):
-    """Whether the number of camera paths a pixel is the pilot's to choose: what one costs is known in renders of a given time only."""
+    """Whether the number of camera paths a pixel is the pilot's to choose: what one costs is known
+    in renders of a given time only."""
     return session.seconds is not None and not session.integrator.camera_paths
 
 
 def choose_camera_paths(pilot, seconds, count, left):
-    """Sets how many camera paths each pixel has in an iteration, where one takes so many `seconds` and there is time for `count` of them; returns the
-    seconds that this took. What camera paths cost is measured where they may pay; the session keeps the iterations if they have the right number."""
+    """Sets how many camera paths each pixel has in an iteration, where one takes so many `seconds`
+    and there is time for `count` of them; returns the seconds that this took. What camera paths
+    cost is measured where they may pay; the session keeps the iterations if they have the right
+    number."""
     session = pilot.session
     if pilot.ladder is None:
         return 0.0
@@ -110,7 +132,10 @@ def choose_camera_paths(pilot, seconds, count, left):
     session.send(2)
     of_two, spent = rehearse(session, 2 * seconds, left)
     pilot.learn_cost(of_two / seconds)
-    errors = {number: pilot.error(number, count) * (1 if number == 2 else 1 / WORTH_CHANGING) for number in NUMBERS_OF_PATHS}
+    errors = {
+        number: pilot.error(number, count) * (1 if number == 2 else 1 / WORTH_CHANGING)
+        for number in NUMBERS_OF_PATHS
+    }
     pilot.camera_paths = min(errors, key=errors.get)
     if pilot.camera_paths != 2:
         session.send(pilot.camera_paths)
@@ -118,8 +143,9 @@ def choose_camera_paths(pilot, seconds, count, left):
 
 
 def rehearse(session, guess, left):
-    """Renders the session's first iteration, and the second where the first took longer than it should have (it may have had to be compiled) but
-    not most of the seconds that are `left`; returns the seconds of an iteration, and those of all. The session keeps the iterations."""
+    """Renders the session's first iteration, and the second where the first took longer than it
+    should have (it may have had to be compiled) but not most of the seconds that are `left`;
+    returns the seconds of an iteration, and those of all. The session keeps the iterations."""
     spent = 0.0
     for number in range(2):
         start = time.perf_counter()
@@ -136,7 +162,8 @@ def rehearse(session, guess, left):
 
 @dataclass(frozen=True)
 class Forecast:
-    """What a pilot expects of a session's iterations; errors are relative, by `relative_weights` of `mean`."""
+    """What a pilot expects of a session's iterations; errors are relative, by `relative_weights` of
+    `mean`."""
 
     squared_bias: float
     variance: float
@@ -156,19 +183,21 @@ class Forecast:
 
 
 def pilot_pixels(session):
-    """`(stride, count, copies)`: the pilot's pixels are numbers 0, stride, 2 stride, ... of the film's, and so many camera paths go through each."""
+    """`(stride, count, copies)`: the pilot's pixels are numbers 0, stride, 2 stride, ... of the
+    film's, and so many camera paths go through each."""
     pixels = film_sample_count(session.sensor)
     copies = 2 if may_choose_camera_paths(session) or session.samples_per_iteration > 1 else 1
     count = min(pixels, PILOT_PATHS // copies)
     stride = pixels // count
     width, _ = film_size(session.sensor)
-    while stride > 1 and math.gcd(stride, width) > 1:          # else the pixels would stand in columns
+    while stride > 1 and math.gcd(stride, width) > 1:  # else the pixels would stand in columns
         stride -= 1
     return stride, count, copies
 
 
 def neighbourhoods(session, stride, count):
-    """Numbers of the square cells of the film, from 0, in which the pilot's pixels lie, `NEIGHBOURS` in each: (count,)."""
+    """Numbers of the square cells of the film, from 0, in which the pilot's pixels lie,
+    `NEIGHBOURS` in each: (count,)."""
     width = film_size(session.sensor)[0]
     side = math.sqrt(NEIGHBOURS * stride)
     row, column = np.divmod(np.arange(count) * stride, width)
@@ -182,7 +211,8 @@ class Noise(NamedTuple):
     expected: dict[str, Expected]
     """By kind of photons."""
     of_a_path: dict[str, dict[bool, np.ndarray]]
-    """By kind of photons and whether they are corrected at edges: variance between camera paths that share photons, one a radius."""
+    """By kind of photons and whether they are corrected at edges: variance between camera paths
+    that share photons, one a radius."""
     direct: float
     """Variance of the light of a camera path that does not come from photons."""
 
@@ -190,11 +220,14 @@ class Noise(NamedTuple):
 class Pilot:
     """Pilot iterations of a session.
 
-    `ladder`: radii (ascending); `samples[kind, corrected]`: gathered values, one array (radii, copies, pixels) an iteration, channel mean; `direct`: the
-    light that does not come from photons, (copies, pixels) an iteration; `photons[kind]`: mean number of photons within the largest radius.
+    `ladder`: radii (ascending); `samples[kind, corrected]`: gathered values, one array (radii,
+    copies, pixels) an iteration, channel mean; `direct`: the light that does not come from photons,
+    (copies, pixels) an iteration; `photons[kind]`: mean number of photons within the largest
+    radius.
 
-    `copies`: camera paths of a pixel, which share the photons of their iteration. Where an iteration may have several camera paths a pixel there are two,
-    whose difference tells the noise of camera paths from that of photons.
+    `copies`: camera paths of a pixel, which share the photons of their iteration. Where an
+    iteration may have several camera paths a pixel there are two, whose difference tells the noise
+    of camera paths from that of photons.
     """
 
     def __init__(self, session):
@@ -204,10 +237,14 @@ class Pilot:
         self.stride, self.paths = stride * self.copies, self.pixels * self.copies
         self.cells = neighbourhoods(session, stride, self.pixels)
         self.ladder = None
-        # Caustics have edges of their own; only the smooth indirect light gains from knowing the surfaces' edges, and only where the camera
-        # sees the vertices: deeper ones are spread over the scene, and their blur averages out.
+        # Caustics have edges of their own; only the smooth indirect light gains from knowing the
+        # surfaces' edges, and only where the camera sees the vertices: deeper ones are spread over
+        # the scene, and their blur averages out.
         self.at_first_vertex = session.integrator.bdd == 0
-        self.ways = {kind: [False, True] if kind == "indirect" and self.at_first_vertex else [False] for kind in session.kinds()}
+        self.ways = {
+            kind: [False, True] if kind == "indirect" and self.at_first_vertex else [False]
+            for kind in session.kinds()
+        }
         self.samples = {(kind, way): [] for kind, ways in self.ways.items() for way in ways}
         self.direct, self.photons = [], {}
         self._record_camera(session._vertex_room(self.paths) * (1 if session.one_vertex else 4))
@@ -216,21 +253,48 @@ class Pilot:
 
     def _record_camera(self, capacity):
         session, self.capacity = self.session, capacity
-        back = (1 - self.pixels * self.stride) % 2 ** 32              # from a copy's path after the last pixel to the next copy's of the first one
-        self._camera = session.recorded(lambda scene, sensor, tables, seed, spectral: session._trace_camera(
-            scene, sensor, seed, lanes(self.paths) // self.pixels * back, self.stride, self.paths, self.copies, capacity, spectral))
+        back = (
+            1 - self.pixels * self.stride
+        ) % 2**32  # from a copy's path after the last pixel to the next copy's of the first one
+        self._camera = session.recorded(
+            lambda scene, sensor, tables, seed, spectral: session._trace_camera(
+                scene,
+                sensor,
+                seed,
+                lanes(self.paths) // self.pixels * back,
+                self.stride,
+                self.paths,
+                self.copies,
+                capacity,
+                spectral,
+            )
+        )
 
     def _record_gather(self):
         session = self.session
         self.photon_capacity = session.photon_capacity
-        self._gather = session.recorded(lambda scene, tables, photons, vertices, radii, spectral: {
-            kind: session._gather(session._map(photons, kind, radii[-1]), vertices, kind, radii, spectral, grey=True) for kind in self.ways})
+        self._gather = session.recorded(
+            lambda scene, tables, photons, vertices, radii, spectral: {
+                kind: session._gather(
+                    session._map(photons, kind, radii[-1]),
+                    vertices,
+                    kind,
+                    radii,
+                    spectral,
+                    grey=True,
+                )
+                for kind in self.ways
+            }
+        )
 
     def _trace(self, seed, spectral):
-        """Radiance and vertices of the pilot's camera paths. Where the vertices overflow their buffer, it grows and the pass runs again."""
+        """Radiance and vertices of the pilot's camera paths. Where the vertices overflow their
+        buffer, it grows and the pass runs again."""
         session = self.session
         while True:
-            radiance, _, _, vertices, count = self._camera(session.scene, session.sensor, session._tables, seed, spectral)
+            radiance, _, _, vertices, count = self._camera(
+                session.scene, session.sensor, session._tables, seed, spectral
+            )
             found = 0 if session.one_vertex else int(dr.max(count)[0])
             if found <= self.capacity:
                 return radiance, vertices
@@ -254,20 +318,26 @@ class Pilot:
         for (kind, way), store in self.samples.items():
             values = gathered[kind]
             if way:
-                values = [v * dr.rcp(self._covered(session.scene, session._tables, vertices, r, seed)) for v, r in zip(values, radii)]
-            store.append([self._numpy(session._per_path(value, vertices, self.paths)) for value in values])
+                values = [
+                    v * dr.rcp(self._covered(session.scene, session._tables, vertices, r, seed))
+                    for v, r in zip(values, radii)
+                ]
+            store.append(
+                [self._numpy(session._per_path(value, vertices, self.paths)) for value in values]
+            )
 
     def _numpy(self, value):
         return np.broadcast_to(np.array(value), self.paths).reshape(self.copies, self.pixels)
 
     def _prepare(self, photons, vertices):
-        """Sets the ladder and counts photons; false if no camera path meets a surface that gathers."""
+        """Sets the ladder and counts photons; false if no camera path meets a surface that
+        gathers."""
         points = vertices["ray_o"] + vertices["ray_d"] * vertices["hit"].t
         self.ladder = ladder(np.array(points), np.array(dr.max(vertices["throughput"])))
         if self.ladder is None:
             return False
         self._count(photons, vertices)
-        largest = LARGEST_SHARE * float(dr.norm(self.session.traits.bounds.extents())) / 3 ** 0.5
+        largest = LARGEST_SHARE * float(dr.norm(self.session.traits.bounds.extents())) / 3**0.5
         while (crowd := max(self.photons.values())) < FEWEST_PHOTONS and self.ladder[-1] < largest:
             self.ladder = self.ladder * min(WIDER, largest / self.ladder[-1])
             self._count(photons, vertices)
@@ -284,22 +354,34 @@ class Pilot:
 
     def _cost(self, kind, corrected, radius, camera_paths):
         gather = GATHER_COST * self.gathered(kind, radius) + PROBE_COST * corrected
-        return (1 + gather + (camera_paths - 1) * (self.camera_share + gather)) / (1 + GATHER_COST * USUAL_PHOTONS)
+        return (1 + gather + (camera_paths - 1) * (self.camera_share + gather)) / (
+            1 + GATHER_COST * USUAL_PHOTONS
+        )
 
     def forecast(self, choices, count):
-        """The `Forecast` for these choices and `count` iterations of usual cost; `None` if no camera path meets a surface that gathers."""
+        """The `Forecast` for these choices and `count` iterations of usual cost; `None` if no
+        camera path meets a surface that gathers."""
         if self.ladder is None:
             return None
         mean = self.mean()
         session = self.session
         caustics = np.mean(self.middling("caustic")) if "caustic" in self.ways else 0.0
-        return Forecast(sum(choice.squared_bias for choice in choices.values()), self._variance(choices, self.camera_paths),
-                        sum(self.gathered(kind, session.radii[kind]) for kind in choices), count / self.cost_of_choice(), mean,
-                        float(caustics / max(np.mean(mean), 1e-30)), len(self.direct), self.cost_of_choice() / self.cost_of_choice(1))
+        return Forecast(
+            sum(choice.squared_bias for choice in choices.values()),
+            self._variance(choices, self.camera_paths),
+            sum(self.gathered(kind, session.radii[kind]) for kind in choices),
+            count / self.cost_of_choice(),
+            mean,
+            float(caustics / max(np.mean(mean), 1e-30)),
+            len(self.direct),
+            self.cost_of_choice() / self.cost_of_choice(1),
+        )
 
     def _variance(self, choices, camera_paths):
         """Relative variance of an iteration with these choices, direct light included."""
-        return self.noise.direct / camera_paths + sum(choice.variance for choice in choices.values())
+        return self.noise.direct / camera_paths + sum(
+            choice.variance for choice in choices.values()
+        )
 
     def gathered(self, kind, radius):
         """Photons of a kind within `radius` of a vertex, on average."""
@@ -307,26 +389,47 @@ class Pilot:
 
     def cost_of_choice(self, camera_paths=None):
         """Relative cost of an iteration with the session's radii."""
-        return max((self._cost(kind, self.session.corrected[kind], radius, camera_paths or self.camera_paths)
-                    for kind, radius in self.session.radii.items() if kind in self.photons), default=1.0)
+        return max(
+            (
+                self._cost(
+                    kind, self.session.corrected[kind], radius, camera_paths or self.camera_paths
+                )
+                for kind, radius in self.session.radii.items()
+                if kind in self.photons
+            ),
+            default=1.0,
+        )
 
     def learn_cost(self, of_two):
         """Takes over what an iteration of two camera paths costs, in units of one of one."""
-        slope = (of_two - 1) * self.cost_of_choice(1) + self.camera_share - (self.cost_of_choice(2) - self.cost_of_choice(1))
+        slope = (
+            (of_two - 1) * self.cost_of_choice(1)
+            + self.camera_share
+            - (self.cost_of_choice(2) - self.cost_of_choice(1))
+        )
         self.camera_share = min(max(slope, LEAST_CAMERA_SHARE), MOST_CAMERA_SHARE)
 
     def error(self, camera_paths, count):
-        """Predicted relative error of a render that could have `count` iterations of usual cost, if each has so many camera paths a pixel."""
+        """Predicted relative error of a render that could have `count` iterations of usual cost, if
+        each has so many camera paths a pixel."""
         choices = self._best_radii(camera_paths, count)
-        cost = max(self._cost(kind, choice.correct, choice.radius, camera_paths) for kind, choice in choices.items())
-        return sum(choice.squared_bias for choice in choices.values()) + self._variance(choices, camera_paths) / max(count / cost, 1)
+        cost = max(
+            self._cost(kind, choice.correct, choice.radius, camera_paths)
+            for kind, choice in choices.items()
+        )
+        return sum(choice.squared_bias for choice in choices.values()) + self._variance(
+            choices, camera_paths
+        ) / max(count / cost, 1)
 
     def decide(self, count, reluctance=None):
-        """Sets the session's radii and corrections for `count` iterations of usual cost; returns the choice for each kind of photons. With a
-        `reluctance` those that are set already are kept unless the predicted error falls by more than this share."""
+        """Sets the session's radii and corrections for `count` iterations of usual cost; returns
+        the choice for each kind of photons. With a `reluctance` those that are set already are kept
+        unless the predicted error falls by more than this share."""
         session = self.session
         if self.ladder is None:
-            session.radii = {kind: 1e-3 * float(dr.norm(session.traits.bounds.extents())) for kind in self.ways}
+            session.radii = {
+                kind: 1e-3 * float(dr.norm(session.traits.bounds.extents())) for kind in self.ways
+            }
             return {}
         choices = self._best_radii(self.camera_paths, count, reluctance)
         session.radii = {kind: choice.radius for kind, choice in choices.items()}
@@ -337,10 +440,19 @@ class Pilot:
         """The `Choice` for each kind of photons, in iterations of so many camera paths a pixel."""
         session, choices = self.session, {}
         for kind, expected in self.noise.expected.items():
-            more_noise = {way: noise * (1 / camera_paths - 1 / self.copies) for way, noise in self.noise.of_a_path[kind].items()}
+            more_noise = {
+                way: noise * (1 / camera_paths - 1 / self.copies)
+                for way, noise in self.noise.of_a_path[kind].items()
+            }
             choices[kind] = best_radius(
-                expected, lambda radius, corrected, kind=kind: np.maximum(count / self._cost(kind, corrected, radius, camera_paths), 1),
-                None if reluctance is None else (session.radii[kind], session.corrected[kind]), reluctance or 0.0, more_noise)
+                expected,
+                lambda radius, corrected, kind=kind: np.maximum(
+                    count / self._cost(kind, corrected, radius, camera_paths), 1
+                ),
+                None if reluctance is None else (session.radii[kind], session.corrected[kind]),
+                reluctance or 0.0,
+                more_noise,
+            )
         return choices
 
     @cached_property
@@ -349,24 +461,47 @@ class Pilot:
         mean = self.mean()
         weights, expected, of_a_path = relative_weights(mean), {}, {}
         for kind, ways in self.ways.items():
-            samples = {way: np.array(self.samples[kind, way]) for way in ways}                       # (iterations, radii, copies, pixels)
+            samples = {
+                way: np.array(self.samples[kind, way]) for way in ways
+            }  # (iterations, radii, copies, pixels)
             means = {way: values.mean(axis=2) for way, values in samples.items()}
-            expected[kind] = expect(self.ladder, means[False], means.get(True), mean, self.at_first_vertex, kind == "caustic")
-            of_a_path[kind] = {way: self._between_copies(weights, values) for way, values in samples.items()}
-        of_direct = np.var(self.direct, axis=0, ddof=1).mean(axis=0) if len(self.direct) > 1 else np.full(self.pixels, np.inf)
+            expected[kind] = expect(
+                self.ladder,
+                means[False],
+                means.get(True),
+                mean,
+                self.at_first_vertex,
+                kind == "caustic",
+            )
+            of_a_path[kind] = {
+                way: self._between_copies(weights, values) for way, values in samples.items()
+            }
+        of_direct = (
+            np.var(self.direct, axis=0, ddof=1).mean(axis=0)
+            if len(self.direct) > 1
+            else np.full(self.pixels, np.inf)
+        )
         return Noise(expected, of_a_path, usual_mean(weights * of_direct))
 
     def _between_copies(self, weights, samples):
         """Relative variance between the camera paths of a pixel, one a radius."""
         if self.copies == 1:
             return np.zeros(len(self.ladder))
-        return np.array([usual_mean(pixels) for pixels in weights * np.var(samples, axis=2, ddof=1).mean(axis=0)])
+        return np.array(
+            [
+                usual_mean(pixels)
+                for pixels in weights * np.var(samples, axis=2, ddof=1).mean(axis=0)
+            ]
+        )
 
     def mean(self):
-        """The pilot's pixels, gathered at a middling radius: (pixels,), or those that the session is to be judged by."""
+        """The pilot's pixels, gathered at a middling radius: (pixels,), or those that the session
+        is to be judged by."""
         if self.session.judged_by is not None:
             return self.session.judged_by
-        image = np.mean(self.direct, axis=1) + sum(np.mean(self.middling(kind), axis=1) for kind in self.ways)       # (iterations, pixels)
+        image = np.mean(self.direct, axis=1) + sum(
+            np.mean(self.middling(kind), axis=1) for kind in self.ways
+        )  # (iterations, pixels)
         return steadied(image, self.cells)
 
     def middling(self, kind):

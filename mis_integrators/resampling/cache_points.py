@@ -1,8 +1,10 @@
-"""Which cache points a place in the scene listens to: a table over the cells of a grid and the six directions that a surface can face.
+"""Which cache points a place in the scene listens to: a table over the cells of a grid and the six
+directions that a surface can face.
 
-A cache point knows something about light that surfaces near it with a similar normal share. The nearest ones are found once for each
-cell and facing; after that a look-up is one gather, cheap enough for path loops. What it returns is a function of place and normal
-alone, constant within a cell: weights made of it are the same for every technique that makes a path.
+A cache point knows something about light that surfaces near it with a similar normal share. The
+nearest ones are found once for each cell and facing; after that a look-up is one gather, cheap
+enough for path loops. What it returns is a function of place and normal alone, constant within a
+cell: weights made of it are the same for every technique that makes a path.
 """
 
 from __future__ import annotations
@@ -21,17 +23,20 @@ BLOCK = 4
 """Edge of a block of cells that are searched together, in cells."""
 FACINGS = 6
 NORMAL_COST = 8.0
-"""Squared distance, in units of the cache points' spacing, that a cache point facing the other way seems farther; a right angle: half of it."""
+"""Squared distance, in units of the cache points' spacing, that a cache point facing the other way
+seems farther; a right angle: half of it."""
 
 
 class CacheGrid:
     """The `neighbors` nearest cache points of every cell and facing.
 
-    Parameters: `points`, `normals` (`Point3f`, `Normal3f` of width C >= 1, evaluated; unit normals on the side that the camera path came from),
-    `neighbors` (N_c; if C is smaller, neighbours repeat).
+    Parameters: `points`, `normals` (`Point3f`, `Normal3f` of width C >= 1, evaluated; unit normals
+    on the side that the camera path came from), `neighbors` (N_c; if C is smaller, neighbours
+    repeat).
 
-    Attributes: `table` (uint32, indices of cache points: entry `rows` times N_c and on, nearest first), `rows` (number of rows), `spacing` (of the
-    cache points [length]) and `squared_spacing` (opaque, [length^2]), `normal_cost` (what a right angle between normals costs [length^2]).
+    Attributes: `table` (uint32, indices of cache points: entry `rows` times N_c and on, nearest
+    first), `rows` (number of rows), `spacing` (of the cache points [length]) and `squared_spacing`
+    (opaque, [length^2]), `normal_cost` (what a right angle between normals costs [length^2]).
     """
 
     def __init__(self, points, normals, neighbors):
@@ -42,28 +47,45 @@ class CacheGrid:
         # Surfaces: C points cover about the box's faces, each an equal share.
         area = 2 * (size[0] * size[1] + size[1] * size[2] + size[2] * size[0])
         self.spacing = float(np.sqrt(area / len(p)))
-        self.normal_cost = 0.5 * NORMAL_COST * self.spacing ** 2
+        self.normal_cost = 0.5 * NORMAL_COST * self.spacing**2
         edge = FINENESS * self.spacing
         while np.prod(np.maximum(np.ceil(size / edge), 1)) > CELLS:
             edge *= 1.05
         self.resolution = [int(n) for n in np.maximum(np.ceil(size / edge), 1)]
-        self.squared_spacing = dr.opaque(mi.Float, self.spacing ** 2)
+        self.squared_spacing = dr.opaque(mi.Float, self.spacing**2)
         self._low = dr.opaque(mi.Point3f, [float(x) for x in low])
         self._scale = dr.opaque(mi.Float, 1 / edge)
-        self._cells = dr.opaque(mi.Point3u, self.resolution)         # as literals they would have path kernels compiled anew for each seed
+        self._cells = dr.opaque(
+            mi.Point3u, self.resolution
+        )  # as literals they would have path kernels compiled anew for each seed
         self.rows = FACINGS * int(np.prod(self.resolution))
         nx, ny, nz = self.resolution
-        x, y, z = np.tile(np.arange(nx), ny * nz), np.tile(np.repeat(np.arange(ny), nx), nz), np.repeat(np.arange(nz), nx * ny)
+        x, y, z = (
+            np.tile(np.arange(nx), ny * nz),
+            np.tile(np.repeat(np.arange(ny), nx), nz),
+            np.repeat(np.arange(nz), nx * ny),
+        )
         centres = (np.stack([x, y, z], axis=1) + 0.5) * edge + low
         blocks = ((z // BLOCK) * ny + y // BLOCK) * nx + x // BLOCK
-        self.table = from_numpy(mi.UInt32, _nearest(centres, blocks, p, to_numpy(normals).astype(np.float64).T, neighbors, self.normal_cost).ravel())
+        self.table = from_numpy(
+            mi.UInt32,
+            _nearest(
+                centres,
+                blocks,
+                p,
+                to_numpy(normals).astype(np.float64).T,
+                neighbors,
+                self.normal_cost,
+            ).ravel(),
+        )
 
     def tables(self):
         """Every evaluated array that `row` and the grid's users read, for `dr.freeze` to track."""
         return [self.table, self.squared_spacing, self._low, self._scale, self._cells]
 
     def row(self, p, n):
-        """Row of a point on a surface with normal `n`, on the side at hand; places outside the grid belong to its border."""
+        """Row of a point on a surface with normal `n`, on the side at hand; places outside the grid
+        belong to its border."""
         nx, ny, _ = self._cells
         x, y, z = mi.Point3u(dr.clip((p - self._low) * self._scale, 0, mi.Point3f(self._cells - 1)))
         return ((z * ny + y) * nx + x) * FACINGS + facing(n)
@@ -74,13 +96,21 @@ class CacheGrid:
 
     def mean(self, values, row, active=True):
         """Mean of `values`, one a cache point, over those of a row."""
-        return sum(dr.gather(mi.Float, values, self.neighbor(row, number, active), active) for number in range(self.neighbors)) / self.neighbors
+        return (
+            sum(
+                dr.gather(mi.Float, values, self.neighbor(row, number, active), active)
+                for number in range(self.neighbors)
+            )
+            / self.neighbors
+        )
 
 
 def facing(n):
     """Which of the six axis directions a normal is nearest to."""
     x, y, z = dr.abs(n.x), dr.abs(n.y), dr.abs(n.z)
-    axis = dr.select((x >= y) & (x >= z), mi.UInt32(0), dr.select(y >= z, mi.UInt32(1), mi.UInt32(2)))
+    axis = dr.select(
+        (x >= y) & (x >= z), mi.UInt32(0), dr.select(y >= z, mi.UInt32(1), mi.UInt32(2))
+    )
     component = dr.select(axis == 0, n.x, dr.select(axis == 1, n.y, n.z))
     return 2 * axis + dr.select(component < 0, mi.UInt32(1), mi.UInt32(0))
 
@@ -88,27 +118,40 @@ def facing(n):
 def _nearest(centres, blocks, p, n, neighbors, normal_cost):
     """The table, a NumPy array (rows, neighbors).
 
-    `centres` (cells, 3) of the cells, `blocks` (cells,) numbers of the blocks that they belong to, `p`, `n` (C, 3) of the cache points. Only points that
-    can be among the nearest somewhere in a block are tried for its cells."""
+    `centres` (cells, 3) of the cells, `blocks` (cells,) numbers of the blocks that they belong to,
+    `p`, `n` (C, 3) of the cache points. Only points that can be among the nearest somewhere in a
+    block are tried for its cells."""
     wanted = min(neighbors, len(p))
     table = np.empty((len(centres), FACINGS, wanted), dtype=np.uint32)
     order = np.argsort(blocks, kind="stable")
     members = np.split(order, np.flatnonzero(np.diff(blocks[order])) + 1)
-    middles = np.array([(centres[cells].min(axis=0) + centres[cells].max(axis=0)) / 2 for cells in members])
-    reach = np.array([np.linalg.norm(centres[cells] - middle, axis=1).max() for cells, middle in zip(members, middles)])[:, None]
+    middles = np.array(
+        [(centres[cells].min(axis=0) + centres[cells].max(axis=0)) / 2 for cells in members]
+    )
+    reach = np.array(
+        [
+            np.linalg.norm(centres[cells] - middle, axis=1).max()
+            for cells, middle in zip(members, middles)
+        ]
+    )[:, None]
     distance = np.sqrt(_squared(middles, p))
     for direction in range(FACINGS):
         turned = normal_cost * (1 - n[:, direction // 2] * (-1 if direction % 2 else 1))
-        at_most = np.partition((distance + reach) ** 2 + turned, wanted - 1, axis=1)[:, wanted - 1:wanted]
+        at_most = np.partition((distance + reach) ** 2 + turned, wanted - 1, axis=1)[
+            :, wanted - 1 : wanted
+        ]
         possible = np.maximum(distance - reach, 0) ** 2 + turned <= at_most * (1 + 1e-6)
         for cells, candidates in zip(members, map(np.flatnonzero, possible)):
             cost = _squared(centres[cells], p[candidates]) + turned[candidates]
             table[cells, direction] = candidates[least_columns(cost, wanted)]
-    return table[:, :, np.arange(neighbors) % wanted].reshape(-1, neighbors)          # fewer cache points than neighbours repeat
+    return table[:, :, np.arange(neighbors) % wanted].reshape(
+        -1, neighbors
+    )  # fewer cache points than neighbours repeat
 
 
 def least_columns(cost, wanted):
-    """Columns of the `wanted` least entries of each row of `cost` (NumPy, at least as wide), least first: (rows, wanted). They are overwritten."""
+    """Columns of the `wanted` least entries of each row of `cost` (NumPy, at least as wide), least
+    first: (rows, wanted). They are overwritten."""
     lines, columns = np.arange(len(cost)), np.empty((len(cost), wanted), dtype=np.intp)
     for place in range(wanted):
         columns[:, place] = cost.argmin(axis=1)

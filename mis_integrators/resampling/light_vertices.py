@@ -1,4 +1,5 @@
-"""Ends of light sub-paths that camera vertices can be joined with: starts on emitters, and kept vertices of the light sub-paths."""
+"""Ends of light sub-paths that camera vertices can be joined with: starts on emitters, and kept
+vertices of the light sub-paths."""
 
 from __future__ import annotations
 
@@ -7,12 +8,11 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from ..paths.vertex import SMALLEST_COSINE, scattered_mean
-from ..paths.sensor import unblocked
-from ..paths.light_starts import read_starts
 from ..core.spectra import channel_mean
+from ..paths.light_starts import read_starts
+from ..paths.sensor import unblocked
 from ..paths.subpaths import junction_of, read_vertices
-
+from ..paths.vertex import SMALLEST_COSINE, scattered_mean
 
 END = ("near", "far", "strength")
 """Fields that the ends' states have."""
@@ -22,11 +22,14 @@ END = ("near", "far", "strength")
 class Sent:
     """What the end of a light sub-path sends to a point, one a lane.
 
-    `d`, `distance`: from the point to the end (infinite for emitters that are); `light` (spectrum): per solid angle if the sub-path's
-    density were one there, that is, times what the point's BSDF makes of it (cosine included) it is the contribution over the sub-path's
-    density; unoccluded; `mean`: its channel mean without colours along the sub-path mixed (a product of channel means); `across` [1/m^2]: density
-    per area across `d` with which the sub-path would go on to the point; `behind`: techniques nearer to the light than this one, over the density per
-    solid angle at the point with which the camera's side would make the end; `vertices`: how many the light sub-path has.
+    `d`, `distance`: from the point to the end (infinite for emitters that are); `light` (spectrum):
+    per solid angle if the sub-path's density were one there, that is, times what the point's BSDF
+    makes of it (cosine included) it is the contribution over the sub-path's density; unoccluded;
+    `mean`: its channel mean without colours along the sub-path mixed (a product of channel means);
+    `across` [1/m^2]: density per area across `d` with which the sub-path would go on to the point;
+    `behind`: techniques nearer to the light than this one, over the density per solid angle at the
+    point with which the camera's side would make the end; `vertices`: how many the light sub-path
+    has.
     """
 
     d: mi.Vector3f
@@ -39,8 +42,8 @@ class Sent:
 
 
 class LightEnds:
-    """Ends of M light sub-paths. The first M are starts (`light_starts`), the others the vertices at the places `list` of a buffer of `subpaths`, whose
-    states have the fields `END`.
+    """Ends of M light sub-paths. The first M are starts (`light_starts`), the others the vertices
+    at the places `list` of a buffer of `subpaths`, whose states have the fields `END`.
 
     `count`: how many ends there are (uint32 of width one).
     """
@@ -58,12 +61,20 @@ class LightEnds:
         squared = dr.maximum(dr.squared_norm(offset), 1e-20)
         distance = dr.sqrt(squared)
         d = offset * dr.rcp(distance)
-        value, back, forward = junction_of(self.traits, y, wavelengths, surface).between(-d, y["towards"], surface)
+        value, back, forward = junction_of(self.traits, y, wavelengths, surface).between(
+            -d, y["towards"], surface
+        )
         leaving = dr.abs(dr.dot(y["n"], d)) * dr.rcp(squared)
         landing = dr.maximum(dr.abs(dr.dot(y["n"], y["towards"])), SMALLEST_COSINE)
-        sent = Sent(d, distance, value * y["throughput"] * (leaving * dr.rcp(landing)),
-                    y["strength"] * scattered_mean(value, y["n"], y["towards"]) * leaving, forward * leaving,
-                    leaving * (y["near"] + back * y["far"]), y["depth"] + 1)
+        sent = Sent(
+            d,
+            distance,
+            value * y["throughput"] * (leaving * dr.rcp(landing)),
+            y["strength"] * scattered_mean(value, y["n"], y["towards"]) * leaving,
+            forward * leaving,
+            leaving * (y["near"] + back * y["far"]),
+            y["depth"] + 1,
+        )
 
         start = active & (index < self.paths)
         x = read_starts(self.starts, index, start)
@@ -74,20 +85,32 @@ class LightEnds:
         across = self.lights.forward_density(reference, ds, start)
         per = dr.select(density > 0, dr.rcp(dr.maximum(density, 1e-20)), 0)
         light *= per
-        mean = dr.select(self.lights.untold(ds.emitter, start), self.lights.total_power * across, channel_mean(light))
+        mean = dr.select(
+            self.lights.untold(ds.emitter, start),
+            self.lights.total_power * across,
+            channel_mean(light),
+        )
         met = start & self.lights.can_be_met(ds.emitter, start)
-        return Sent(dr.select(start, ds.d, sent.d), dr.select(start, ds.dist, sent.distance), dr.select(active, dr.select(start, light, sent.light), 0),
-                    dr.select(start, mean, sent.mean), dr.select(start, across, sent.across),
-                    dr.select(start, dr.select(met, per, 0), sent.behind), dr.select(start, 1, sent.vertices))
+        return Sent(
+            dr.select(start, ds.d, sent.d),
+            dr.select(start, ds.dist, sent.distance),
+            dr.select(active, dr.select(start, light, sent.light), 0),
+            dr.select(start, mean, sent.mean),
+            dr.select(start, across, sent.across),
+            dr.select(start, dr.select(met, per, 0), sent.behind),
+            dr.select(start, 1, sent.vertices),
+        )
 
     def unblocked(self, scene, p, n, sent, active):
-        """Whether nothing stands between points `p` (geometric normals `n`) and the ends that sent `sent`."""
+        """Whether nothing stands between points `p` (geometric normals `n`) and the ends that sent
+        `sent`."""
         return unblocked(scene, p, n, sent.d, dr.minimum(sent.distance, self.reach), active)
 
 
 def list_ends(vertices, count, lengths, first, paths: int, capacity: int, room: int):
-    """Places of the vertices of the light sub-paths `first`, `first + 1`, ..., `paths` of them, in the order of paths and of each one's vertices, and their
-    number (width one; above `room`: the surplus is missing). `lengths`: how many vertices each sub-path has."""
+    """Places of the vertices of the light sub-paths `first`, `first + 1`, ..., `paths` of them, in
+    the order of paths and of each one's vertices, and their number (width one; above `room`: the
+    surplus is missing). `lengths`: how many vertices each sub-path has."""
     start = dr.prefix_sum(lengths)
     dr.eval(start)
     last = first + (paths - 1)

@@ -1,1 +1,2 @@
-"""Media along a line of sight: sections, shifts between segments, transmittance, volumetric paths, views."""
+"""Media along a line of sight: sections, shifts between segments, transmittance, volumetric paths,
+views."""

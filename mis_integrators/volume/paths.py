@@ -5,8 +5,8 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from ..lights.lights import mis_power
 from ..core.random import next_2d
+from ..lights.lights import mis_power
 from ..paths.roulette import russian_roulette
 from .media import collision, section, transmittance
 
@@ -21,24 +21,44 @@ def scattering_interaction(medium, p, wi, time, wavelengths):
 
 @dr.syntax
 def direct_light(scene, lights, traits, it, medium, transition, surface, rng, active):
-    """Next-event estimation at interaction `it`, in `medium` or where `transition` between the media of `surface`: `(ds, light, pdf, rng)`, the
-    light's radiance over its density, attenuated on the way, and the advanced generator."""
+    """Next-event estimation at interaction `it`, in `medium` or where `transition` between the
+    media of `surface`: `(ds, light, pdf, rng)`, the light's radiance over its density, attenuated
+    on the way, and the advanced generator."""
     rng = mi.PCG32(rng)
     ds, light, pdf = lights.propose_direct(it, rng, active)
     lit = active & (dr.max(light) > 0)
     medium = mi.MediumPtr(medium)
     medium[lit & transition] = surface.target_medium(ds.d)
-    kept, rng = transmittance(scene, traits, lights.shadow_ray(it, ds, traits.has_infinite_lights), medium, rng, lit)
+    kept, rng = transmittance(
+        scene, traits, lights.shadow_ray(it, ds, traits.has_infinite_lights), medium, rng, lit
+    )
     return ds, dr.select(lit, light * kept, 0), pdf, rng
 
 
 @dr.syntax
-def incident_radiance(scene, lights, traits, ray, medium, origin, scatter_pdf, specular, throughput, strength, depth, rng, max_depth: int,
-                      rr_depth: int, active):
-    """Throughput times the radiance that arrives at `ray.o` along `ray`, by null-scattering path tracing with next-event estimation.
+def incident_radiance(
+    scene,
+    lights,
+    traits,
+    ray,
+    medium,
+    origin,
+    scatter_pdf,
+    specular,
+    throughput,
+    strength,
+    depth,
+    rng,
+    max_depth: int,
+    rr_depth: int,
+    active,
+):
+    """Throughput times the radiance that arrives at `ray.o` along `ray`, by null-scattering path
+    tracing with next-event estimation.
 
-    `origin` is the interaction that the ray leaves, `scatter_pdf` the density of its direction (unless `specular`), `depth` the number of
-    scattering vertices so far with that one, `strength` a factor by which roulette takes the throughput for larger than it is.
+    `origin` is the interaction that the ray leaves, `scatter_pdf` the density of its direction
+    (unless `specular`), `depth` the number of scattering vertices so far with that one, `strength`
+    a factor by which roulette takes the throughput for larger than it is.
     """
     ray = mi.Ray3f(ray)
     rng = mi.PCG32(rng)
@@ -52,7 +72,7 @@ def incident_radiance(scene, lights, traits, ray, medium, origin, scatter_pdf, s
     radiance = mi.Spectrum(0)
     eta = mi.Float(1)
     surface = dr.zeros(mi.SurfaceInteraction3f)
-    fresh = mi.Bool(True)                            # the next surface is not known yet
+    fresh = mi.Bool(True)  # the next surface is not known yet
     context = mi.BSDFContext()
     phase_context = mi.PhaseFunctionContext(None)
 
@@ -69,10 +89,14 @@ def incident_radiance(scene, lights, traits, ray, medium, origin, scatter_pdf, s
         t = near - dr.log(1 - rng.next_float32(inside)) * dr.rcp(dr.maximum(majorant, 1e-30))
         collided = inside & (majorant > 0) & (t < far)
         p = ray(t)
-        null, real, probability = collision(medium, p, majorant, ray.time, ray.wavelengths, collided)
+        null, real, probability = collision(
+            medium, p, majorant, ray.time, ray.wavelengths, collided
+        )
         passes = collided & (rng.next_float32(collided) < probability)
         scatters = collided & ~passes
-        throughput = dr.select(passes, throughput * null, dr.select(scatters, throughput * real, throughput))
+        throughput = dr.select(
+            passes, throughput * null, dr.select(scatters, throughput * real, throughput)
+        )
         met = active & ~collided
 
         # ---- Emission
@@ -88,20 +112,24 @@ def incident_radiance(scene, lights, traits, ray, medium, origin, scatter_pdf, s
         mei = scattering_interaction(medium, p, -ray.d, ray.time, ray.wavelengths)
         phase = dr.select(scatters, medium, dr.zeros(mi.MediumPtr)).phase_function()
         lit = scatters | (met & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth))
-        if dr.hint(max_depth > 0, mode='scalar'):
+        if dr.hint(max_depth > 0, mode="scalar"):
             lit &= depth + 1 < max_depth
             scatters &= depth + 1 < max_depth
         here = dr.select(met, mi.Interaction3f(surface), mi.Interaction3f(mei))
         reference = dr.zeros(mi.Interaction3f)
         reference[active] = here
-        if dr.hint(not lights.dark, mode='scalar'):
+        if dr.hint(not lights.dark, mode="scalar"):
             ds, light, pdf = lights.propose_direct(reference, rng, lit)
             on_surface, in_medium = lit & met, lit & ~met
-            response, response_pdf = bsdf.eval_pdf(context, surface, surface.to_local(ds.d), on_surface)
+            response, response_pdf = bsdf.eval_pdf(
+                context, surface, surface.to_local(ds.d), on_surface
+            )
             scattered, scattered_pdf = phase.eval_pdf(phase_context, mei, ds.d, in_medium)
             response = dr.select(met, response, scattered)
             response_pdf = dr.select(met, response_pdf, scattered_pdf)
-            gain = throughput * light * response * dr.select(ds.delta, 1, mis_power(pdf, response_pdf))
+            gain = (
+                throughput * light * response * dr.select(ds.delta, 1, mis_power(pdf, response_pdf))
+            )
             lit &= dr.max(gain) > 0
             beyond = mi.MediumPtr(medium)
             beyond[on_surface & surface.is_medium_transition()] = surface.target_medium(ds.d)
@@ -110,7 +138,9 @@ def incident_radiance(scene, lights, traits, ray, medium, origin, scatter_pdf, s
             radiance[lit] += gain * kept
 
         # ---- Scattering in a medium
-        wo, phase_weight, phase_pdf = phase.sample(phase_context, mei, rng.next_float32(scatters), next_2d(rng, scatters), scatters)
+        wo, phase_weight, phase_pdf = phase.sample(
+            phase_context, mei, rng.next_float32(scatters), next_2d(rng, scatters), scatters
+        )
         scatters &= phase_pdf > 0
 
         # ---- Scattering at a surface
@@ -122,7 +152,9 @@ def incident_radiance(scene, lights, traits, ray, medium, origin, scatter_pdf, s
 
         # ---- Go on
         vertex = scatters | bounces
-        throughput = dr.select(met, throughput * weight, dr.select(scatters, throughput * phase_weight, throughput))
+        throughput = dr.select(
+            met, throughput * weight, dr.select(scatters, throughput * phase_weight, throughput)
+        )
         eta[met] = eta * bs.eta
         direction = dr.select(met, surface.to_world(bs.wo), dr.select(scatters, wo, ray.d))
         onward = surface.spawn_ray(direction)
@@ -137,8 +169,10 @@ def incident_radiance(scene, lights, traits, ray, medium, origin, scatter_pdf, s
         depth[vertex] += 1
         medium[met & surface.is_medium_transition()] = surface.target_medium(ray.d)
         active &= passes | vertex | crosses
-        if dr.hint(max_depth > 0, mode='scalar'):
+        if dr.hint(max_depth > 0, mode="scalar"):
             active &= depth < max_depth
         begun = vertex & (depth >= rr_depth)
-        throughput, active = russian_roulette(rng, throughput, dr.max(throughput) * strength, eta, begun, active)
+        throughput, active = russian_roulette(
+            rng, throughput, dr.max(throughput) * strength, eta, begun, active
+        )
     return radiance

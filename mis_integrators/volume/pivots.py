@@ -1,4 +1,5 @@
-"""First segments of camera paths, up to the pivot: the vertex where a path scatters first and where other views can join it."""
+"""First segments of camera paths, up to the pivot: the vertex where a path scatters first and where
+other views can join it."""
 
 from __future__ import annotations
 
@@ -12,19 +13,22 @@ from .media import collision, section
 NOWHERE, IN_MEDIUM, ON_SURFACE = range(3)
 """Where a path's pivot is."""
 SHARED, OWN = 0, 1
-"""Whether other views may join at the pivot, or the path goes on by a delta function and is its own view's alone."""
+"""Whether other views may join at the pivot, or the path goes on by a delta function and is its own
+view's alone."""
 
-NULL_SALT, ADDED_SALT = 0x6e756c6c, 0x61646465
+NULL_SALT, ADDED_SALT = 0x6E756C6C, 0x61646465
 
 
 def null_stream(number, seed):
-    """The random numbers that place a path's null interactions: optical depths between tentative collisions on the first segment. They can be drawn
-    again wherever the interactions are needed, so none is stored."""
+    """The random numbers that place a path's null interactions: optical depths between tentative
+    collisions on the first segment. They can be drawn again wherever the interactions are needed,
+    so none is stored."""
     return streams(number, seed ^ NULL_SALT)
 
 
 def added_stream(number, seed):
-    """The random numbers that place null interactions which are added to a path (see `lines.common_nulls`)."""
+    """The random numbers that place null interactions which are added to a path (see
+    `lines.common_nulls`)."""
     return streams(number, seed ^ ADDED_SALT)
 
 
@@ -34,24 +38,30 @@ def next_gap(rng, active=True):
 
 
 def passing(bsdf, surface, active):
-    """Null transmission of a surface (a spectrum, zero for what does not transmit) and the probability with which paths pass."""
+    """Null transmission of a surface (a spectrum, zero for what does not transmit) and the
+    probability with which paths pass."""
     null = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null)
     value = dr.select(null, bsdf.eval_null_transmission(surface, null), 0)
     return value, dr.clip(channel_mean(value), 0, 1)
 
 
 @dr.syntax
-def trace_first_segments(scene, views, traits, number, seed, rng, wavelengths, sensor_weight, hide_emitters: bool, active):
+def trace_first_segments(
+    scene, views, traits, number, seed, rng, wavelengths, sensor_weight, hide_emitters: bool, active
+):
     """Traces camera paths to their pivots.
 
-    Media scatter by delta tracking against their majorants, null surfaces let paths pass with the mean of their transmission, and what stops is a
-    pivot. Returns `(pivot, radiance, rng)`, a dictionary and the emission seen on the way:
+    Media scatter by delta tracking against their majorants, null surfaces let paths pass with the
+    mean of their transmission, and what stops is a pivot. Returns `(pivot, radiance, rng)`, a
+    dictionary and the emission seen on the way:
 
-    - `kind`, `branch`: see the constants; `p`, `medium` (before the pivot), `wi` (to the camera), `time`, `wavelengths`;
+    - `kind`, `branch`: see the constants; `p`, `medium` (before the pivot), `wi` (to the camera),
+      `time`, `wavelengths`;
     - `hit`, `ray_o`, `ray_d`: what rebuilds the surface interaction;
     - `view`, `position`, `aperture`, `in_window`: of the camera ray (see `Views.sample`);
-    - `weight`, `tint`: spectra whose product is what the path carries when it scatters, measured value over density; the former belongs to the
-      pivot and is every view's, the latter to the path's own first segment;
+    - `weight`, `tint`: spectra whose product is what the path carries when it scatters, measured
+      value over density; the former belongs to the pivot and is every view's, the latter to the
+      path's own first segment;
     - `nulls`: how many null interactions it passed;
     - `visible`: what the alpha channel shows.
     """
@@ -86,7 +96,9 @@ def trace_first_segments(scene, views, traits, number, seed, rng, wavelengths, s
         near, far, majorant = section(medium, stretch, inside)
         t = near + gap * dr.rcp(dr.maximum(majorant, 1e-30))
         collided = inside & (majorant > 0) & (t < far)
-        null, real, probability = collision(medium, ray(t), majorant, ray.time, ray.wavelengths, collided)
+        null, real, probability = collision(
+            medium, ray(t), majorant, ray.time, ray.wavelengths, collided
+        )
         passes = collided & (rng.next_float32(collided) < probability)
         scatters = collided & ~passes
         gap = dr.select(inside & ~collided, dr.maximum(gap - majorant * (far - near), 0), gap)
@@ -101,7 +113,7 @@ def trace_first_segments(scene, views, traits, number, seed, rng, wavelengths, s
         met = tracing & ~collided
         emitter = surface.emitter(scene)
         hidden = met & surface.is_valid() & (emitter != None)  # noqa: E711
-        if dr.hint(hide_emitters, mode='scalar'):
+        if dr.hint(hide_emitters, mode="scalar"):
             met &= surface.is_valid()
         else:
             ds = mi.DirectionSample3f(scene, surface, nowhere)
@@ -111,17 +123,24 @@ def trace_first_segments(scene, views, traits, number, seed, rng, wavelengths, s
             hidden = mi.Bool(False)
         bsdf = surface.bsdf(ray)
         through, passing_probability = passing(bsdf, surface, met)
-        through, passing_probability = dr.select(hidden, mi.Spectrum(1), through), dr.select(hidden, 1, passing_probability)
+        through, passing_probability = (
+            dr.select(hidden, mi.Spectrum(1), through),
+            dr.select(hidden, 1, passing_probability),
+        )
         crosses = met & (rng.next_float32(met) < passing_probability)
         tint[crosses] = tint * through * dr.rcp(dr.maximum(passing_probability, 1e-30))
         stops = met & ~crosses
         smooth = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-        delta = mi.has_flag(bsdf.flags(), mi.BSDFFlags.DeltaReflection) | mi.has_flag(bsdf.flags(), mi.BSDFFlags.DeltaTransmission)
+        delta = mi.has_flag(bsdf.flags(), mi.BSDFFlags.DeltaReflection) | mi.has_flag(
+            bsdf.flags(), mi.BSDFFlags.DeltaTransmission
+        )
         tint[stops] = tint * dr.rcp(dr.maximum(1 - passing_probability, 1e-30))
-        if dr.hint(traits.has_mixed, mode='scalar'):
+        if dr.hint(traits.has_mixed, mode="scalar"):
             mixed = stops & smooth & delta
             weight[mixed] = 2 * weight
-            branch[mixed] = dr.select(rng.next_float32(mixed) < 0.5, mi.UInt32(SHARED), mi.UInt32(OWN))
+            branch[mixed] = dr.select(
+                rng.next_float32(mixed) < 0.5, mi.UInt32(SHARED), mi.UInt32(OWN)
+            )
         branch[stops & ~smooth] = OWN
         kind[stops] = ON_SURFACE
         p[stops] = surface.p
@@ -140,10 +159,26 @@ def trace_first_segments(scene, views, traits, number, seed, rng, wavelengths, s
         ray[tracing] = going
 
     reached = active & (kind != NOWHERE)
-    pivot = {"kind": dr.select(active, kind, NOWHERE), "branch": branch, "p": p, "medium": dr.select(reached, medium, dr.zeros(mi.MediumPtr)),
-             "wi": -ray.d, "time": ray.time, "wavelengths": ray.wavelengths, "hit": hit, "ray_o": ray.o, "ray_d": ray.d, "view": view,
-             "position": position, "aperture": aperture, "in_window": in_window, "tint": tint, "weight": weight * sensor_weight,
-             "nulls": nulls, "visible": dr.select(active & visible, mi.Float(1), mi.Float(0))}
+    pivot = {
+        "kind": dr.select(active, kind, NOWHERE),
+        "branch": branch,
+        "p": p,
+        "medium": dr.select(reached, medium, dr.zeros(mi.MediumPtr)),
+        "wi": -ray.d,
+        "time": ray.time,
+        "wavelengths": ray.wavelengths,
+        "hit": hit,
+        "ray_o": ray.o,
+        "ray_d": ray.d,
+        "view": view,
+        "position": position,
+        "aperture": aperture,
+        "in_window": in_window,
+        "tint": tint,
+        "weight": weight * sensor_weight,
+        "nulls": nulls,
+        "visible": dr.select(active & visible, mi.Float(1), mi.Float(0)),
+    }
     return pivot, dr.select(active, radiance * sensor_weight, 0), rng
 
 
@@ -156,5 +191,9 @@ def pivot_surface(pivot, active):
 
 def of_paths(record, index):
     """The entries `index` of every array of a dictionary (and of lists in it)."""
-    return {name: [dr.gather(type(v), v, index) for v in value] if isinstance(value, list) else dr.gather(type(value), value, index)
-            for name, value in record.items()}
+    return {
+        name: [dr.gather(type(v), v, index) for v in value]
+        if isinstance(value, list)
+        else dr.gather(type(value), value, index)
+        for name, value in record.items()
+    }

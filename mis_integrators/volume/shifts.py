@@ -1,22 +1,27 @@
-"""Shifts of interactions along one segment to another: where on the target segment an interaction of the base segment goes.
+"""Shifts of interactions along one segment to another: where on the target segment an interaction
+of the base segment goes.
 
-Source: Fraboni, Webanck, Bonneel, Iehl, Volumetric Multi-View Rendering (Computer Graphics Forum 2022), supplemental document: shifts by raw
-depth, by majorant optical depth and by primary sample, each as a copy (earlier work) or as a stretch (theirs).
+Source: Fraboni, Webanck, Bonneel, Iehl, Volumetric Multi-View Rendering (Computer Graphics Forum
+2022), supplemental document: shifts by raw depth, by majorant optical depth and by primary sample,
+each as a copy (earlier work) or as a stretch (theirs).
 
-A segment crosses sections [tmin_k, tmax_k] of constant majorant mu_k, in order and without overlap, with nothing between them. Symbols: distance
-t [m], length in media l(t) [m], majorant optical depth tau(t), primary sample u(t) = 1 - exp(-tau(t)); a prime marks the target.
+A segment crosses sections [tmin_k, tmax_k] of constant majorant mu_k, in order and without overlap,
+with nothing between them. Symbols: distance t [m], length in media l(t) [m], majorant optical depth
+tau(t), primary sample u(t) = 1 - exp(-tau(t)); a prime marks the target.
 
-A shift S moves t to t' and has the derivative |S'| = dt'/dt = (dtau'/dtau) mu_k / mu'_k'. Delta tracking places interactions as a Poisson process of
-unit rate in tau, so it is dtau'/dtau that weights need; it is returned as a logarithm, for it spans more than single precision.
+A shift S moves t to t' and has the derivative |S'| = dt'/dt = (dtau'/dtau) mu_k / mu'_k'. Delta
+tracking places interactions as a Poisson process of unit rate in tau, so it is dtau'/dtau that
+weights need; it is returned as a logarithm, for it spans more than single precision.
 
-Everything works on NumPy arrays and on Dr.Jit arrays of any float type, element by element. The inverse of a shift is the same shift with base and
-target exchanged.
+Everything works on NumPy arrays and on Dr.Jit arrays of any float type, element by element. The
+inverse of a shift is the same shift with base and target exchanged.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from typing import Any, Callable, Iterator
+from typing import Any
 
 import drjit as dr
 import numpy as np
@@ -29,7 +34,8 @@ LOWEST = -1e30
 
 @dataclass
 class Sections:
-    """S sections of a segment, each a list of S arrays of one width: where they start and end [m], and their majorants [1/m].
+    """S sections of a segment, each a list of S arrays of one width: where they start and end [m],
+    and their majorants [1/m].
 
     Sections without majorant or of no length count as empty space.
     """
@@ -44,8 +50,9 @@ class Sections:
 
 @dataclass
 class Shifted:
-    """A shifted interaction: distance `t` on the target, its majorant optical depth `tau` there, `log_rate` = ln dtau'/dtau, `jacobian` = dt'/dt
-    (capped where it exceeds exp(80)), and whether there is such an interaction at all (elsewhere the numbers are finite and mean nothing)."""
+    """A shifted interaction: distance `t` on the target, its majorant optical depth `tau` there,
+    `log_rate` = ln dtau'/dtau, `jacobian` = dt'/dt (capped where it exceeds exp(80)), and whether
+    there is such an interaction at all (elsewhere the numbers are finite and mean nothing)."""
 
     t: Any
     tau: Any
@@ -151,7 +158,8 @@ def majorant_at(sections: Sections, t: Array) -> Array:
 
 
 def _invert(sections: Sections, x: Array, density: Callable[[Array], Array]) -> tuple[Array, Array]:
-    """t and majorant where the cumulated `density` of the sections reaches x > 0; x beyond the total gives the last section's end."""
+    """t and majorant where the cumulated `density` of the sections reaches x > 0; x beyond the
+    total gives the last section's end."""
     t, majorant, before = 0 * x, 0 * x, 0 * x
     for tmin, tmax, mu in sections:
         rho = density(mu)
@@ -172,10 +180,20 @@ def at_optical_depth(sections: Sections, tau: Array) -> tuple[Array, Array]:
     return _invert(sections, tau, lambda mu: mu)
 
 
-def _result(base: Sections, t: Array, target_t: Array, target_majorant: Array, tau: Array, log_rate: Array, valid: Array) -> Array:
+def _result(
+    base: Sections,
+    t: Array,
+    target_t: Array,
+    target_majorant: Array,
+    tau: Array,
+    log_rate: Array,
+    valid: Array,
+) -> Array:
     majorant = majorant_at(base, t)
     valid = valid & (majorant > 0) & (target_majorant > 0)
-    jacobian = _exp(log_rate) * _where(valid, majorant / _where(target_majorant > 0, target_majorant, 1.0), 0.0)
+    jacobian = _exp(log_rate) * _where(
+        valid, majorant / _where(target_majorant > 0, target_majorant, 1.0), 0.0
+    )
     return Shifted(target_t, tau, log_rate, jacobian, valid)
 
 
@@ -190,34 +208,55 @@ def raw_depth(base: Sections, target: Sections, t: Array) -> Shifted:
     """l'(t') = C l(t), C = l'max / lmax; dt'/dt = C. Keeps the base segment's distribution."""
     C = _ratio(total_length(target), total_length(base))
     at, majorant = at_length(target, C * length(base, t))
-    return _result(base, t, at, majorant, optical_depth(target, at), _log(C * _ratio(majorant, majorant_at(base, t))),
-                   (total_length(base) > 0) & (total_length(target) > 0))
+    return _result(
+        base,
+        t,
+        at,
+        majorant,
+        optical_depth(target, at),
+        _log(C * _ratio(majorant, majorant_at(base, t))),
+        (total_length(base) > 0) & (total_length(target) > 0),
+    )
 
 
 def majorant_optical_depth(base: Sections, target: Sections, t: Array) -> Shifted:
-    """tau'(t') = C tau(t), C = tau'max / taumax; dt'/dt = C mu_k / mu'_k'. Piecewise constant derivative: the default."""
+    """tau'(t') = C tau(t), C = tau'max / taumax; dt'/dt = C mu_k / mu'_k'. Piecewise constant
+    derivative: the default."""
     C = _ratio(total_optical_depth(target), total_optical_depth(base))
     tau = C * optical_depth(base, t)
     at, majorant = at_optical_depth(target, tau)
-    return _result(base, t, at, majorant, tau, _log(C) + 0 * tau,
-                   (total_optical_depth(base) > 0) & (total_optical_depth(target) > 0))
+    return _result(
+        base,
+        t,
+        at,
+        majorant,
+        tau,
+        _log(C) + 0 * tau,
+        (total_optical_depth(base) > 0) & (total_optical_depth(target) > 0),
+    )
 
 
 def primary_sample(base: Sections, target: Sections, t: Array) -> Shifted:
-    """u'(t') = C u(t), C = u'max / umax; dt'/dt = (mu_k / mu'_k') C exp(-tau) / exp(-tau'). Follows the target's majorant density.
+    """u'(t') = C u(t), C = u'max / umax; dt'/dt = (mu_k / mu'_k') C exp(-tau) / exp(-tau'). Follows
+    the target's majorant density.
 
-    With exp(-tau') = [exp(-tau)(1 - exp(tau - taumax)) + exp(-tau'max)(1 - exp(-tau))] / (1 - exp(-taumax)), whose terms are positive and are
-    summed as logarithms, thick media neither overflow nor cancel; while u' is small, tau' = -ln(1 - u') is the better form.
+    With exp(-tau') = [exp(-tau)(1 - exp(tau - taumax)) + exp(-tau'max)(1 - exp(-tau))] / (1 -
+    exp(-taumax)), whose terms are positive and are summed as logarithms, thick media neither
+    overflow nor cancel; while u' is small, tau' = -ln(1 - u') is the better form.
     """
     end, target_end = total_optical_depth(base), total_optical_depth(target)
     tau = _least(optical_depth(base, t), end)
     log_C = _log(one_minus_exp(target_end)) - _log(one_minus_exp(end))
-    log_transmittance = _log_sum(_log(one_minus_exp(end - tau)) - tau, _log(one_minus_exp(tau)) - target_end) - _log(one_minus_exp(end))
+    log_transmittance = _log_sum(
+        _log(one_minus_exp(end - tau)) - tau, _log(one_minus_exp(tau)) - target_end
+    ) - _log(one_minus_exp(end))
     u = _exp(_least(log_C, 80.0)) * one_minus_exp(tau)
     target_tau = _where(u < 0.5, minus_log_one_minus(_least(u, 0.5)), -log_transmittance)
     target_tau = _most(_least(target_tau, target_end), 0.0)
     at, majorant = at_optical_depth(target, target_tau)
-    return _result(base, t, at, majorant, target_tau, log_C + target_tau - tau, (end > 0) & (target_end > 0))
+    return _result(
+        base, t, at, majorant, target_tau, log_C + target_tau - tau, (end > 0) & (target_end > 0)
+    )
 
 
 # --- Copies: earlier work, for comparison -----------------------------------------------------------------
@@ -226,7 +265,15 @@ def primary_sample(base: Sections, target: Sections, t: Array) -> Shifted:
 def raw_depth_copy(base: Sections, target: Sections, t: Array) -> Shifted:
     """t' = t; dt'/dt = 1. Lost where the target has no medium at t."""
     majorant = majorant_at(target, t)
-    return _result(base, t, t, majorant, optical_depth(target, t), _log(_ratio(majorant, majorant_at(base, t))), majorant > 0)
+    return _result(
+        base,
+        t,
+        t,
+        majorant,
+        optical_depth(target, t),
+        _log(_ratio(majorant, majorant_at(base, t))),
+        majorant > 0,
+    )
 
 
 def majorant_optical_depth_copy(base: Sections, target: Sections, t: Array) -> Shifted:
@@ -241,6 +288,15 @@ def primary_sample_copy(base: Sections, target: Sections, t: Array) -> Shifted:
     return majorant_optical_depth_copy(base, target, t)
 
 
-SHIFTS = {shift.__name__: shift for shift in (majorant_optical_depth, raw_depth, primary_sample, majorant_optical_depth_copy, raw_depth_copy,
-                                              primary_sample_copy)}
+SHIFTS = {
+    shift.__name__: shift
+    for shift in (
+        majorant_optical_depth,
+        raw_depth,
+        primary_sample,
+        majorant_optical_depth_copy,
+        raw_depth_copy,
+        primary_sample_copy,
+    )
+}
 """By name, as the parameter `shift` of `volpath_multiview` has them."""

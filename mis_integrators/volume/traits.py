@@ -6,16 +6,18 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..lights.environment_guide import infinite_emitters
 from ..core.traits import UnsupportedScene, check_emitters, check_variant, scene_objects, used_bsdfs
+from ..lights.environment_guide import infinite_emitters
 from .media import point_in
 
 
 class VolumeTraits:
-    """Attributes: `has_grids` (media that are not homogeneous), `has_null_media` (media in which collisions may be null: grids, and media whose
-    extinction depends on the channel), `has_infinite_lights`, `has_delta` (specular reflection or refraction), `has_mixed` (smooth and specular
-    parts in one BSDF), `has_null_vertices` (BSDFs that let part of the light pass straight on), `has_masks` (BSDFs that ignore the component
-    mask), `boundary_flags` (what must be known of surfaces that only let light pass), `shares` (see `density_share`, by the media's registry
+    """Attributes: `has_grids` (media that are not homogeneous), `has_null_media` (media in which
+    collisions may be null: grids, and media whose extinction depends on the channel),
+    `has_infinite_lights`, `has_delta` (specular reflection or refraction), `has_mixed` (smooth and
+    specular parts in one BSDF), `has_null_vertices` (BSDFs that let part of the light pass straight
+    on), `has_masks` (BSDFs that ignore the component mask), `boundary_flags` (what must be known of
+    surfaces that only let light pass), `shares` (see `density_share`, by the media's registry
     numbers)."""
 
     def __init__(self, scene, sensors):
@@ -25,12 +27,16 @@ class VolumeTraits:
         specular = int(flag.DeltaReflection) | int(flag.DeltaTransmission)
         self.has_delta = any(f & specular for f in flags)
         self.has_mixed = any(f & specular and f & int(flag.Smooth) for f in flags)
-        self.has_null_vertices = any(f & int(flag.Null) and f & (specular | int(flag.Smooth)) for f in flags)
+        self.has_null_vertices = any(
+            f & int(flag.Null) and f & (specular | int(flag.Smooth)) for f in flags
+        )
         self.has_masks = any(b.class_name() == "MaskBSDF" for b in bsdfs)
         # Where all boundaries are plain, neither textures nor shading frames matter there.
         self.boundary_flags = mi.RayFlags.All if self.has_null_vertices else mi.RayFlags.Minimal
         self.has_infinite_lights = bool(infinite_emitters(scene))
-        media = [o for root in (scene, *sensors) for o in scene_objects(root) if isinstance(o, mi.Medium)]
+        media = [
+            o for root in (scene, *sensors) for o in scene_objects(root) if isinstance(o, mi.Medium)
+        ]
         self.has_grids = any(not m.is_homogeneous() for m in media)
         self.has_null_media = self.has_grids or any(_is_coloured(m) for m in media)
         numbers = [int(dr.reinterpret_array(mi.UInt32, mi.MediumPtr(m))[0]) for m in media]
@@ -40,14 +46,23 @@ class VolumeTraits:
         dr.make_opaque(self.shares)
 
     def density_share(self, medium, active):
-        """Roughly, a medium's mean density over its majorant: how many tentative collisions are real."""
+        """Roughly, a medium's mean density over its majorant: how many tentative collisions are
+        real."""
         return dr.gather(mi.Float, self.shares, dr.reinterpret_array(mi.UInt32, medium), active)
 
 
 def _mean_over_majorant(medium):
-    """Mean extinction over its maximum: of the grid's values where there is a grid, of the channels elsewhere. What is unknown counts as thin."""
+    """Mean extinction over its maximum: of the grid's values where there is a grid, of the channels
+    elsewhere. What is unknown counts as thin."""
     parameters = mi.traverse(medium)
-    name = next((name for name in ("sigma_t.data", "sigma_t.value.value", "sigma_t.value") if name in parameters), None)
+    name = next(
+        (
+            name
+            for name in ("sigma_t.data", "sigma_t.value.value", "sigma_t.value")
+            if name in parameters
+        ),
+        None,
+    )
     values = np.abs(np.array(parameters[name], dtype=np.float64)) if name else np.zeros(1)
     return float(values.mean() / values.max()) if values.max() > 0 else 0.0
 
@@ -56,14 +71,19 @@ def _is_coloured(medium):
     """Whether a homogeneous medium's extinction depends on the channel or wavelength."""
     if mi.is_spectral:
         return True
-    _, _, sigma_t = medium.get_scattering_coefficients(point_in(medium, mi.Point3f(0), mi.Float(0), dr.zeros(mi.Ray3f).wavelengths))
+    _, _, sigma_t = medium.get_scattering_coefficients(
+        point_in(medium, mi.Point3f(0), mi.Float(0), dr.zeros(mi.Ray3f).wavelengths)
+    )
     return bool((dr.max(sigma_t) > dr.min(sigma_t))[0])
 
 
 def check_volume_scene(scene, plugin):
-    """Raises `UnsupportedScene` for what the volumetric integrators cannot render, before any sampling."""
+    """Raises `UnsupportedScene` for what the volumetric integrators cannot render, before any
+    sampling."""
     check_variant(scene, plugin)
     if mi.is_polarized:
-        raise UnsupportedScene(f'{plugin}: polarised variants are not supported (active: {mi.variant()}); use an unpolarised '
-                               'one such as "llvm_ad_rgb"')
+        raise UnsupportedScene(
+            f"{plugin}: polarised variants are not supported (active: {mi.variant()}); use an unpolarised "
+            'one such as "llvm_ad_rgb"'
+        )
     check_emitters(scene, plugin)

@@ -1,7 +1,9 @@
-"""Weights of strategies that make the same paths: pure mathematics on NumPy and Dr.Jit arrays alike.
+"""Weights of strategies that make the same paths: pure mathematics on NumPy and Dr.Jit arrays
+alike.
 
-Nothing here knows a renderer. `recursion` holds the optimal weights of any number of merging strategies, `mis2` and `mis3` the
-published closed forms for two and three of them, `heuristics` Veach's balance and power heuristic.
+Nothing here knows a renderer. `recursion` holds the optimal weights of any number of merging
+strategies, `mis2` and `mis3` the published closed forms for two and three of them, `heuristics`
+Veach's balance and power heuristic.
 """
 
 from typing import Any

@@ -1,11 +1,13 @@
 """Weights of views that can make each other's paths.
 
-Source: Fraboni, Webanck, Bonneel, Iehl, Volumetric Multi-View Rendering (Computer Graphics Forum 2022). A path x_i of view i becomes x_k in view
-k. Of all densities only the ratios r_k = p_k(x_k) |dx_k/dx_i| / p_i(x_i) matter, numbers of samples included (r_i = 1; 0 where view k cannot make
-the path). Along the shifts the chain rule makes r_k / sum r the same whichever view's path they were computed from.
+Source: Fraboni, Webanck, Bonneel, Iehl, Volumetric Multi-View Rendering (Computer Graphics Forum
+2022). A path x_i of view i becomes x_k in view k. Of all densities only the ratios r_k = p_k(x_k)
+|dx_k/dx_i| / p_i(x_i) matter, numbers of samples included (r_i = 1; 0 where view k cannot make the
+path). Along the shifts the chain rule makes r_k / sum r the same whichever view's path they were
+computed from.
 
-Every function works on numbers, NumPy and Dr.Jit arrays. What a path adds to view j is `gain` times f(x_j)/p_j(x_j) of the shifted path, a plain
-sample of view j.
+Every function works on numbers, NumPy and Dr.Jit arrays. What a path adds to view j is `gain` times
+f(x_j)/p_j(x_j) of the shifted path, a plain sample of view j.
 """
 
 from __future__ import annotations
@@ -23,7 +25,8 @@ def summand(heuristic: str, ratio: Array) -> Array:
 
 
 def gain(ratio: Array, total: Array) -> Array:
-    """w_{i->j} p_j(x_j) |dx_j/dx_i| / p_i(x_i): the weight of the path in view j times what turns f/p_{i->j} into f/p_j.
+    """w_{i->j} p_j(x_j) |dx_j/dx_i| / p_i(x_i): the weight of the path in view j times what turns
+    f/p_{i->j} into f/p_j.
 
     `total` is the sum of the `summand` over all views that can make the path, the path's own included. Only there do heuristics differ:
     mis:   w = 1 / S_r with S_r = sum_k r_k (balance heuristic); mwis has the same numerator, and its weights (1 / S_r) p_jj / p_ij = r_j / S_r

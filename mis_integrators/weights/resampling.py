@@ -1,11 +1,14 @@
-"""Resampled light sub-paths: their pmf, the variance of the estimate, and weights that know of the resampling.
+"""Resampled light sub-paths: their pmf, the variance of the estimate, and weights that know of the
+resampling.
 
-Sources: Nabata, Iwasaki and Dobashi, Resampling-aware weighting functions for bidirectional path tracing using multiple light sub-paths,
-ACM Transactions on Graphics 39 (2020), doi 10.1145/3338994; the resampling itself: Popov, Ramamoorthi, Durand and Drettakis, Probabilistic
-connections for bidirectional path tracing, Computer Graphics Forum 34 (2015), doi 10.1111/cgf.12680.
+Sources: Nabata, Iwasaki and Dobashi, Resampling-aware weighting functions for bidirectional path
+tracing using multiple light sub-paths, ACM Transactions on Graphics 39 (2020), doi 10.1145/3338994;
+the resampling itself: Popov, Ramamoorthi, Durand and Drettakis, Probabilistic connections for
+bidirectional path tracing, Computer Graphics Forum 34 (2015), doi 10.1111/cgf.12680.
 
-M light sub-paths Y_{s,i} of every length s = 1 ... S are traced, and an eye sub-path Z connects to N of all S M of them, drawn with
-probabilities proportional to q*(Y Z) / p(Y). Arrays of any shape that broadcasts, NumPy or Dr.Jit, one element a light sub-path:
+M light sub-paths Y_{s,i} of every length s = 1 ... S are traced, and an eye sub-path Z connects to
+N of all S M of them, drawn with probabilities proportional to q*(Y Z) / p(Y). Arrays of any shape
+that broadcasts, NumPy or Dr.Jit, one element a light sub-path:
 
     p    density of the light sub-path, product area measure
     q*   target density, not normalised, in the same measure
@@ -14,18 +17,19 @@ probabilities proportional to q*(Y Z) / p(Y). Arrays of any shape that broadcast
     q    q*/Q, and q_s = q*/Q_s
     g    w f, what the estimate sums up
 
-Densities of whole paths overflow; what the renderer needs are the ratio q/p = r/Q = M P_r and the share Q_s/Q, which do not.
+Densities of whole paths overflow; what the renderer needs are the ratio q/p = r/Q = M P_r and the
+share Q_s/Q, which do not.
 """
 
 from __future__ import annotations
 
-from typing import Callable, Sequence
+from collections.abc import Callable, Sequence
 
 from . import Array
 from .recursion import LARGEST, SMALLEST, at_least, at_most
 
-
 # ---------------------------------------------------------------- the draw
+
 
 def proposal_weight(q_star: Array, p: Array) -> Array:
     """r = q*/p, zero for what cannot be proposed (p = 0)."""
@@ -33,14 +37,17 @@ def proposal_weight(q_star: Array, p: Array) -> Array:
 
 
 def safe_share(total: Array, uniform: Array) -> Array:
-    """Share of the uniform pmf in the mixture: `uniform`, but all of it where nothing is worth drawing (`total` = 0)."""
+    """Share of the uniform pmf in the mixture: `uniform`, but all of it where nothing is worth
+    drawing (`total` = 0)."""
     return uniform + (1 - uniform) * (total <= SMALLEST)
 
 
 def pmf(r: Array, total: Array, count: Array, uniform: Array = 0.0) -> Array:
-    """P_r = r / sum_s sum_i r, mixed with a share `uniform` of the uniform pmf over all `count` proposals; only that if the sum is zero.
+    """P_r = r / sum_s sum_i r, mixed with a share `uniform` of the uniform pmf over all `count`
+    proposals; only that if the sum is zero.
 
-    Without a uniform share a proposal that the cached pmf gives nothing, though it contributes, would be lost."""
+    Without a uniform share a proposal that the cached pmf gives nothing, though it contributes,
+    would be lost."""
     share = safe_share(total, uniform)
     return (1 - share) * (r / at_least(total, SMALLEST)) + share / count
 
@@ -51,22 +58,26 @@ def density_ratio(probability: Array, M: int) -> Array:
 
 
 def estimate(g: Array, p: Array, probability: Array, M: int) -> Array:
-    """What one of the N drawn proposals says: g / (M p P_r); I is the mean over the draws (and over p(Z))."""
+    """What one of the N drawn proposals says: g / (M p P_r); I is the mean over the draws (and over
+    p(Z))."""
     return g / at_least(M * p * probability, SMALLEST)
 
 
 # ---------------------------------------------------------------- the weights
 
+
 def bracket(share: Array, M: int) -> Array:
-    """1 - Q_s / (M Q), of share = Q_s/Q: the chance to draw another sub-path than the one at hand. Never negative, whatever rounding or
-    estimates of Q and Q_s make of it."""
+    """1 - Q_s / (M Q), of share = Q_s/Q: the chance to draw another sub-path than the one at hand.
+    Never negative, whatever rounding or estimates of Q and Q_s make of it."""
     return at_least(1 - share / M, 0)
 
 
 def gain(ratio: Array, share: Array, M: int, N: int = 1) -> Array:
-    """p_t / p = 1 / (1/M + (1 - Q_s/(M Q)) / (N q/p)): how many times better than one connection to a light sub-path of its own.
+    """p_t / p = 1 / (1/M + (1 - Q_s/(M Q)) / (N q/p)): how many times better than one connection to
+    a light sub-path of its own.
 
-    `ratio` = q/p and `share` = Q_s/Q. From zero (never drawn) to M (always drawn). M = 1 and a uniform pmf over S lengths give 1/S."""
+    `ratio` = q/p and `share` = Q_s/Q. From zero (never drawn) to M (always drawn). M = 1 and a
+    uniform pmf over S lengths give 1/S."""
     x = at_most(ratio, LARGEST) * (N / M)
     return M * (x / at_least(x + bracket(share, M), SMALLEST))
 
@@ -77,44 +88,70 @@ def resampled_density(p: Array, q: Array, share: Array, M: int, N: int = 1) -> A
 
 
 def technique_weights(densities: Sequence[Array], counts: Sequence[Array]) -> list[Array]:
-    """w_t = n_t p_t / sum_i n_i p_i, a list. n_t = 1 for t in Lambda_RIS, N_t samples for t in Lambda_IS; zero for a path without techniques."""
+    """w_t = n_t p_t / sum_i n_i p_i, a list. n_t = 1 for t in Lambda_RIS, N_t samples for t in
+    Lambda_IS; zero for a path without techniques."""
     parts = [n * density for n, density in zip(counts, densities)]
     total = at_least(sum(parts), SMALLEST)
     return [part / total for part in parts]
 
 
 def doubtful_ratio(whole: Array, spare: Array, doubt: Array) -> Array:
-    """q/p to put into `gain` where the pmf is a cached one, made for a place near by: 1 / E[p/q], for 1/q is what the variance is linear in.
+    """q/p to put into `gain` where the pmf is a cached one, made for a place near by: 1 / E[p/q],
+    for 1/q is what the variance is linear in.
 
-    `whole`: q/p if the cache sees what can be seen here; `spare`: what is left of it if it does not, which happens with the probability `doubt`."""
+    `whole`: q/p if the cache sees what can be seen here; `spare`: what is left of it if it does
+    not, which happens with the probability `doubt`."""
     return 1 / ((1 - doubt) / at_least(whole, SMALLEST) + doubt / at_least(spare, SMALLEST))
 
 
 # ---------------------------------------------------------------- the noise
 
+
 def sample_variance(g: Array, p: Array, integrate: Callable[[Array], Array]) -> Array:
-    """V[g/p] = integral of g^2/p - (integral of g)^2: one sample of density p. `integrate`: the caller's sum over the sub-paths."""
+    """V[g/p] = integral of g^2/p - (integral of g)^2: one sample of density p. `integrate`: the
+    caller's sum over the sub-paths."""
     return integrate(g * g / p) - integrate(g) ** 2
 
 
-def estimate_variance(g: Sequence[Array], p: Sequence[Array], q_star: Sequence[Array], M: int, N: int, integrate: Callable[[Array],
-                      Array] = sum) -> Array:
-    """V[I | Z] = (1/M) sum_s V[g/p] - (1/(M N)) sum_s V[g/q_s] + (1/N) V[g/q], exact if the proposals are independent.
+def estimate_variance(
+    g: Sequence[Array],
+    p: Sequence[Array],
+    q_star: Sequence[Array],
+    M: int,
+    N: int,
+    integrate: Callable[[Array], Array] = sum,
+) -> Array:
+    """V[I | Z] = (1/M) sum_s V[g/p] - (1/(M N)) sum_s V[g/q_s] + (1/N) V[g/q], exact if the
+    proposals are independent.
 
-    `g`, `p`, `q_star`: lists with an array of sub-paths for each length; q_star > 0 wherever g is not zero. Q and Q_s are the exact integrals
-    here. p(Z) = 1; else the variance is to be divided by its square.
+    `g`, `p`, `q_star`: lists with an array of sub-paths for each length; q_star > 0 wherever g is
+    not zero. Q and Q_s are the exact integrals here. p(Z) = 1; else the variance is to be divided
+    by its square.
     """
     Q_s = [integrate(x) for x in q_star]
     Q = sum(Q_s)
     proposals = sum(sample_variance(a, b, integrate) for a, b in zip(g, p))
     within = sum(sample_variance(a, c / norm, integrate) for a, c, norm in zip(g, q_star, Q_s))
-    over_all = sum(integrate(a * a / (c / Q)) for a, c in zip(g, q_star)) - sum(integrate(a) for a in g) ** 2
+    over_all = (
+        sum(integrate(a * a / (c / Q)) for a, c in zip(g, q_star))
+        - sum(integrate(a) for a in g) ** 2
+    )
     return proposals / M - within / (M * N) + over_all / N
 
 
-def second_moment(g: Sequence[Array], p: Sequence[Array], q_star: Sequence[Array], M: int, N: int, integrate: Callable[[Array],
-                  Array] = sum) -> Array:
-    """sum_s integral of g^2 / p_t: the part of the variance that is quadratic in each value of g; what the weights minimise, summed over t."""
+def second_moment(
+    g: Sequence[Array],
+    p: Sequence[Array],
+    q_star: Sequence[Array],
+    M: int,
+    N: int,
+    integrate: Callable[[Array], Array] = sum,
+) -> Array:
+    """sum_s integral of g^2 / p_t: the part of the variance that is quadratic in each value of g;
+    what the weights minimise, summed over t."""
     Q_s = [integrate(x) for x in q_star]
     Q = sum(Q_s)
-    return sum(integrate(a * a / resampled_density(b, c / Q, norm / Q, M, N)) for a, b, c, norm in zip(g, p, q_star, Q_s))
+    return sum(
+        integrate(a * a / resampled_density(b, c / Q, norm / Q, M, N))
+        for a, b, c, norm in zip(g, p, q_star, Q_s)
+    )

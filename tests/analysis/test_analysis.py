@@ -1,23 +1,40 @@
 """Measures of `mis_integrators.analysis` on synthetic images with known answers.
 
-Tolerances of random figures are five standard errors of the figure itself (false alarms: 6e-7 each); coverages are binomial, judged at four
-standard deviations (6e-5 each). All seeds are fixed.
+Tolerances of random figures are five standard errors of the figure itself (false alarms: 6e-7
+each); coverages are binomial, judged at four standard deviations (6e-5 each). All seeds are fixed.
 """
 
 import math
 
+from mis_integrators.analysis.confidence import (
+    Interval,
+    log_ratio_error,
+    log_slope,
+    mean_interval,
+    ratio_interval,
+    slope_interval,
+)
+from mis_integrators.analysis.metrics import (
+    RELATIVE_OFFSET,
+    References,
+    decompose,
+    efficiency,
+    errors,
+    flip,
+    median_of_means,
+    squared_errors,
+    trimmed_mean,
+)
+
 import numpy as np
 import pytest
-
-from mis_integrators.analysis.confidence import (Interval, log_ratio_error, log_slope, mean_interval, ratio_interval, slope_interval)
-from mis_integrators.analysis.metrics import (RELATIVE_OFFSET, References, decompose, efficiency, errors, flip, median_of_means, squared_errors, trimmed_mean)
 
 SHAPE = (96, 112, 3)
 OFFSET, NOISE, REFERENCE_NOISE = 0.2, 0.5, 0.4
 
 
 def truth():
-    y, x, c = np.mgrid[0:SHAPE[0], 0:SHAPE[1], 0:3]
+    y, x, c = np.mgrid[0 : SHAPE[0], 0 : SHAPE[1], 0:3]
     return 1.5 + np.sin(x / 17) * np.cos(y / 11) + 0.2 * c
 
 
@@ -26,7 +43,9 @@ def noisy(image, sigma, seed):
 
 
 def references(noise=REFERENCE_NOISE):
-    return References(noisy(truth(), noise, 1), noisy(truth(), noise, 2), "synthetic", noisy=noise > 0)
+    return References(
+        noisy(truth(), noise, 1), noisy(truth(), noise, 2), "synthetic", noisy=noise > 0
+    )
 
 
 def render(seed, offset=OFFSET):
@@ -45,12 +64,14 @@ def test_squared_error_is_free_of_the_references_noise():
     allowed = 5 * products.std() / math.sqrt(products.size)
     found = errors(render(0), references())
     assert found.mse == pytest.approx(products.mean())
-    assert abs(found.mse - (OFFSET ** 2 + NOISE ** 2)) < allowed
-    assert allowed < 0.2 * REFERENCE_NOISE ** 2              # else the noise of the references, left in, would pass
+    assert abs(found.mse - (OFFSET**2 + NOISE**2)) < allowed
+    assert (
+        allowed < 0.2 * REFERENCE_NOISE**2
+    )  # else the noise of the references, left in, would pass
 
 
 def test_relative_squared_error():
-    expected = ((OFFSET ** 2 + NOISE ** 2) / exact_divisor()).mean()
+    expected = ((OFFSET**2 + NOISE**2) / exact_divisor()).mean()
     assert errors(render(0), references(0)).relmse == pytest.approx(expected, rel=0.03)
     assert errors(render(0), references()).relmse == pytest.approx(expected, rel=0.1)
 
@@ -69,20 +90,24 @@ def test_absolute_percentage_error_and_mean():
 def test_robust_errors_forget_outliers():
     image = render(0)
     spoiled = image.copy()
-    spoiled[::40, ::50] = 1e4                                # 9 of 10752 pixels: fewer than one in a thousand
+    spoiled[::40, ::50] = 1e4  # 9 of 10752 pixels: fewer than one in a thousand
     clean, found = errors(image, references()), errors(spoiled, references())
     assert found.mse > 100 * clean.mse
     for name in ("mse_trimmed", "relmse_trimmed"):
         assert getattr(found, name) == pytest.approx(getattr(clean, name), rel=0.05)
     spoiled = image.copy()
     spoiled[[5, 50, 70], [7, 70, 20]] = 1e4
-    assert errors(spoiled, references()).relmse_median == pytest.approx(clean.relmse_median, rel=0.1)
+    assert errors(spoiled, references()).relmse_median == pytest.approx(
+        clean.relmse_median, rel=0.1
+    )
 
 
 def test_trimming_does_not_favour_either_sign():
     """A perfect image has no error, trimmed or not, however noisy the references are."""
     products = squared_errors(truth(), references()).mean(axis=-1)
-    assert abs(errors(truth(), references()).mse_trimmed) < 5 * products.std() / math.sqrt(products.size)
+    assert abs(errors(truth(), references()).mse_trimmed) < 5 * products.std() / math.sqrt(
+        products.size
+    )
 
 
 def test_robust_means_of_known_values():
@@ -96,17 +121,19 @@ def test_robust_means_of_known_values():
 
 def test_bias_and_variance_apart():
     found = decompose([render(seed) for seed in range(4)], references(0.1))
-    bias2, variance = ((value / exact_divisor()).mean() for value in (OFFSET ** 2, NOISE ** 2))
+    bias2, variance = ((value / exact_divisor()).mean() for value in (OFFSET**2, NOISE**2))
     assert found.bias2 == pytest.approx(bias2, rel=0.15)
     assert found.variance == pytest.approx(variance, rel=0.05)
-    assert found.bias_share == pytest.approx(OFFSET ** 2 / (OFFSET ** 2 + NOISE ** 2), rel=0.15)
+    assert found.bias_share == pytest.approx(OFFSET**2 / (OFFSET**2 + NOISE**2), rel=0.15)
     unbiased = decompose([render(seed, offset=0) for seed in range(4)], references(0.1))
     assert abs(unbiased.bias_share) < 0.03
 
 
 def test_bias_and_variance_add_up_to_the_error():
     images = [render(seed) for seed in range(3)]
-    assert decompose(images, references()).total == pytest.approx(np.mean([errors(image, references()).relmse for image in images]))
+    assert decompose(images, references()).total == pytest.approx(
+        np.mean([errors(image, references()).relmse for image in images])
+    )
     assert decompose(images[:1], references()) is None
 
 
@@ -131,7 +158,12 @@ def test_flip():
 
 def covered(trials, make, true):
     """Share of `trials` intervals that hold the true value."""
-    return np.mean([low <= true <= high for _, low, high in (make(np.random.default_rng(trial)) for trial in range(trials))])
+    return np.mean(
+        [
+            low <= true <= high
+            for _, low, high in (make(np.random.default_rng(trial)) for trial in range(trials))
+        ]
+    )
 
 
 def assert_coverage(share, trials, level=0.95):
@@ -145,14 +177,19 @@ def test_coverage_of_means(count):
 
 @pytest.mark.parametrize("level", [0.8, 0.99])
 def test_coverage_at_another_level(level):
-    assert_coverage(covered(3000, lambda rng: mean_interval(rng.normal(3, 2, 4), level), 3), 3000, level)
+    assert_coverage(
+        covered(3000, lambda rng: mean_interval(rng.normal(3, 2, 4), level), 3), 3000, level
+    )
 
 
 def test_coverage_of_ratios_of_pairs():
-    """A machine's drift, common to both of a pair, cancels; the interval is narrower than that of unpaired figures."""
+    """A machine's drift, common to both of a pair, cancels; the interval is narrower than that of
+    unpaired figures."""
+
     def pair(rng):
         drift = rng.normal(1, 0.2, 5)
         return drift * rng.normal(2, 0.1, 5), drift * rng.normal(1, 0.05, 5)
+
     assert_coverage(covered(3000, lambda rng: ratio_interval(*pair(rng)), 2), 3000)
     values, base = pair(np.random.default_rng(1))
     assert log_ratio_error(values, base) < 0.7 * log_ratio_error(values, np.roll(base, 1))
@@ -162,18 +199,27 @@ def test_coverage_of_slopes():
     times = 2.0 ** np.arange(5)
 
     def run(rng):
-        return times, times ** -0.8 * np.exp(rng.normal(0, 0.1, 5))
-    assert_coverage(covered(2000, lambda rng: slope_interval([run(rng) for _ in range(3)]), -0.8), 2000)
+        return times, times**-0.8 * np.exp(rng.normal(0, 0.1, 5))
+
+    assert_coverage(
+        covered(2000, lambda rng: slope_interval([run(rng) for _ in range(3)]), -0.8), 2000
+    )
 
 
 def test_coverage_of_the_error_of_renders():
-    """The whole way: renders against noisy references that change, too, errors with their interval over seeds."""
+    """The whole way: renders against noisy references that change, too, errors with their interval
+    over seeds."""
     flat = np.ones((12, 12, 3))
 
     def interval(rng):
-        r = References(flat + rng.normal(0, 0.1, flat.shape), flat + rng.normal(0, 0.1, flat.shape), "", False)
-        return mean_interval([errors(flat + OFFSET + rng.normal(0, NOISE, flat.shape), r).mse for _ in range(3)])
-    assert_coverage(covered(1000, interval, OFFSET ** 2 + NOISE ** 2), 1000)
+        r = References(
+            flat + rng.normal(0, 0.1, flat.shape), flat + rng.normal(0, 0.1, flat.shape), "", False
+        )
+        return mean_interval(
+            [errors(flat + OFFSET + rng.normal(0, NOISE, flat.shape), r).mse for _ in range(3)]
+        )
+
+    assert_coverage(covered(1000, interval, OFFSET**2 + NOISE**2), 1000)
 
 
 def test_slope_of_a_power_law():
@@ -187,4 +233,7 @@ def test_slope_of_a_power_law():
 def test_too_few_renders_have_no_interval():
     assert math.isnan(mean_interval([1.0]).low) and math.isnan(ratio_interval([2.0], [1.0]).low)
     assert ratio_interval([2.0], [1.0]).value == 2
-    assert str(Interval(2.0, math.nan, math.nan)) == "2" and str(Interval(2.0, 1.0, 4.0)) == "2 (1 to 4)"
+    assert (
+        str(Interval(2.0, math.nan, math.nan)) == "2"
+        and str(Interval(2.0, 1.0, 4.0)) == "2 (1 to 4)"
+    )

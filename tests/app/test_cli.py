@@ -7,14 +7,14 @@ import sys
 import time
 from pathlib import Path
 
+from mis_integrators.app import cli, loading, output
+from mis_integrators.core.session import MitsubaSession
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import OpenEXR
 import pytest
-
-from mis_integrators.app import cli, loading, output
-from mis_integrators.core.session import MitsubaSession
 
 SCENE = """<scene version="3.0.0">
   <default name="spp" value="10"/>
@@ -103,7 +103,9 @@ def test_image_metadata_and_preview(scene, tmp_path):
     assert mi.__version__ in header["versions"] and header["renderTime"] > 0
     preview = np.array(mi.Bitmap(str(tmp_path / "new" / "a.png")))
     assert preview.shape == (8, 12, 3) and preview.dtype == np.uint8
-    np.testing.assert_allclose(preview[0, 0], [137, 188, 255], atol=1)  # the sRGB curve at 0.25, 0.5 and 1
+    np.testing.assert_allclose(
+        preview[0, 0], [137, 188, 255], atol=1
+    )  # the sRGB curve at 0.25, 0.5 and 1
     assert sorted(file.name for file in (tmp_path / "new").iterdir()) == ["a.exr", "a.png"]
 
 
@@ -137,7 +139,10 @@ def test_aovs_keep_their_names(scene, tmp_path):
 
 
 def test_bdpm_with_variance(scene, tmp_path):
-    assert render(scene, "-i", "bdpm", "-P", "variance=true", "--spp", 2, "-o", tmp_path / "a.exr") == 0
+    assert (
+        render(scene, "-i", "bdpm", "-P", "variance=true", "--spp", 2, "-o", tmp_path / "a.exr")
+        == 0
+    )
     header, channels = read(tmp_path / "a.exr")
     assert set(channels) == {"R", "G", "B", "var.R", "var.G", "var.B"}
     np.testing.assert_allclose(channels["B"], 2, rtol=1e-4)
@@ -145,15 +150,33 @@ def test_bdpm_with_variance(scene, tmp_path):
 
 
 def test_variance_of_a_short_render(scene, tmp_path):
-    """An image that shows its variance needs a second iteration, whatever the time says; nor is there a preview before."""
-    arguments = "-i", "bdpt", "-P", "variance=true", "-P", "max_depth=2", "--time", "1e-6", "--preview", "1e-6", "-o", tmp_path / "a.exr"
+    """An image that shows its variance needs a second iteration, whatever the time says; nor is
+    there a preview before."""
+    arguments = (
+        "-i",
+        "bdpt",
+        "-P",
+        "variance=true",
+        "-P",
+        "max_depth=2",
+        "--time",
+        "1e-6",
+        "--preview",
+        "1e-6",
+        "-o",
+        tmp_path / "a.exr",
+    )
     assert render(scene, *arguments) == 0
     header, channels = read(tmp_path / "a.exr")
     assert header["iterations"] == 2 and np.isfinite(channels["var.R"]).all()
 
 
 def test_interrupt_waits_for_an_image_that_shows_its_variance(scene, tmp_path, use):
-    session = use(FakeSession(on_iteration=lambda number: signal.raise_signal(signal.SIGINT) if number == 1 else None))
+    session = use(
+        FakeSession(
+            on_iteration=lambda number: signal.raise_signal(signal.SIGINT) if number == 1 else None
+        )
+    )
     session.fewest_iterations = 3
     assert render(scene, "-o", tmp_path / "a.exr") == 130
     assert read(tmp_path / "a.exr")[0]["iterations"] == 3
@@ -176,7 +199,9 @@ def test_failed_write_leaves_the_old_file(tmp_path):
 def test_preview_of_luminance_and_of_spectral_bands(tmp_path, rgb):
     image = np.array([[[0.5], [np.nan]]], np.float32)
     assert output.write_png(tmp_path / "y.png", image, ["Y"])
-    np.testing.assert_allclose(np.array(mi.Bitmap(str(tmp_path / "y.png"))).ravel(), [188, 0], atol=1)
+    np.testing.assert_allclose(
+        np.array(mi.Bitmap(str(tmp_path / "y.png"))).ravel(), [188, 0], atol=1
+    )
     assert not output.write_png(tmp_path / "bands.png", image, ["S400"])
 
 
@@ -206,7 +231,8 @@ def test_replaced_integrator_hands_on_what_the_new_one_knows(scene, plugin, kept
 def test_integrator_inside_a_replaced_one_hands_on_too(scene):
     scene.write_text(
         SCENE.replace(
-            '<integrator type="$integrator">', '<integrator type="moment"><integrator type="$integrator">'
+            '<integrator type="$integrator">',
+            '<integrator type="moment"><integrator type="$integrator">',
         ).replace("</integrator>", "</integrator></integrator>")
     )
     assert loading.load(scene, {}, "ptracer", {}).parameters == {"max_depth": 3}
@@ -234,7 +260,15 @@ def test_parameters_reach_the_integrator(scene):
 
 @pytest.mark.parametrize(
     "text, value",
-    [("3", 3), ("-1", -1), ("0.5", 0.5), ("1e-3", 1e-3), ("true", True), ("False", False), ("full", "full")],
+    [
+        ("3", 3),
+        ("-1", -1),
+        ("0.5", 0.5),
+        ("1e-3", 1e-3),
+        ("true", True),
+        ("False", False),
+        ("full", "full"),
+    ],
 )
 def test_parameter_types(text, value):
     assert loading.parse_value(text) == value and type(loading.parse_value(text)) is type(value)
@@ -261,11 +295,15 @@ def test_passes_are_independent_and_add_up(scene, monkeypatch):
             },
         }
     )
-    sensor = mi.load_dict({"type": "perspective", "film": {"type": "hdrfilm", "width": 12, "height": 8}})
+    sensor = mi.load_dict(
+        {"type": "perspective", "film": {"type": "hdrfilm", "width": 12, "height": 8}}
+    )
     integrator = mi.load_dict({"type": "ptracer"})
     session = MitsubaSession(loaded.integrator(), loaded, loaded.sensors()[0], seed=0, spp=10)
     assert (session.iterations_planned, session.samples_per_iteration) == (3, 4)
-    first, again, other = (MitsubaSession(integrator, noisy, sensor, seed=seed, spp=8) for seed in (0, 0, 1))
+    first, again, other = (
+        MitsubaSession(integrator, noisy, sensor, seed=seed, spp=8) for seed in (0, 0, 1)
+    )
     for each in (first, again, other):
         each.iterate()
     single = first.image()
@@ -292,7 +330,9 @@ def test_sampler_that_rounds_up(rgb):
             "light": {"type": "constant"},
         }
     )
-    session = MitsubaSession(mi.load_dict({"type": "path"}), scene, scene.sensors()[0], seed=0, spp=10)
+    session = MitsubaSession(
+        mi.load_dict({"type": "path"}), scene, scene.sensors()[0], seed=0, spp=10
+    )
     assert (session.iterations_planned, session.samples_per_iteration) == (1, 16)
     session.iterate()
     np.testing.assert_allclose(session.image(), 1, rtol=1e-5)
@@ -320,7 +360,17 @@ def test_rounding_up_is_said_once(scene, tmp_path, use, capsys):
 
 @pytest.mark.parametrize("quiet", [False, True])
 def test_rounding_up_of_an_integrator_is_said_once(scene, tmp_path, capfd, quiet):
-    arguments = "-i", "bdpt", "-P", "max_depth=1", "-P", "camera_paths=3", "-o", tmp_path / "a.exr", *["--quiet"] * quiet
+    arguments = (
+        "-i",
+        "bdpt",
+        "-P",
+        "max_depth=1",
+        "-P",
+        "camera_paths=3",
+        "-o",
+        tmp_path / "a.exr",
+        *["--quiet"] * quiet,
+    )
     assert render(scene, *arguments) == 0
     assert sum(text.count("rounded up") for text in capfd.readouterr()) == (0 if quiet else 1)
 
@@ -330,7 +380,9 @@ def test_progress_in_lines_and_quiet(scene, tmp_path, use, capsys, monkeypatch):
     use(FakeSession())
     assert render(scene, "-o", tmp_path / "a.exr") == 0
     lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == 6 and all("iteration" in line and "samples/s" in line for line in lines[:5])
+    assert len(lines) == 6 and all(
+        "iteration" in line and "samples/s" in line for line in lines[:5]
+    )
     use(FakeSession())
     assert render(scene, "-o", tmp_path / "a.exr", "--quiet") == 0
     assert capsys.readouterr() == ("", "")
@@ -347,9 +399,16 @@ def test_remarks_are_said_once(scene, tmp_path, use, capsys):
 def test_why_bdpm_auto_chose_is_said(scene, tmp_path, capsys):
     arguments = "-i", "bdpm_auto", "-P", "max_depth=2", "-o", tmp_path / "a.exr"
     assert render(scene, *arguments) == 0
-    said = [line.partition(": ")[2] for line in capsys.readouterr().err.splitlines() if line.startswith("bdpm_auto: ")]
+    said = [
+        line.partition(": ")[2]
+        for line in capsys.readouterr().err.splitlines()
+        if line.startswith("bdpm_auto: ")
+    ]
     header, _ = read(tmp_path / "a.exr")
-    assert said == [header[name] for name in sorted(header) if name.startswith("choice.because.")] and "needs no photons" in said[0]
+    assert (
+        said == [header[name] for name in sorted(header) if name.startswith("choice.because.")]
+        and "needs no photons" in said[0]
+    )
     assert render(scene, *arguments, "--quiet") == 0
     assert capsys.readouterr() == ("", "")
 
@@ -428,8 +487,12 @@ def test_variant_without_its_gpu(scene, capsys, monkeypatch):
 
 @pytest.mark.parametrize(
     "arguments, message",
-    [(["--spp", "many"], "many is not an integer"), (["--seed", "x"], "x is not an integer"), (["--time", "long"], "long is not a number"),
-     (["--all-views", "--sensor", "1"], "not allowed with")],
+    [
+        (["--spp", "many"], "many is not an integer"),
+        (["--seed", "x"], "x is not an integer"),
+        (["--time", "long"], "long is not a number"),
+        (["--all-views", "--sensor", "1"], "not allowed with"),
+    ],
 )
 def test_wrong_usage_is_said_in_words(scene, capsys, arguments, message):
     with pytest.raises(SystemExit) as exit:
@@ -536,14 +599,25 @@ def test_second_interrupt_stops_at_once(scene, tmp_path, use):
 def test_interrupted_process(scene, tmp_path):
     """The whole command as a process of its own, and the signal from outside."""
     process = subprocess.Popen(
-        [sys.executable, "-m", "mis_integrators.app.cli", scene, "-o", tmp_path / "a.exr", "--time", "100"],
+        [
+            sys.executable,
+            "-m",
+            "mis_integrators.app.cli",
+            scene,
+            "-o",
+            tmp_path / "a.exr",
+            "--time",
+            "100",
+        ],
         stderr=subprocess.PIPE,
         text=True,
         cwd=Path(cli.__file__).parents[2],
         env={**os.environ, "PYTHONUNBUFFERED": "1"},
     )
     try:
-        assert "iteration" in process.stderr.readline()  # the first line of progress: an iteration is done
+        assert (
+            "iteration" in process.stderr.readline()
+        )  # the first line of progress: an iteration is done
         process.send_signal(signal.SIGINT)
         assert process.wait(timeout=30) == 130
         assert "interrupted after" in process.stderr.read().splitlines()[-1]

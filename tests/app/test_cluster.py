@@ -1,4 +1,5 @@
-"""Renders whose iterations are spread over processes: the image is that of one process, whatever happens to workers."""
+"""Renders whose iterations are spread over processes: the image is that of one process, whatever
+happens to workers."""
 
 import asyncio
 import contextlib
@@ -10,15 +11,18 @@ import threading
 import time
 from types import SimpleNamespace
 
-import numpy as np
-import pytest
-from lamplit import ROOT, command, read, render, run, same, write_scene
-
 from mis_integrators.app import checkpoint, cluster
 from mis_integrators.app.request import Request
 from mis_integrators.core.sums import Iterations, Sums
 
-pytest.importorskip("distributed", reason="dask.distributed is not installed: pip install 'mis-integrators[cluster]'")
+import numpy as np
+import pytest
+from lamplit import ROOT, command, read, render, run, same, write_scene
+
+pytest.importorskip(
+    "distributed",
+    reason="dask.distributed is not installed: pip install 'mis-integrators[cluster]'",
+)
 
 
 @pytest.fixture
@@ -34,8 +38,18 @@ def client():
 
 
 def request_for(scene, plugin, spp, **parameters) -> Request:
-    return Request(scene=str(scene), variables={"size": "48"}, plugin=plugin, parameters=parameters, variant="llvm_ad_rgb", sensor=0,
-                   all_views=False, seed=7, spp=spp, fine=True)
+    return Request(
+        scene=str(scene),
+        variables={"size": "48"},
+        plugin=plugin,
+        parameters=parameters,
+        variant="llvm_ad_rgb",
+        sensor=0,
+        all_views=False,
+        seed=7,
+        spp=spp,
+        fine=True,
+    )
 
 
 def iterate_for(session, seconds, until=lambda: False) -> None:
@@ -46,14 +60,33 @@ def iterate_for(session, seconds, until=lambda: False) -> None:
 
 
 def test_image_is_that_of_one_process(scene, tmp_path, client):
-    """Through the scheduler's address, from a checkpoint on, with a pilot whose result the workers must be told (its radius is for the three samples
-    that were planned then)."""
-    options = ["-i", "bdpm_opt3", "-P", "mix_diffuse=true", "-P", "variance=true", "--seed", 3, "--quiet"]
+    """Through the scheduler's address, from a checkpoint on, with a pilot whose result the workers
+    must be told (its radius is for the three samples that were planned then)."""
+    options = [
+        "-i",
+        "bdpm_opt3",
+        "-P",
+        "mix_diffuse=true",
+        "-P",
+        "variance=true",
+        "--seed",
+        3,
+        "--quiet",
+    ]
     for name, where in (("one", []), ("two", ["--scheduler", client.scheduler.address])):
-        assert render(scene, *options, "--spp", 3, "-o", tmp_path / f"{name}.exr", "--checkpoint", 100) == 0
-        assert render(scene, *options, "--spp", 12, "-o", tmp_path / f"{name}.exr", "--resume", *where) == 0
+        assert (
+            render(scene, *options, "--spp", 3, "-o", tmp_path / f"{name}.exr", "--checkpoint", 100)
+            == 0
+        )
+        assert (
+            render(scene, *options, "--spp", 12, "-o", tmp_path / f"{name}.exr", "--resume", *where)
+            == 0
+        )
     (one_header, one), (header, image) = (read(tmp_path / f"{name}.exr") for name in ("one", "two"))
-    assert header["iterations"] == one_header["iterations"] == 12 and header["radius.indirect"] == one_header["radius.indirect"]
+    assert (
+        header["iterations"] == one_header["iterations"] == 12
+        and header["radius.indirect"] == one_header["radius.indirect"]
+    )
     assert same(one, image)
     assert checkpoint.read(tmp_path / "two.checkpoint").done == Iterations(12)
 
@@ -70,7 +103,10 @@ def test_killed_worker_costs_its_iterations_only(scene, client, monkeypatch):
         session.iterate()
     pids = client.run(os.getpid)
     deadline = time.monotonic() + 60
-    while not (victims := [worker for worker, keys in client.processing().items() if keys]) and time.monotonic() < deadline:
+    while (
+        not (victims := [worker for worker, keys in client.processing().items() if keys])
+        and time.monotonic() < deadline
+    ):
         session.iterate()
     in_hand, before = sum(len(batch.numbers) for batch in session._waiting), session.iterations
     os.kill(pids[victims[0]], signal.SIGKILL)
@@ -87,21 +123,31 @@ def test_worker_that_sees_another_scene_is_an_error(scene, client, tmp_path):
     opened = request_for(scene, "path", 4).open()
     session = cluster.DistributedSession(client, opened, False, 1)
     (tmp_path / "lamp.xml").write_text((tmp_path / "lamp.xml").read_text().replace("5, 4", "5, 5"))
-    with pytest.raises(cluster.ClusterError, match="a worker sees another render.*lamp.xml has changed"):
+    with pytest.raises(
+        cluster.ClusterError, match="a worker sees another render.*lamp.xml has changed"
+    ):
         iterate_for(session, 60)
 
 
 def test_workers_are_told_what_a_pilot_found(scene, client):
-    """With a time limit it hangs on the clock: a worker that had a pilot of its own would merge within another radius."""
+    """With a time limit it hangs on the clock: a worker that had a pilot of its own would merge
+    within another radius."""
     request = request_for(scene, "bdpm", 8, bdd=0)
     opened = request.open()
-    told = {"radii": {kind: 0.31 for kind in opened.session.kinds()}, "corrected": {kind: False for kind in opened.session.kinds()},
-            "camera_paths": 2}
+    told = {
+        "radii": dict.fromkeys(opened.session.kinds(), 0.31),
+        "corrected": dict.fromkeys(opened.session.kinds(), False),
+        "camera_paths": 2,
+    }
     identity = opened.identity()
     opened.session.recall(told)
     opened.session.iterate(2)
-    arrays, done, _ = client.submit(cluster.run, cluster.Job("told", request, told, identity, False, 1), [2], pure=False).result()
-    assert done == Iterations(0, (2,)) and same(opened.session.sums.arrays()["total"], arrays["total"])
+    arrays, done, _ = client.submit(
+        cluster.run, cluster.Job("told", request, told, identity, False, 1), [2], pure=False
+    ).result()
+    assert done == Iterations(0, (2,)) and same(
+        opened.session.sums.arrays()["total"], arrays["total"]
+    )
 
 
 def test_error_of_a_worker_leaves_nothing_half_summed(scene, client, monkeypatch):
@@ -116,19 +162,43 @@ def test_error_of_a_worker_leaves_nothing_half_summed(scene, client, monkeypatch
 
     expected = ask([4])[0]["total"]
     with pytest.raises(Exception):
-        ask([3, -1])                     # numpy refuses a negative seed, or the sums a negative iteration, after iteration 3 was summed
+        ask(
+            [3, -1]
+        )  # numpy refuses a negative seed, or the sums a negative iteration, after iteration 3 was summed
     arrays, done, _ = ask([4])
     assert done == Iterations(0, (4,))
     np.testing.assert_allclose(arrays["total"], expected, rtol=1e-4, atol=1e-6)
 
 
 def test_processes_of_this_machine_and_ctrl_c(scene, tmp_path):
-    """Ctrl-C in a terminal reaches the workers, too: what they have rendered is written, and one process can go on from it."""
-    options = ["-i", "bdpt", "-D", "size=48", "--spp", 4000, "-o", tmp_path / "a.exr", "--checkpoint", 0.2]
-    process = subprocess.Popen(command(scene, *options, "--workers", 2), cwd=ROOT, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    """Ctrl-C in a terminal reaches the workers, too: what they have rendered is written, and one
+    process can go on from it."""
+    options = [
+        "-i",
+        "bdpt",
+        "-D",
+        "size=48",
+        "--spp",
+        4000,
+        "-o",
+        tmp_path / "a.exr",
+        "--checkpoint",
+        0.2,
+    ]
+    process = subprocess.Popen(
+        command(scene, *options, "--workers", 2),
+        cwd=ROOT,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
     try:
         deadline = time.monotonic() + 100
-        while not (tmp_path / "a.checkpoint").exists() and time.monotonic() < deadline and process.poll() is None:
+        while (
+            not (tmp_path / "a.checkpoint").exists()
+            and time.monotonic() < deadline
+            and process.poll() is None
+        ):
             time.sleep(0.01)
         os.killpg(process.pid, signal.SIGINT)
         error = process.communicate(timeout=60)[1]
@@ -140,7 +210,21 @@ def test_processes_of_this_machine_and_ctrl_c(scene, tmp_path):
     count = max([done.below, *(number + 1 for number in done.beyond)]) + 2
     options[options.index(4000)] = count
     assert render(scene, *options, "--resume", "--quiet") == 0
-    assert render(scene, "-i", "bdpt", "-D", "size=48", "--spp", count, "-o", tmp_path / "b.exr", "--quiet") == 0
+    assert (
+        render(
+            scene,
+            "-i",
+            "bdpt",
+            "-D",
+            "size=48",
+            "--spp",
+            count,
+            "-o",
+            tmp_path / "b.exr",
+            "--quiet",
+        )
+        == 0
+    )
     assert same(read(tmp_path / "b.exr")[1], read(tmp_path / "a.exr")[1])
 
 
@@ -153,18 +237,41 @@ def test_scheduler_that_is_not_there(scene, tmp_path, monkeypatch, capsys):
 
 def test_dask_that_is_missing(scene, tmp_path):
     hidden = "import sys; sys.modules['distributed'] = None; from mis_integrators import cli; sys.exit(cli.main())"
-    result = run([command(scene)[0], "-c", hidden, str(scene), "--workers", "2", "-o", str(tmp_path / "a.exr")])
-    assert result.returncode == 5 and "mis-integrators[cluster]" in result.stderr and result.stderr.count("\n") == 1
+    result = run(
+        [
+            command(scene)[0],
+            "-c",
+            hidden,
+            str(scene),
+            "--workers",
+            "2",
+            "-o",
+            str(tmp_path / "a.exr"),
+        ]
+    )
+    assert (
+        result.returncode == 5
+        and "mis-integrators[cluster]" in result.stderr
+        and result.stderr.count("\n") == 1
+    )
 
 
 def test_numbers_are_handed_out_once(scene):
-    """With gaps in what is done already, each missing number below the planned one is given to some worker, once."""
+    """With gaps in what is done already, each missing number below the planned one is given to some
+    worker, once."""
     opened = request_for(scene, "path", 0).open()
     session = cluster.DistributedSession.__new__(cluster.DistributedSession)
-    session._session, session._next, session._seconds_per_iteration, session.gathering = opened.session, 0, 0.3, 0.01
+    session._session, session._next, session._seconds_per_iteration, session.gathering = (
+        opened.session,
+        0,
+        0.3,
+        0.01,
+    )
     opened.session.sums.done = Iterations(2, (4, 7))
     opened.session.iterations_planned = 12
-    session.gathering = 2.0                     # two workers, of whose time the gatherer may take a tenth: batches of 40 seconds
+    session.gathering = (
+        2.0  # two workers, of whose time the gatherer may take a tenth: batches of 40 seconds
+    )
     opened.session.iterations_planned = 10**6
     assert len(session._take_numbers(2)) == round(40 / 0.3)
     session._next, session.gathering, opened.session.iterations_planned = 0, 0.01, 12
@@ -177,12 +284,19 @@ def test_numbers_are_handed_out_once(scene):
 @pytest.fixture
 def impatient(monkeypatch):
     """Workers are silent, and given up, after seconds."""
-    for name, seconds in (("SILENCE", 2.0), ("PATIENCE", 2.0), ("ANSWER_SECONDS", 2.0), ("SECONDS_PER_BATCH", 0.2), ("CLOSING_SECONDS", 2.0)):
+    for name, seconds in (
+        ("SILENCE", 2.0),
+        ("PATIENCE", 2.0),
+        ("ANSWER_SECONDS", 2.0),
+        ("SECONDS_PER_BATCH", 0.2),
+        ("CLOSING_SECONDS", 2.0),
+    ):
         monkeypatch.setattr(cluster, name, seconds)
 
 
 def test_stopped_worker_costs_its_iterations_only(scene, client, impatient):
-    """One of two workers hangs with iterations in hand: the other does them, and those that remain; each is summed once."""
+    """One of two workers hangs with iterations in hand: the other does them, and those that remain;
+    each is summed once."""
     request = request_for(scene, "bdpm", 60, bdd=0, initial_radius=0.2)
     whole = request.open().session
     for _ in range(60):
@@ -201,19 +315,24 @@ def test_stopped_worker_costs_its_iterations_only(scene, client, impatient):
         os.kill(pids[victim], signal.SIGCONT)
     assert session.sums.done == Iterations(60)
     assert same(whole.image(), session.image())
-    iterate_for(session, 20, lambda: not session._watch.silent)     # a worker that is heard of again counts again
+    iterate_for(
+        session, 20, lambda: not session._watch.silent
+    )  # a worker that is heard of again counts again
     assert set(session._watch.present) == set(pids)
 
 
 def test_no_worker_is_heard_of(scene, client, impatient):
-    """Before the first result, too. Polls stay short meanwhile, so signals and clocks are heeded."""
+    """Before the first result, too. Polls stay short meanwhile, so signals and clocks are
+    heeded."""
     pids = client.run(os.getpid)
     session = cluster.DistributedSession(client, request_for(scene, "path", 60).open(), False, 1)
     for pid in pids.values():
         os.kill(pid, signal.SIGSTOP)
     polls, start = [], time.monotonic()
     try:
-        with pytest.raises(cluster.ClusterError, match="there has been no worker for 2 s.*the 2 that it knows"):
+        with pytest.raises(
+            cluster.ClusterError, match="there has been no worker for 2 s.*the 2 that it knows"
+        ):
             while True:
                 polls.append(time.monotonic())
                 session.iterate()
@@ -224,17 +343,35 @@ def test_no_worker_is_heard_of(scene, client, impatient):
     assert session.iterations == 0
 
 
-@pytest.mark.parametrize("end, message", [(signal.SIGSTOP, "the scheduler has not answered for 2 s"), (signal.SIGKILL, "the scheduler is gone")])
+@pytest.mark.parametrize(
+    "end, message",
+    [
+        (signal.SIGSTOP, "the scheduler has not answered for 2 s"),
+        (signal.SIGKILL, "the scheduler is gone"),
+    ],
+)
 def test_scheduler_that_ends(scene, impatient, monkeypatch, capfd, end, message):
-    """One that hangs is waited for in vain for a while; both are left within seconds, and Dask says nothing of its own."""
+    """One that hangs is waited for in vain for a while; both are left within seconds, and Dask says
+    nothing of its own."""
     monkeypatch.setattr(cluster, "PATIENCE", 60.0)
-    arguments = ["-c", "from dask.__main__ import main; main()", "scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard"]
+    arguments = [
+        "-c",
+        "from dask.__main__ import main; main()",
+        "scheduler",
+        "--host",
+        "127.0.0.1",
+        "--port",
+        "0",
+        "--no-dashboard",
+    ]
     process = subprocess.Popen([sys.executable, *arguments], stderr=subprocess.PIPE, text=True)
     try:
         address = next(line.split()[-1] for line in process.stderr if "Scheduler at:" in line)
         with pytest.raises(cluster.ClusterError, match=message):
             with cluster.connected(None, address) as client:
-                session = cluster.DistributedSession(client, request_for(scene, "path", 4).open(), False, 1)
+                session = cluster.DistributedSession(
+                    client, request_for(scene, "path", 4).open(), False, 1
+                )
                 session.iterate()
                 process.send_signal(end)
                 start = time.monotonic()
@@ -250,20 +387,41 @@ def workers_of(process) -> list:
 
     found = []
     for child in psutil.Process(process.pid).children():
-        with contextlib.suppress(psutil.Error):          # others of its children may have ended meanwhile
+        with contextlib.suppress(psutil.Error):  # others of its children may have ended meanwhile
             found += [child] if "spawn_main" in " ".join(child.cmdline()) else []
     return found
 
 
 @pytest.mark.parametrize("end", ["time", "SIGTERM"])
 def test_only_worker_is_stopped(scene, tmp_path, end):
-    """The time limit and SIGTERM are heeded while nothing comes in: what there is is written, and no process stays."""
-    options = ["-i", "bdpt", "-D", "size=48", "-o", tmp_path / "a.exr", "--checkpoint", 0.2, "--workers", 1]
-    process = subprocess.Popen(command(scene, *options, *(["--time", 7] if end == "time" else ["--spp", 10**6])), cwd=ROOT, stderr=subprocess.PIPE,
-                               text=True, start_new_session=True)
+    """The time limit and SIGTERM are heeded while nothing comes in: what there is is written, and
+    no process stays."""
+    options = [
+        "-i",
+        "bdpt",
+        "-D",
+        "size=48",
+        "-o",
+        tmp_path / "a.exr",
+        "--checkpoint",
+        0.2,
+        "--workers",
+        1,
+    ]
+    process = subprocess.Popen(
+        command(scene, *options, *(["--time", 7] if end == "time" else ["--spp", 10**6])),
+        cwd=ROOT,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
     try:
         deadline = time.monotonic() + 100
-        while not (tmp_path / "a.checkpoint").exists() and time.monotonic() < deadline and process.poll() is None:
+        while (
+            not (tmp_path / "a.checkpoint").exists()
+            and time.monotonic() < deadline
+            and process.poll() is None
+        ):
             time.sleep(0.01)
         workers = workers_of(process)
         assert len(workers) == 1
@@ -285,7 +443,12 @@ def test_only_worker_is_stopped(scene, tmp_path, end):
 
 def test_worker_that_is_stopped_while_it_starts(scene, tmp_path):
     """Interrupted then, the command ends at once, says one line, and leaves no process."""
-    process = subprocess.Popen(command(scene, "-o", tmp_path / "a.exr", "--workers", 1), cwd=ROOT, stderr=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        command(scene, "-o", tmp_path / "a.exr", "--workers", 1),
+        cwd=ROOT,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
     try:
         workers, deadline = [], time.monotonic() + 60
         while not workers and time.monotonic() < deadline:
@@ -316,28 +479,51 @@ def test_scene_that_a_worker_cannot_open_is_tried_once(scene, client):
     client.run(exec, COUNT_OPENINGS, {})
     session = cluster.DistributedSession(client, request_for(scene, "path", 1).open(), False, 1)
     (scene.parent / "lamp.xml").write_text("<scene>")
-    with pytest.raises(cluster.ClusterError, match="a worker cannot open the scene: .*lamp.xml.*tcp://127.0.0.1") as raised:
+    with pytest.raises(
+        cluster.ClusterError, match="a worker cannot open the scene: .*lamp.xml.*tcp://127.0.0.1"
+    ) as raised:
         iterate_for(session, 60)
     assert "\n" not in str(raised.value) and "Traceback" not in str(raised.value)
-    assert sum(client.run(eval, "__import__('mis_integrators').opening.Request.tries").values()) == 1
+    assert (
+        sum(client.run(eval, "__import__('mis_integrators').opening.Request.tries").values()) == 1
+    )
 
 
 def test_iteration_that_fails_is_tried_once_more_elsewhere(scene, client, monkeypatch):
     session = cluster.DistributedSession(client, request_for(scene, "path", 8).open(), False, 1)
-    numbers = iter([[0], [1, -1], [2]])                 # the sums refuse a negative iteration, or numpy such a seed
+    numbers = iter(
+        [[0], [1, -1], [2]]
+    )  # the sums refuse a negative iteration, or numpy such a seed
     monkeypatch.setattr(session, "_take_numbers", lambda workers: next(numbers, []))
     sent, send = [], session._send
-    monkeypatch.setattr(session, "_send", lambda batch, workers: (sent.append(batch), send(batch, workers)))
+    monkeypatch.setattr(
+        session, "_send", lambda batch, workers: (sent.append(batch), send(batch, workers))
+    )
     with pytest.raises(cluster.ClusterError, match="a worker failed: .*negative.*tcp://127.0.0.1"):
         iterate_for(session, 60)
     (failed,) = [batch for batch in session._waiting if batch.failed_at]
-    assert failed.numbers == [1, -1] and sent.count(failed) == 2 and set(failed.failed_at) == set(client.run(os.getpid))
-    assert session.sums.done in (Iterations(1), Iterations(1, (2,)), Iterations(0, (2,)), Iterations())
+    assert (
+        failed.numbers == [1, -1]
+        and sent.count(failed) == 2
+        and set(failed.failed_at) == set(client.run(os.getpid))
+    )
+    assert session.sums.done in (
+        Iterations(1),
+        Iterations(1, (2,)),
+        Iterations(0, (2,)),
+        Iterations(),
+    )
 
 
 class FakeFuture:
     def __init__(self, key: str, workers):
-        self.key, self.workers, self.result, self.released, self._finished = key, workers, None, False, False
+        self.key, self.workers, self.result, self.released, self._finished = (
+            key,
+            workers,
+            None,
+            False,
+            False,
+        )
         self._callbacks = []
 
     def add_done_callback(self, callback):
@@ -356,7 +542,8 @@ class FakeFuture:
 
 
 class FakeClient:
-    """A client of two workers that do nothing until they are told to: what is handed out, and by whom it is held, is in ``futures``."""
+    """A client of two workers that do nothing until they are told to: what is handed out, and by
+    whom it is held, is in ``futures``."""
 
     status = "running"
 
@@ -368,19 +555,34 @@ class FakeClient:
 
     def submit(self, function, job, numbers, pure, retries, workers):
         assert retries == 0
-        loads = {name: sum(future.workers == [name] for future in self.futures) for name in workers or self.heartbeats}
-        self.futures.append(FakeFuture(f"{len(self.futures)}: {numbers}", [min(loads, key=loads.get)]))
+        loads = {
+            name: sum(future.workers == [name] for future in self.futures)
+            for name in workers or self.heartbeats
+        }
+        self.futures.append(
+            FakeFuture(f"{len(self.futures)}: {numbers}", [min(loads, key=loads.get)])
+        )
         return self.futures[-1]
 
     async def identity(self, n_workers):
         return {"workers": {name: {"last_seen": seen} for name, seen in self.heartbeats.items()}}
 
     async def processing(self, workers):
-        return {name: [future.key for future in self.futures if future.workers == [name] and not (future.done() or future.released)]
-                for name in self.heartbeats}
+        return {
+            name: [
+                future.key
+                for future in self.futures
+                if future.workers == [name] and not (future.done() or future.released)
+            ]
+            for name in self.heartbeats
+        }
 
     async def who_has(self, keys):
-        return {future.key: future.workers for future in self.futures if future.key in keys and future.done()}
+        return {
+            future.key: future.workers
+            for future in self.futures
+            if future.key in keys and future.done()
+        }
 
     async def gather(self, future, asynchronous):
         if isinstance(future.result, Exception):
@@ -390,12 +592,16 @@ class FakeClient:
 
 @pytest.fixture
 def fakes(scene, monkeypatch):
-    """A session of five iterations with a fake client; the other sums are how often each iteration was added."""
+    """A session of five iterations with a fake client; the other sums are how often each iteration
+    was added."""
     monkeypatch.setattr(cluster, "POLL_SECONDS", 0.1)
     monkeypatch.setattr(cluster, "LOOKING_SECONDS", 0.0)
     for name in ("SILENCE", "PATIENCE", "ANSWER_SECONDS"):
         monkeypatch.setattr(cluster, name, float("inf"))
-    client, session = FakeClient(), SimpleNamespace(sums=Sums(), iterations_planned=5, learned={}, start=lambda: None)
+    client, session = (
+        FakeClient(),
+        SimpleNamespace(sums=Sums(), iterations_planned=5, learned={}, start=lambda: None),
+    )
     opened = SimpleNamespace(session=session, identity=dict, request=request_for(scene, "path", 5))
     yield client, cluster.DistributedSession(client, opened, False, 1)
     loop = client.loop.asyncio_loop
@@ -404,7 +610,11 @@ def fakes(scene, monkeypatch):
 
 
 def sums_of(*numbers):
-    return {"count": np.bincount(numbers, minlength=5).astype(float)}, Iterations(0, numbers), 0.1 * len(numbers)
+    return (
+        {"count": np.bincount(numbers, minlength=5).astype(float)},
+        Iterations(0, numbers),
+        0.1 * len(numbers),
+    )
 
 
 def pass_time(session, seconds) -> None:
@@ -417,30 +627,43 @@ def pass_time(session, seconds) -> None:
 def test_overdue_batches_are_handed_to_others_and_duplicates_dropped(fakes):
     client, session = fakes
     session.iterate()
-    assert [future.key for future in client.futures] == ["0: [0]", "1: [1]", "2: [2]", "3: [3]"] and session.sums.done == Iterations()
-    pass_time(session, 10000)                            # before the first result nobody knows how long it takes
+    assert [future.key for future in client.futures] == [
+        "0: [0]",
+        "1: [1]",
+        "2: [2]",
+        "3: [3]",
+    ] and session.sums.done == Iterations()
+    pass_time(session, 10000)  # before the first result nobody knows how long it takes
     assert len(client.futures) == 4
     session._watch.now = 10.0
     for batch in session._waiting:
         batch.copies[0].since = 10.0
     client.futures[0].finish(sums_of(0))
     iterate_for(session, 10, lambda: len(client.futures) == 5)
-    assert session.sums.done == Iterations(1) and client.futures[0].released and client.futures[4].key == "4: [4]"
+    assert (
+        session.sums.done == Iterations(1)
+        and client.futures[0].released
+        and client.futures[4].key == "4: [4]"
+    )
     pass_time(session, 20)
-    assert len(client.futures) == 5                      # 30 seconds are allowed, and ten times that of an iteration
+    assert len(client.futures) == 5  # 30 seconds are allowed, and ten times that of an iteration
     pass_time(session, 20)
     again = client.futures[5:]
     assert [future.key.partition(" ")[2] for future in again] == ["[1]", "[2]", "[3]", "[4]"]
     for future, first in zip(again, client.futures[1:5]):
         assert future.workers != first.workers and not first.released
-    client.futures[1].finish(sums_of(1))                 # the first copy comes after all, and so does the second, at the same time
+    client.futures[1].finish(
+        sums_of(1)
+    )  # the first copy comes after all, and so does the second, at the same time
     again[0].finish(sums_of(1))
-    again[1].finish(sums_of(2))                          # of this one only the second comes in time
+    again[1].finish(sums_of(2))  # of this one only the second comes in time
     iterate_for(session, 10, lambda: len(session.sums.done) == 3)
     assert again[0].released and client.futures[1].released and client.futures[2].released
     client.futures[2].finish(sums_of(2))
     pass_time(session, 1)
-    with pytest.raises(cluster.ClusterError, match="no worker has finished iteration [34] in 31 s, 3 times"):
+    with pytest.raises(
+        cluster.ClusterError, match="no worker has finished iteration [34] in 31 s, 3 times"
+    ):
         pass_time(session, 60)
         pass_time(session, 60)
     assert session.sums.done == Iterations(3)
@@ -471,13 +694,21 @@ def test_sums_that_cannot_be_fetched(fakes, monkeypatch):
 
 
 def test_sums_in_a_worker_that_hangs_are_asked_of_another(fakes, monkeypatch):
-    """Batches were finished, but their sums cannot be fetched: this keeps nobody from fetching those of others."""
+    """Batches were finished, but their sums cannot be fetched: this keeps nobody from fetching
+    those of others."""
     client, session = fakes
     session.iterate()
     hanging = [future for future in client.futures if future.workers == ["one"]]
     never = asyncio.run_coroutine_threadsafe(asyncio.sleep(1000), client.loop.asyncio_loop)
-    monkeypatch.setattr(client, "gather", lambda future, asynchronous, gather=client.gather:
-                        asyncio.wrap_future(never, loop=client.loop.asyncio_loop) if future in hanging else gather(future, asynchronous))
+    monkeypatch.setattr(
+        client,
+        "gather",
+        lambda future, asynchronous, gather=client.gather: (
+            asyncio.wrap_future(never, loop=client.loop.asyncio_loop)
+            if future in hanging
+            else gather(future, asynchronous)
+        ),
+    )
     for future in hanging:
         future.finish(None)
     pass_time(session, 0)
@@ -485,7 +716,10 @@ def test_sums_in_a_worker_that_hangs_are_asked_of_another(fakes, monkeypatch):
     for _ in range(8):
         client.heartbeats["two"] += 1
         session.iterate()
-    assert session._watch.silent == {"one"} and [future.workers for future in client.futures] == [["one"], ["two"]] * 2 + [["two"]] * 2
+    assert (
+        session._watch.silent == {"one"}
+        and [future.workers for future in client.futures] == [["one"], ["two"]] * 2 + [["two"]] * 2
+    )
     for future in client.futures[1:]:
         if future not in hanging:
             future.finish(sums_of(*eval(future.key.partition(" ")[2])))
@@ -495,13 +729,23 @@ def test_sums_in_a_worker_that_hangs_are_asked_of_another(fakes, monkeypatch):
         return len(session.sums.done) == 4
 
     iterate_for(session, 10, beat)
-    assert session.sums.done == Iterations(4) and all(future.released for future in client.futures[:6])
+    assert session.sums.done == Iterations(4) and all(
+        future.released for future in client.futures[:6]
+    )
     never.cancel()
 
 
-@pytest.mark.parametrize("address, message", [
-    ("tls://127.0.0.1:9", "distributed.comm.tls.ca-file"), ("nonsense", "no scheduler at nonsense: "), ("http://x:1", "no scheduler at http://x:1: "),
-    ("::::", "no scheduler at ::::"), ("tcp://127.0.0.1:x", "no scheduler at tcp://127.0.0.1:x: "), ("inproc://1", "no scheduler at inproc://1: ")])
+@pytest.mark.parametrize(
+    "address, message",
+    [
+        ("tls://127.0.0.1:9", "distributed.comm.tls.ca-file"),
+        ("nonsense", "no scheduler at nonsense: "),
+        ("http://x:1", "no scheduler at http://x:1: "),
+        ("::::", "no scheduler at ::::"),
+        ("tcp://127.0.0.1:x", "no scheduler at tcp://127.0.0.1:x: "),
+        ("inproc://1", "no scheduler at inproc://1: "),
+    ],
+)
 def test_addresses_that_are_none(address, message, monkeypatch):
     monkeypatch.setattr(cluster, "CONNECTION_SECONDS", 1)
     with pytest.raises(cluster.ClusterError, match=message) as raised:

@@ -19,15 +19,22 @@ linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /
 
 
 def start(command: list, folder: Path) -> subprocess.Popen:
-    return subprocess.Popen([*map(str, command), str(SCENE), "-o", str(folder / "a.exr"), "--time", "60"], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-                            text=True, env={**os.environ, "PYTHONPATH": str(ROOT)})
+    return subprocess.Popen(
+        [*map(str, command), str(SCENE), "-o", str(folder / "a.exr"), "--time", "60"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )
 
 
 def wait_for_handlers(process: subprocess.Popen) -> None:
     """Until the process has its handler of SIGTERM, which Python by itself has not."""
     deadline = time.monotonic() + 30
     while time.monotonic() < deadline:
-        caught = re.search(r"^SigCgt:\s*(\w+)", Path("/proc", str(process.pid), "status").read_text(), re.MULTILINE)
+        caught = re.search(
+            r"^SigCgt:\s*(\w+)", Path("/proc", str(process.pid), "status").read_text(), re.MULTILINE
+        )
         if int(caught[1], 16) >> (signal.SIGTERM - 1) & 1:
             return
         time.sleep(0.001)
@@ -39,7 +46,11 @@ def check_stopped(process: subprocess.Popen, folder: Path) -> None:
         out, err = process.communicate(timeout=60)
     finally:
         process.kill()
-    assert (process.returncode, out) == (130, "") and err.startswith("mis-render: interrupted") and err.count("\n") == 1, err
+    assert (
+        (process.returncode, out) == (130, "")
+        and err.startswith("mis-render: interrupted")
+        and err.count("\n") == 1
+    ), err
     assert ("nothing written" in err) == (not (folder / "a.exr").exists())
 
 
@@ -80,7 +91,8 @@ def test_installed_script(tmp_path, delay):
 
 @linux
 def test_module(tmp_path):
-    """``python -m mis_integrators render`` imports the package before its own code runs; from then on it is the same."""
+    """``python -m mis_integrators render`` imports the package before its own code runs; from then
+    on it is the same."""
     process = start([sys.executable, "-m", "mis_integrators", "render"], tmp_path)
     wait_for_handlers(process)
     process.send_signal(signal.SIGINT)
@@ -90,14 +102,32 @@ def test_module(tmp_path):
 def test_nothing_large_is_imported_first():
     """Before the handlers are there."""
     code = "import sys, mis_render; assert not {'mitsuba', 'drjit', 'numpy', 'mis_integrators'} & set(sys.modules)"
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=60, env={**os.environ, "PYTHONPATH": str(ROOT)})
+    subprocess.run(
+        [sys.executable, "-c", code],
+        check=True,
+        timeout=60,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )
 
 
 def test_render_as_before(tmp_path):
     """Image, exit code, and a signal at the very end is of no consequence."""
     scene = shutil.copy(SCENE, tmp_path)
-    done = subprocess.run([*IMPORTED, scene, "--spp", "1", "-i", "path", "--quiet"], capture_output=True, text=True, timeout=100,
-                          env={**os.environ, "PYTHONPATH": str(ROOT)})
-    assert (done.returncode, done.stdout, done.stderr) == (0, "", "") and (tmp_path / "cornell_point.exr").exists()
-    wrong = subprocess.run([*IMPORTED, scene, "--nope"], capture_output=True, text=True, timeout=100, env={**os.environ, "PYTHONPATH": str(ROOT)})
+    done = subprocess.run(
+        [*IMPORTED, scene, "--spp", "1", "-i", "path", "--quiet"],
+        capture_output=True,
+        text=True,
+        timeout=100,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "") and (
+        tmp_path / "cornell_point.exr"
+    ).exists()
+    wrong = subprocess.run(
+        [*IMPORTED, scene, "--nope"],
+        capture_output=True,
+        text=True,
+        timeout=100,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )
     assert wrong.returncode == 2

@@ -1,22 +1,23 @@
-"""What goes wrong in the middle of a render costs what went wrong, and nothing else: values that are not finite, errors, two jobs with one output."""
+"""What goes wrong in the middle of a render costs what went wrong, and nothing else: values that
+are not finite, errors, two jobs with one output."""
 
 import multiprocessing
 import os
-import signal
 import stat
 import subprocess
 import sys
 import time
 
+from mis_integrators import _plugins
+from mis_integrators.app import checkpoint, fingerprint, loading, output
+from mis_integrators.app import target_error as stopping
+from mis_integrators.core.session import MitsubaSession, make_session
+from mis_integrators.core.sums import Iterations, Sums
+
 import mitsuba as mi
 import numpy as np
 import pytest
 from lamplit import ROOT, command, read, render, run, same, write_scene
-
-from mis_integrators import _plugins
-from mis_integrators.app import checkpoint, cli, fingerprint, loading, output, target_error as stopping
-from mis_integrators.core.session import MitsubaSession, make_session
-from mis_integrators.core.sums import Iterations, Sums
 
 
 @pytest.fixture
@@ -38,15 +39,37 @@ def spotted(scene, tmp_path):
 
 @pytest.mark.parametrize("plugin", [*_plugins.PLUGINS, "path"])
 def test_texel_that_is_no_number(spotted, tmp_path, capsys, plugin):
-    """The image is there, finite, and as bright as it should be; the texture is named. Both renders' means have a standard deviation of about 2 %."""
+    """The image is there, finite, and as bright as it should be; the texture is named. Both
+    renders' means have a standard deviation of about 2 %."""
     options = ["-D", "size=32", "-i", plugin, "--spp", 16, "--seed", 1]
-    assert render(spotted, *options, "-D", "picture=nan.exr", "-o", tmp_path / "nan.exr.exr", "--target-error", 0.001) == 0
+    assert (
+        render(
+            spotted,
+            *options,
+            "-D",
+            "picture=nan.exr",
+            "-o",
+            tmp_path / "nan.exr.exr",
+            "--target-error",
+            0.001,
+        )
+        == 0
+    )
     error = capsys.readouterr().err
     header, image = read(tmp_path / "nan.exr.exr")
     assert "reflectance.data of BitmapTexture" in error and error.count("not finite") <= 2, error
-    assert np.isfinite(image).all() and np.isfinite(header["relativeError"]) and header["relativeError"] > 0.001
+    assert (
+        np.isfinite(image).all()
+        and np.isfinite(header["relativeError"])
+        and header["relativeError"] > 0.001
+    )
     mi.Bitmap(np.full((16, 16, 3), 0.5, np.float32)).write(str(tmp_path / "grey.exr"))
-    assert render(spotted, *options, "-D", "picture=grey.exr", "-o", tmp_path / "grey.exr.exr", "--quiet") == 0
+    assert (
+        render(
+            spotted, *options, "-D", "picture=grey.exr", "-o", tmp_path / "grey.exr.exr", "--quiet"
+        )
+        == 0
+    )
     assert image.mean() == pytest.approx(read(tmp_path / "grey.exr.exr")[1].mean(), rel=0.12)
 
 
@@ -92,10 +115,14 @@ def poison(monkeypatch, kind, value, iterations):
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf], ids=str)
 @pytest.mark.parametrize("kind, plugin", [("ours", "bdpt"), ("mitsuba", "path")])
 def test_bad_pixel_costs_its_iterations_only(scene, monkeypatch, value, kind, plugin):
-    """The pixel is the mean over the iterations in which it is finite, and so is its variance; all others are as they were."""
+    """The pixel is the mean over the iterations in which it is finite, and so is its variance; all
+    others are as they were."""
+
     def session():
         loaded = loading.load(scene, {"size": "16"}, plugin, {})
-        made = make_session(loaded.integrator, loaded.scene, loaded.scene.sensors()[0], 3, 64, fine=True)
+        made = make_session(
+            loaded.integrator, loaded.scene, loaded.scene.sensors()[0], 3, 64, fine=True
+        )
         made.keep_variance()
         return made
 
@@ -120,7 +147,9 @@ def test_bad_pixel_costs_its_iterations_only(scene, monkeypatch, value, kind, pl
     if plugin == "path":
         left = np.array([images[number][12, 7, :3] for number in (0, 2, 3, 5)])
         np.testing.assert_allclose(image[12, 7, :3], left.mean(axis=0), rtol=1e-3, atol=1e-5)
-        np.testing.assert_allclose(variance[12, 7], left.var(axis=0, ddof=1) / 4, rtol=1e-2, atol=1e-7)
+        np.testing.assert_allclose(
+            variance[12, 7], left.var(axis=0, ddof=1) / 4, rtol=1e-2, atol=1e-7
+        )
     assert np.isfinite(image).all() and np.isfinite(variance).all() and (image[12, 7, :3] > 0).any()
     assert np.isfinite(stopping.relative_error(mean, variance))
 
@@ -128,7 +157,21 @@ def test_bad_pixel_costs_its_iterations_only(scene, monkeypatch, value, kind, pl
 @pytest.mark.parametrize("value", [np.nan, np.inf], ids=str)
 def test_bad_pixel_is_counted_and_said_once(scene, tmp_path, monkeypatch, capsys, value):
     poison(monkeypatch, "mitsuba", value, (0, 1, 2))
-    assert render(scene, "-D", "size=16", "-o", tmp_path / "a.exr", "--spp", 320, "--target-error", 0.01, "--quiet") == 0
+    assert (
+        render(
+            scene,
+            "-D",
+            "size=16",
+            "-o",
+            tmp_path / "a.exr",
+            "--spp",
+            320,
+            "--target-error",
+            0.01,
+            "--quiet",
+        )
+        == 0
+    )
     error = capsys.readouterr().err
     header, image = read(tmp_path / "a.exr")
     assert error.count("not finite") == 1 and "1 pixels" in error and header["unfinitePixels"] == 1
@@ -164,14 +207,31 @@ def test_bad_pixels_of_many_views(scene, rgb):
     one, other = clean.image(), spoiled.image()
     changed = ~np.isclose(one, other, rtol=1e-4, atol=1e-6).all(axis=2)
     assert 0 < spoiled.unfinite_pixels() <= 18 and changed.sum() <= 18 and np.isfinite(other).all()
-    # Five of eight iterations of the same eight paths a pixel, over 18 pixels: a standard deviation of about 3 %.
+    # Five of eight iterations of the same eight paths a pixel, over 18 pixels: a standard deviation
+    # of about 3 %.
     assert other[changed].mean() == pytest.approx(one[changed].mean(), rel=0.2)
 
 
 def test_black_image_is_said(scene, tmp_path, capsys):
-    assert render(scene, "-i", "bdpm", "-P", "max_depth=0", "-o", tmp_path / "a.exr", "--target-error", 0.1, "--quiet") == 0
+    assert (
+        render(
+            scene,
+            "-i",
+            "bdpm",
+            "-P",
+            "max_depth=0",
+            "-o",
+            tmp_path / "a.exr",
+            "--target-error",
+            0.1,
+            "--quiet",
+        )
+        == 0
+    )
     error = capsys.readouterr().err
-    assert "the image is black" in error and error.count("\n") == 1 and (tmp_path / "a.exr").exists()
+    assert (
+        "the image is black" in error and error.count("\n") == 1 and (tmp_path / "a.exr").exists()
+    )
 
 
 def test_one_pixel_that_is_brighter_than_all_others_together():
@@ -187,7 +247,7 @@ def test_one_pixel_that_is_brighter_than_all_others_together():
 
 
 def failing(monkeypatch, plugin, error, at):
-    from mis_integrators.integrators.common import IterativeSession      # of the active variant
+    from mis_integrators.integrators.common import IterativeSession  # of the active variant
 
     kind = MitsubaSession if plugin == "path" else IterativeSession
     plain = kind.iterate
@@ -201,10 +261,19 @@ def failing(monkeypatch, plugin, error, at):
 
 
 @pytest.mark.parametrize("plugin", ["bdpm", "path", "volpath_multiview"])
-@pytest.mark.parametrize("error, message", [(RuntimeError("the device is gone"), "the device is gone"), (MemoryError(), "not enough memory"),
-                                            (TypeError("a defect"), "TypeError: a defect")])
-def test_error_in_the_middle_keeps_what_is_done(scene, tmp_path, monkeypatch, capsys, plugin, error, message):
-    """Image and checkpoint hold the iterations before it, and a resumed render is that of an undisturbed one."""
+@pytest.mark.parametrize(
+    "error, message",
+    [
+        (RuntimeError("the device is gone"), "the device is gone"),
+        (MemoryError(), "not enough memory"),
+        (TypeError("a defect"), "TypeError: a defect"),
+    ],
+)
+def test_error_in_the_middle_keeps_what_is_done(
+    scene, tmp_path, monkeypatch, capsys, plugin, error, message
+):
+    """Image and checkpoint hold the iterations before it, and a resumed render is that of an
+    undisturbed one."""
     options = ["-i", plugin, "-D", "size=16", "--spp", 64, "--checkpoint", 100, "--seed", 2]
     if plugin != "path":
         options += ["-P", "camera_paths=8"]
@@ -214,7 +283,11 @@ def test_error_in_the_middle_keeps_what_is_done(scene, tmp_path, monkeypatch, ca
         assert render(scene, *options, "-o", tmp_path / "a.exr") == 1
         said = capsys.readouterr().err.splitlines()[-1]
         assert message in said and "what was rendered before is written" in said and "a.exr" in said
-        assert read(tmp_path / "a.exr")[0]["iterations"] == 5 == len(checkpoint.read(tmp_path / "a.checkpoint").done)
+        assert (
+            read(tmp_path / "a.exr")[0]["iterations"]
+            == 5
+            == len(checkpoint.read(tmp_path / "a.checkpoint").done)
+        )
     monkeypatch.setattr("mis_integrators.core.session.PATHS_PER_PASS", 16 * 16 * 8)
     assert render(scene, *options, "-o", tmp_path / "a.exr", "--resume", "--quiet") == 0
     assert render(scene, *options, "-o", tmp_path / "b.exr", "--quiet") == 0
@@ -226,14 +299,21 @@ def test_error_in_the_first_iteration_leaves_nothing(scene, tmp_path, monkeypatc
     failing(monkeypatch, "path", RuntimeError("at once"), 0)
     assert render(scene, "-o", tmp_path / "a.exr", "--checkpoint", 100) == 1
     error = capsys.readouterr().err
-    assert "at once" in error and error.count("\n") == 1 and not (tmp_path / "a.exr").exists() and not (tmp_path / "a.checkpoint").exists()
+    assert (
+        "at once" in error
+        and error.count("\n") == 1
+        and not (tmp_path / "a.exr").exists()
+        and not (tmp_path / "a.checkpoint").exists()
+    )
 
 
 @pytest.mark.parametrize("plugin", ["bdpm", "path"])
 def test_error_while_summing_sums_nothing(scene, plugin, monkeypatch):
     """An iteration of which the half is summed when memory runs out."""
     loaded = loading.load(scene, {"size": "16"}, plugin, {})
-    session = make_session(loaded.integrator, loaded.scene, loaded.scene.sensors()[0], 3, 64, fine=True)
+    session = make_session(
+        loaded.integrator, loaded.scene, loaded.scene.sensors()[0], 3, 64, fine=True
+    )
     session.keep_variance()
     session.iterate()
     before = session.image()
@@ -266,7 +346,11 @@ def test_second_job_is_refused_and_the_first_goes_on(scene, tmp_path):
             time.sleep(0.01)
         for extra in ([], ["--resume"]):
             second = run(command(scene, "-o", tmp_path / "a.exr", "--spp", 1, *extra))
-            assert second.returncode == 3 and f"process {first.pid} on " in second.stderr and second.stderr.count("\n") == 1, second.stderr
+            assert (
+                second.returncode == 3
+                and f"process {first.pid} on " in second.stderr
+                and second.stderr.count("\n") == 1
+            ), second.stderr
         (tmp_path / "link.exr").symlink_to(tmp_path / "a.exr")
         assert run(command(scene, "-o", tmp_path / "link.exr", "--spp", 1)).returncode == 3
         assert first.poll() is None
@@ -279,13 +363,18 @@ def test_second_job_is_refused_and_the_first_goes_on(scene, tmp_path):
 
 
 def test_leftovers_of_the_living_stay(tmp_path):
-    """Temporary files: of a process that lives, of one that does not, of another machine just now and long ago, and what is none of ours."""
+    """Temporary files: of a process that lives, of one that does not, of another machine just now
+    and long ago, and what is none of ours."""
     path = tmp_path / "a.exr"
     mine = output._temporary(path).name
     random = mine.rsplit("-", 1)[1]
     prefix = f".a.exr.{output._host()}-"
     living, dead = f"{prefix}{os.getppid()}-{random}", f"{prefix}999999999-{random}"
-    elsewhere, long_ago, other = f".a.exr.elsewhere-5-{random}", f".a.exr.elsewhere-6-{random}", ".a.exr.of some other program.part"
+    elsewhere, long_ago, other = (
+        f".a.exr.elsewhere-5-{random}",
+        f".a.exr.elsewhere-6-{random}",
+        ".a.exr.of some other program.part",
+    )
     for name in (living, dead, elsewhere, long_ago, other):
         (tmp_path / name).touch()
     os.utime(tmp_path / long_ago, (0, 0))
@@ -300,17 +389,23 @@ def _write(path, value, barrier):
 
 
 def test_writers_do_not_meet(tmp_path):
-    """Two processes, which may have the same number in two containers, write one file: it is that of one of them."""
+    """Two processes, which may have the same number in two containers, write one file: it is that
+    of one of them."""
     context = multiprocessing.get_context("spawn")
     barrier = context.Barrier(2)
-    writers = [context.Process(target=_write, args=(tmp_path / "a.exr", value, barrier)) for value in (1.0, 2.0)]
+    writers = [
+        context.Process(target=_write, args=(tmp_path / "a.exr", value, barrier))
+        for value in (1.0, 2.0)
+    ]
     for writer in writers:
         writer.start()
     for writer in writers:
         writer.join(60)
         assert writer.exitcode == 0
     _, image = read(tmp_path / "a.exr")
-    assert image.min() == image.max() in (1.0, 2.0) and [file.name for file in tmp_path.iterdir()] == ["a.exr"]
+    assert image.min() == image.max() in (1.0, 2.0) and [
+        file.name for file in tmp_path.iterdir()
+    ] == ["a.exr"]
 
 
 def test_names_of_temporary_files_cannot_be_foreseen(tmp_path):
@@ -333,7 +428,9 @@ def test_link_is_followed(scene, tmp_path):
     (tmp_path / "store").mkdir()
     (tmp_path / "a.exr").symlink_to(tmp_path / "store" / "real.exr")
     assert render(scene, "-o", tmp_path / "a.exr", "--spp", 1, "--quiet") == 0
-    assert (tmp_path / "a.exr").is_symlink() and read(tmp_path / "store" / "real.exr")[0]["spp"] == 1
+    assert (tmp_path / "a.exr").is_symlink() and read(tmp_path / "store" / "real.exr")[0][
+        "spp"
+    ] == 1
     assert sorted(file.name for file in (tmp_path / "store").iterdir()) == ["real.exr"]
 
 
@@ -385,7 +482,11 @@ def test_fingerprint_is_of_every_source(tmp_path):
     def fingerprint_of(folder):
         return run([sys.executable, "-c", program, str(folder)]).stdout
 
-    shutil.copytree(ROOT / "mis_integrators", tmp_path / "mis_integrators", ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(
+        ROOT / "mis_integrators",
+        tmp_path / "mis_integrators",
+        ignore=shutil.ignore_patterns("__pycache__"),
+    )
     before = fingerprint_of(tmp_path)
     assert before == fingerprint_of(ROOT) and len(before.strip()) == 12
     module = tmp_path / "mis_integrators" / "weights" / "heuristics.py"

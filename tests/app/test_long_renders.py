@@ -1,4 +1,5 @@
-"""Renders that are stopped, killed, resumed, or run until they are good enough: nothing that was rendered is lost, and nothing is summed twice."""
+"""Renders that are stopped, killed, resumed, or run until they are good enough: nothing that was
+rendered is lost, and nothing is summed twice."""
 
 import errno
 import os
@@ -9,19 +10,18 @@ import sys
 import time
 from pathlib import Path
 
-import mitsuba as mi
-import numpy as np
-import pytest
-from lamplit import LAMP, ROOT, SCENE, command, read, render, run, same, write_scene
-
-from test_auto import set_price_of_path
-from test_bdpm import always_choose_camera_paths
-
-from mis_integrators.app import checkpoint, cli, fingerprint, loading, output, target_error as stopping
+from mis_integrators.app import checkpoint, cli, fingerprint, loading, output
+from mis_integrators.app import target_error as stopping
 from mis_integrators.app.checkpoint import Checkpoint, CheckpointError
 from mis_integrators.core.session import make_session
 from mis_integrators.core.sums import Iterations, Sums
 
+import mitsuba as mi
+import numpy as np
+import pytest
+from lamplit import LAMP, ROOT, SCENE, command, read, render, run, same, write_scene
+from test_auto import set_price_of_path
+from test_bdpm import always_choose_camera_paths
 
 
 @pytest.fixture
@@ -64,7 +64,10 @@ def test_sums_are_merged_once():
     sums.merge({"total": np.ones((2, 2))}, Iterations(0, (1,)))
     sums.merge({"total": np.ones((2, 2))}, Iterations(1))
     np.testing.assert_array_equal(sums["total"], 2)
-    for arrays, done in (({"total": np.ones((2, 2))}, Iterations(1)), ({"total": np.ones((3, 2))}, Iterations(0, (5,)))):
+    for arrays, done in (
+        ({"total": np.ones((2, 2))}, Iterations(1)),
+        ({"total": np.ones((3, 2))}, Iterations(0, (5,))),
+    ):
         with pytest.raises(ValueError):
             sums.merge(arrays, done)
     np.testing.assert_array_equal(sums["total"], 2)
@@ -75,7 +78,8 @@ def test_sums_are_merged_once():
 
 @pytest.mark.parametrize("comment", ["<!-- one -->", "<!-- a -- b, value='none.ply' -->"])
 def test_scene_that_only_mitsuba_takes_has_its_digests(tmp_path, rgb, comment):
-    """Values too long for the name of a file, and comments that XML forbids but Mitsuba's parser does not."""
+    """Values too long for the name of a file, and comments that XML forbids but Mitsuba's parser
+    does not."""
     spectrum = ", ".join(f"{wavelength}:0.5" for wavelength in range(400, 700, 2))
     (tmp_path / "it's & co.bmp").write_bytes(b"picture")
     (tmp_path / "none.ply").write_bytes(b"commented out")
@@ -99,20 +103,29 @@ PLUGINS = {
     "volpath_multiview": {},
     "path": {},
 }
-REST = {"bdpm": {"bdd": 0}, "bdpm_opt2": {"initial_radius": 0.1}, "bdpm_opt": {"weights": "full"}, "bdpm_balance": {},
-        "pcbpt": {"light_paths": 20}, "ptracer": {}}
+REST = {
+    "bdpm": {"bdd": 0},
+    "bdpm_opt2": {"initial_radius": 0.1},
+    "bdpm_opt": {"weights": "full"},
+    "bdpm_balance": {},
+    "pcbpt": {"light_paths": 20},
+    "ptracer": {},
+}
 
 
 @pytest.mark.parametrize(
     "plugin", [*PLUGINS, *(pytest.param(plugin, marks=pytest.mark.full) for plugin in REST)]
 )
 def test_resumed_session_goes_on_as_if_nothing_had_been(scene, plugin):
-    """Iterations 0 to 4 in one session; the same, of which the first two pass through a checkpoint, and 4 comes before 2 and 3."""
+    """Iterations 0 to 4 in one session; the same, of which the first two pass through a checkpoint,
+    and 4 comes before 2 and 3."""
     loaded = loading.load(scene, {"size": "16"}, plugin, {**PLUGINS, **REST}[plugin])
     file = scene.with_name("a.checkpoint")
 
     def session():
-        made = make_session(loaded.integrator, loaded.scene, loaded.scene.sensors()[0], 3, 10, fine=True)
+        made = make_session(
+            loaded.integrator, loaded.scene, loaded.scene.sensors()[0], 3, 10, fine=True
+        )
         made.keep_variance()
         return made
 
@@ -124,7 +137,9 @@ def test_resumed_session_goes_on_as_if_nothing_had_been(scene, plugin):
     first.iterate()
     half = first.image()
     assert all(np.array(tensor).dtype == np.float64 for tensor in first.sums.tensors.values())
-    checkpoint.write(file, Checkpoint({}, first.learned, first.sums.done, 1.5, 0.5, first.sums.arrays()))
+    checkpoint.write(
+        file, Checkpoint({}, first.learned, first.sums.done, 1.5, 0.5, first.sums.arrays())
+    )
     found = checkpoint.read(file)
     assert (found.seconds, found.compiling, found.done.below) == (1.5, 0.5, 2)
     second = session()
@@ -137,7 +152,9 @@ def test_resumed_session_goes_on_as_if_nothing_had_been(scene, plugin):
     assert second.iterations == 5 and second.sums.done.below == 5
     assert same(whole.image(), second.image())
     assert not np.allclose(whole.image(), half, rtol=1e-2)
-    assert [key for key in second.settings if key.startswith("radius")] == [key for key in whole.settings if key.startswith("radius")]
+    assert [key for key in second.settings if key.startswith("radius")] == [
+        key for key in whole.settings if key.startswith("radius")
+    ]
     for one, other in zip(whole.estimate(), second.estimate()):
         np.testing.assert_allclose(one, other, rtol=2e-3, atol=1e-4 * one.mean())
 
@@ -146,8 +163,11 @@ def test_learned_radii_are_not_learned_again(scene):
     """With a time limit the pilot hangs on the clock, so a resumed render must not have another."""
     loaded = loading.load(scene, {"size": "16"}, "bdpm", {"bdd": 0})
     session = make_session(loaded.integrator, loaded.scene, loaded.scene.sensors()[0], 3, 0)
-    learned = {"radii": {kind: 0.123 for kind in session.kinds()}, "corrected": {kind: False for kind in session.kinds()},
-               "camera_paths": 2}
+    learned = {
+        "radii": dict.fromkeys(session.kinds(), 0.123),
+        "corrected": dict.fromkeys(session.kinds(), False),
+        "camera_paths": 2,
+    }
     session.recall(learned)
     session.plan_time(5.0)
     session.iterate()
@@ -156,11 +176,25 @@ def test_learned_radii_are_not_learned_again(scene):
 
 @pytest.mark.parametrize("plugin", ["bdpm", "path"])
 def test_killed_process_resumes(scene, tmp_path, plugin):
-    """Killed twice, the first time right after a checkpoint, the second time at some moment: the image is that of the undisturbed process."""
-    options = ["-i", plugin, *{"bdpm": ["--spp", 256, "-D", "size=32"],
-                               "path": ["--spp", 2048, "-D", "size=64", "--target-error", 1e-9]}[plugin], "--seed", 5]
-    assert run(command(scene, *options, "--checkpoint", 1000, "-o", tmp_path / "whole.exr")).returncode == 0
-    arguments = command(scene, *options, "-o", tmp_path / "killed.exr", "--checkpoint", 0.001, "--resume")
+    """Killed twice, the first time right after a checkpoint, the second time at some moment: the
+    image is that of the undisturbed process."""
+    options = [
+        "-i",
+        plugin,
+        *{
+            "bdpm": ["--spp", 256, "-D", "size=32"],
+            "path": ["--spp", 2048, "-D", "size=64", "--target-error", 1e-9],
+        }[plugin],
+        "--seed",
+        5,
+    ]
+    assert (
+        run(command(scene, *options, "--checkpoint", 1000, "-o", tmp_path / "whole.exr")).returncode
+        == 0
+    )
+    arguments = command(
+        scene, *options, "-o", tmp_path / "killed.exr", "--checkpoint", 0.001, "--resume"
+    )
     file = tmp_path / "killed.checkpoint"
     counts = []
     for extra in (0.0, 0.13):
@@ -168,7 +202,9 @@ def test_killed_process_resumes(scene, tmp_path, plugin):
         process = subprocess.Popen(arguments, cwd=ROOT, stderr=subprocess.DEVNULL)
         try:
             deadline = time.monotonic() + 100
-            while process.poll() is None and not (file.exists() and file.stat().st_mtime_ns > before):
+            while process.poll() is None and not (
+                file.exists() and file.stat().st_mtime_ns > before
+            ):
                 assert time.monotonic() < deadline
                 time.sleep(0.001)
             time.sleep(extra)
@@ -177,20 +213,28 @@ def test_killed_process_resumes(scene, tmp_path, plugin):
         process.wait()
         counts.append(len(checkpoint.read(file).done))
     assert 0 < counts[0] <= counts[1]
-    assert process.returncode == -signal.SIGKILL and not (tmp_path / "killed.exr").exists(), "it was over before it was killed"
-    leftover = output._temporary(file)           # what writers leave that were killed, of this version and of an earlier one
+    assert process.returncode == -signal.SIGKILL and not (tmp_path / "killed.exr").exists(), (
+        "it was over before it was killed"
+    )
+    leftover = output._temporary(
+        file
+    )  # what writers leave that were killed, of this version and of an earlier one
     leftover.rename(leftover.with_name(leftover.name.replace(f"-{os.getpid()}-", "-999999999-")))
     (tmp_path / ".killed.checkpoint.123.part").touch()
     final = run(arguments)
     assert final.returncode == 0, final.stderr
-    (header, image), (expected_header, expected) = read(tmp_path / "killed.exr"), read(tmp_path / "whole.exr")
+    (header, image), (expected_header, expected) = (
+        read(tmp_path / "killed.exr"),
+        read(tmp_path / "whole.exr"),
+    )
     assert header["iterations"] == expected_header["iterations"] > counts[1]
     assert same(expected, image)
     assert not list(tmp_path.glob(".*.part"))
 
 
 def test_finished_render_is_extended(scene, tmp_path, capsys):
-    """A render of four samples that goes on to eight is one of eight; one that has enough is written as it is."""
+    """A render of four samples that goes on to eight is one of eight; one that has enough is
+    written as it is."""
     out = ["-i", "bdpt", "-o", tmp_path / "a.exr"]
     assert render(scene, *out, "--spp", 4, "--checkpoint", 100) == 0
     assert render(scene, *out, "--spp", 8, "--resume", "--quiet") == 0
@@ -205,9 +249,17 @@ def test_finished_render_is_extended(scene, tmp_path, capsys):
     assert "--resume" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("arguments, price", [
-    (["-i", "bdpm", "-P", "bdd=0", "-D", "size=16"], None), (["-i", "bdpm_auto", "-P", "max_depth=4"], 1e-6), (["-i", "bdpm_auto", "-P", "max_depth=4"], 1e6),
-    (["-i", "bdpm_opt2", "-P", "mix_diffuse=true"], None), (["-i", "volpath_multiview"], None), (["-i", "path"], None)])
+@pytest.mark.parametrize(
+    "arguments, price",
+    [
+        (["-i", "bdpm", "-P", "bdd=0", "-D", "size=16"], None),
+        (["-i", "bdpm_auto", "-P", "max_depth=4"], 1e-6),
+        (["-i", "bdpm_auto", "-P", "max_depth=4"], 1e6),
+        (["-i", "bdpm_opt2", "-P", "mix_diffuse=true"], None),
+        (["-i", "volpath_multiview"], None),
+        (["-i", "path"], None),
+    ],
+)
 def test_image_is_rendered_again_from_itself(scene, tmp_path, monkeypatch, arguments, price):
     """Whatever the clock decided: camera paths, radii, the method, the number of iterations."""
     always_choose_camera_paths(monkeypatch, 3)
@@ -218,8 +270,14 @@ def test_image_is_rendered_again_from_itself(scene, tmp_path, monkeypatch, argum
     monkeypatch.undo()
     assert render(scene, "--like", one, "-o", other) == 0
     (told, image), (again, same_image) = read(one), read(other)
-    told, again = ({name: value for name, value in header.items() if isinstance(value, (int, float, str)) and not name.endswith("Time")}
-                   for header in (told, again))
+    told, again = (
+        {
+            name: value
+            for name, value in header.items()
+            if isinstance(value, (int, float, str)) and not name.endswith("Time")
+        }
+        for header in (told, again)
+    )
     del told["again"], again["again"]
     assert told == again
     assert same(image, same_image) and told["seed"] == 7
@@ -227,12 +285,19 @@ def test_image_is_rendered_again_from_itself(scene, tmp_path, monkeypatch, argum
         assert told["camera_paths"] == 3 and told["spp"] == 3 * told["iterations"]
 
 
-@pytest.mark.parametrize("plugin, price, paths", [("bdpm", None, 3), ("bdpm_auto", 1e6, 3), ("bdpm_auto", 1e-6, 4)])
-def test_samples_asked_for_are_made_whatever_was_learned(scene, tmp_path, monkeypatch, plugin, price, paths):
-    """A timed render that takes several camera paths an iteration goes on to a number of samples."""
+@pytest.mark.parametrize(
+    "plugin, price, paths", [("bdpm", None, 3), ("bdpm_auto", 1e6, 3), ("bdpm_auto", 1e-6, 4)]
+)
+def test_samples_asked_for_are_made_whatever_was_learned(
+    scene, tmp_path, monkeypatch, plugin, price, paths
+):
+    """A timed render that takes several camera paths an iteration goes on to a number of
+    samples."""
     always_choose_camera_paths(monkeypatch, 3)
     film = loading.load(scene, {}, plugin, {}).scene.sensors()[0].film()
-    monkeypatch.setattr("mis_integrators.integrators.unidirectional.BUSY", 4 * int(np.prod(film.size())))
+    monkeypatch.setattr(
+        "mis_integrators.integrators.unidirectional.BUSY", 4 * int(np.prod(film.size()))
+    )
     if price:
         set_price_of_path(monkeypatch, price)
     out = ["-i", plugin, "-o", tmp_path / "a.exr"]
@@ -241,13 +306,23 @@ def test_samples_asked_for_are_made_whatever_was_learned(scene, tmp_path, monkey
     assert header["camera_paths"] == paths and header["spp"] == paths * header["iterations"]
     assert render(scene, *out, "--spp", header["spp"] + 3 * paths, "--resume") == 0
     longer, _ = read(tmp_path / "a.exr")
-    assert longer["spp"] - header["spp"] == 3 * paths and longer["iterations"] == header["iterations"] + 3
+    assert (
+        longer["spp"] - header["spp"] == 3 * paths
+        and longer["iterations"] == header["iterations"] + 3
+    )
 
 
-@pytest.mark.parametrize("image, arguments, code, message", [
-    ("picture.exr", [], 1, "not an image of mis-render"), ("scene.xml", [], 1, "not an image"), ("none.exr", [], 1, "cannot be read"),
-    ("picture.exr", ["--seed", 3], 2, "argument --seed: not allowed with argument --like"), ("picture.exr", ["--seed", 0], 2, "argument --seed: not allowed"),
-    ("a.exr", [], 2, "is the image of --like")])
+@pytest.mark.parametrize(
+    "image, arguments, code, message",
+    [
+        ("picture.exr", [], 1, "not an image of mis-render"),
+        ("scene.xml", [], 1, "not an image"),
+        ("none.exr", [], 1, "cannot be read"),
+        ("picture.exr", ["--seed", 3], 2, "argument --seed: not allowed with argument --like"),
+        ("picture.exr", ["--seed", 0], 2, "argument --seed: not allowed"),
+        ("a.exr", [], 2, "is the image of --like"),
+    ],
+)
 def test_what_cannot_be_rendered_again(scene, tmp_path, capsys, image, arguments, code, message):
     mi.Bitmap(np.zeros((4, 4, 3), np.float32)).write(str(tmp_path / "picture.exr"))
     try:
@@ -260,7 +335,10 @@ def test_what_cannot_be_rendered_again(scene, tmp_path, capsys, image, arguments
 
 def test_sigterm_is_like_ctrl_c(scene, tmp_path):
     process = subprocess.Popen(
-        command(scene, "-o", tmp_path / "a.exr", "--time", 100, "--checkpoint", 0.1), cwd=ROOT, stderr=subprocess.PIPE, text=True
+        command(scene, "-o", tmp_path / "a.exr", "--time", 100, "--checkpoint", 0.1),
+        cwd=ROOT,
+        stderr=subprocess.PIPE,
+        text=True,
     )
     try:
         deadline = time.monotonic() + 60
@@ -271,7 +349,9 @@ def test_sigterm_is_like_ctrl_c(scene, tmp_path):
         assert "interrupted after" in process.stderr.read()
     finally:
         process.kill()
-    assert read(tmp_path / "a.exr")[0]["iterations"] == len(checkpoint.read(tmp_path / "a.checkpoint").done)
+    assert read(tmp_path / "a.exr")[0]["iterations"] == len(
+        checkpoint.read(tmp_path / "a.checkpoint").done
+    )
 
 
 # --- What is refused --------------------------------------------------------------------------------
@@ -280,12 +360,27 @@ def test_sigterm_is_like_ctrl_c(scene, tmp_path):
 @pytest.fixture
 def kept(scene, tmp_path) -> Path:
     """The checkpoint of a finished render, of `bdpm`."""
-    assert render(scene, "-i", "bdpm", "-o", tmp_path / "a.exr", "--spp", 2, "--checkpoint", 100, "--quiet") == 0
+    assert (
+        render(
+            scene,
+            "-i",
+            "bdpm",
+            "-o",
+            tmp_path / "a.exr",
+            "--spp",
+            2,
+            "--checkpoint",
+            100,
+            "--quiet",
+        )
+        == 0
+    )
     return tmp_path / "a.checkpoint"
 
 
 def test_other_renders_are_refused(scene, kept, tmp_path, capsys):
     """One line that names what differs, for everything that may."""
+
     def refused(*arguments):
         plugin = [] if "-i" in arguments else ["-i", "bdpm"]
         code = render(scene, *plugin, "-o", tmp_path / "a.exr", "--spp", 4, "--resume", *arguments)
@@ -300,7 +395,11 @@ def test_other_renders_are_refused(scene, kept, tmp_path, capsys):
     assert "llvm_ad_mono" in refused("--variant", "llvm_ad_mono")
     assert "other.png is new" in refused("-D", "picture=other.png")
     assert "-D size = (default), not 12" in refused("-D", "size=12")
-    for name, change in (("scene.xml", SCENE.replace("0.6", "0.61")), ("lamp.xml", LAMP.replace("5, 4", "5, 5")), ("lamp.spd", "400 0.5\n700 0.7\n")):
+    for name, change in (
+        ("scene.xml", SCENE.replace("0.6", "0.61")),
+        ("lamp.xml", LAMP.replace("5, 4", "5, 5")),
+        ("lamp.spd", "400 0.5\n700 0.7\n"),
+    ):
         before = (tmp_path / name).read_text()
         (tmp_path / name).write_text(change)
         assert f"{name} has changed" in refused()
@@ -325,7 +424,14 @@ def test_damage_is_found(kept, tmp_path, scene, capsys):
         with pytest.raises(CheckpointError, match="damaged"):
             checkpoint.read(damaged)
         content[place // 8] ^= 1 << place % 8
-    for part in (b"", content[:10], content[:40], content[: len(content) // 2], content[:-1], content + b"\0"):
+    for part in (
+        b"",
+        content[:10],
+        content[:40],
+        content[: len(content) // 2],
+        content[:-1],
+        content + b"\0",
+    ):
         damaged.write_bytes(part)
         with pytest.raises(CheckpointError, match="damaged"):
             checkpoint.read(damaged)
@@ -340,7 +446,8 @@ def test_damage_is_found(kept, tmp_path, scene, capsys):
 
 
 def test_full_disk_leaves_the_checkpoint_and_the_image_before(scene, tmp_path):
-    """Files may not become longer than 1000 bytes, which is what a disk that fills up looks like to a writer."""
+    """Files may not become longer than 1000 bytes, which is what a disk that fills up looks like to
+    a writer."""
     options = ["-i", "path", "-o", tmp_path / "a.exr", "-D", "size=48"]
     assert run(command(scene, *options, "--spp", 64, "--checkpoint", 100)).returncode == 0
     files = [tmp_path / f"a.{suffix}" for suffix in ("checkpoint", "exr", "png")]
@@ -352,7 +459,9 @@ def test_full_disk_leaves_the_checkpoint_and_the_image_before(scene, tmp_path):
     )
     assert limited.returncode == 3
     complaints = [line for line in limited.stderr.splitlines() if line.startswith("mis-render")]
-    assert [line.count("cannot write") for line in complaints] == [1, 1], limited.stderr      # each once: the checkpoint, the image
+    assert [line.count("cannot write") for line in complaints] == [1, 1], (
+        limited.stderr
+    )  # each once: the checkpoint, the image
     assert "a.checkpoint: File too large" in complaints[0] and "a.exr" in complaints[1]
     assert [file.read_bytes() for file in files] == before
     assert not list(tmp_path.glob(".*.part"))
@@ -361,7 +470,8 @@ def test_full_disk_leaves_the_checkpoint_and_the_image_before(scene, tmp_path):
 
 
 def test_render_goes_on_when_a_checkpoint_fails(scene, tmp_path, monkeypatch, capsys):
-    """No space is left for a while: said once, the render goes on, and the checkpoint is written when there is room again."""
+    """No space is left for a while: said once, the render goes on, and the checkpoint is written
+    when there is room again."""
     fsync, calls = os.fsync, []
 
     def failing(descriptor):
@@ -371,9 +481,27 @@ def test_render_goes_on_when_a_checkpoint_fails(scene, tmp_path, monkeypatch, ca
         return fsync(descriptor)
 
     monkeypatch.setattr(os, "fsync", failing)
-    assert render(scene, "-i", "bdpt", "-o", tmp_path / "a.exr", "--spp", 6, "--checkpoint", 1e-6, "--quiet") == 0
+    assert (
+        render(
+            scene,
+            "-i",
+            "bdpt",
+            "-o",
+            tmp_path / "a.exr",
+            "--spp",
+            6,
+            "--checkpoint",
+            1e-6,
+            "--quiet",
+        )
+        == 0
+    )
     error = capsys.readouterr().err
-    assert error.count("No space left on device") == 1 and error.count("\n") == 1 and "a.checkpoint" in error
+    assert (
+        error.count("No space left on device") == 1
+        and error.count("\n") == 1
+        and "a.checkpoint" in error
+    )
     assert len(checkpoint.read(tmp_path / "a.checkpoint").done) == 6
 
 
@@ -405,7 +533,10 @@ def test_preview_is_a_whole_picture_at_any_moment(scene, tmp_path, monkeypatch):
         def watched():
             if (tmp_path / "a.preview.exr").exists():
                 header, image = read(tmp_path / "a.preview.exr")
-                assert same(image[..., ::-1], session.image()) and (tmp_path / "a.preview.png").exists()   # channels are sorted: B, G, R
+                assert (
+                    same(image[..., ::-1], session.image())
+                    and (tmp_path / "a.preview.png").exists()
+                )  # channels are sorted: B, G, R
                 seen.append(header["iterations"])
             plain()
 
@@ -413,7 +544,12 @@ def test_preview_is_a_whole_picture_at_any_moment(scene, tmp_path, monkeypatch):
         iterate(session, *rest)
 
     monkeypatch.setattr(cli, "iterate", watching)
-    assert render(scene, "-i", "bdpt", "-o", tmp_path / "a.exr", "--spp", 5, "--preview", 1e-6, "--quiet") == 0
+    assert (
+        render(
+            scene, "-i", "bdpt", "-o", tmp_path / "a.exr", "--spp", 5, "--preview", 1e-6, "--quiet"
+        )
+        == 0
+    )
     assert seen == [1, 2, 3, 4]
     assert sorted(file.name for file in tmp_path.glob("a.*")) == ["a.exr", "a.png"]
 
@@ -422,7 +558,8 @@ def test_preview_is_a_whole_picture_at_any_moment(scene, tmp_path, monkeypatch):
 
 
 def test_relative_error_of_known_noise():
-    """Gaussian noise of standard deviation 0.2 on a picture of brightness 1 and 3, 100 iterations; then a few pixels that flash."""
+    """Gaussian noise of standard deviation 0.2 on a picture of brightness 1 and 3, 100 iterations;
+    then a few pixels that flash."""
     random = np.random.default_rng(1)
     truth = np.where(np.arange(64)[:, None, None] < 32, 1.0, 3.0) * np.ones((64, 64, 3))
     samples = truth + 0.2 * random.standard_normal((100, 64, 64, 3))
@@ -437,16 +574,32 @@ def test_relative_error_of_known_noise():
     assert stopping.relative_error(np.zeros((4, 4, 3)), np.zeros((4, 4, 3))) == 0
 
 
-@pytest.mark.parametrize("plugin, parameters", [
-    ("path", {}), ("bdpm", {"bdd": 0, "initial_radius": 0.3}),
-    *(pytest.param(plugin, {}, marks=pytest.mark.full) for plugin in ("bdpt", "vcm", "volpath_multiview"))])
+@pytest.mark.parametrize(
+    "plugin, parameters",
+    [
+        ("path", {}),
+        ("bdpm", {"bdd": 0, "initial_radius": 0.3}),
+        *(
+            pytest.param(plugin, {}, marks=pytest.mark.full)
+            for plugin in ("bdpt", "vcm", "volpath_multiview")
+        ),
+    ],
+)
 def test_estimated_error_is_the_error(scene, plugin, parameters):
-    """Against the mean of 12 other renders. Each render's squared error sums over 1024 pixels, those of `bdpm` correlated over some hundred:
-    the mean of three ratios has a standard deviation below 7 %."""
+    """Against the mean of 12 other renders. Each render's squared error sums over 1024 pixels,
+    those of `bdpm` correlated over some hundred: the mean of three ratios has a standard deviation
+    below 7 %."""
     loaded = loading.load(scene, {"size": "32"}, plugin, parameters)
     images, estimates = [], []
     for seed in range(15):
-        session = make_session(loaded.integrator, loaded.scene, loaded.scene.sensors()[0], seed, 32 * 16 if plugin == "path" else 16, fine=True)
+        session = make_session(
+            loaded.integrator,
+            loaded.scene,
+            loaded.scene.sensors()[0],
+            seed,
+            32 * 16 if plugin == "path" else 16,
+            fine=True,
+        )
         if seed < 3:
             session.keep_variance()
         for _ in range(16):
@@ -471,11 +624,16 @@ def test_target_error_stops_the_render(scene, tmp_path, capsys):
         assert 0.8 * target < header["relativeError"] <= target
         errors[target] = header["iterations"]
         assert "relative error 0.0" in capsys.readouterr().err
-    assert 3 < errors[0.05] / errors[0.1] < 5.3                                             # four times as many, but for steps
-    assert render(scene, "-i", "bdpt", "-o", tmp_path / "a.exr", "--target-error", 0.001, "--spp", 10) == 0
+    assert 3 < errors[0.05] / errors[0.1] < 5.3  # four times as many, but for steps
+    assert (
+        render(scene, "-i", "bdpt", "-o", tmp_path / "a.exr", "--target-error", 0.001, "--spp", 10)
+        == 0
+    )
     assert read(tmp_path / "a.exr")[0]["iterations"] == 10
     assert "(target 0.001 not reached)" in capsys.readouterr().err
-    assert render(scene, "-o", tmp_path / "a.exr", "--target-error", 0.2, "--quiet") == 0  # path, in passes
+    assert (
+        render(scene, "-o", tmp_path / "a.exr", "--target-error", 0.2, "--quiet") == 0
+    )  # path, in passes
     assert read(tmp_path / "a.exr")[0]["relativeError"] <= 0.2
 
 
@@ -501,7 +659,14 @@ for count in (30, 130):
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
-@pytest.mark.parametrize("plugin", ["bdpm_opt3", "path", *(pytest.param(p, marks=pytest.mark.full) for p in ("bdpt", "vcm", "volpath_multiview"))])
+@pytest.mark.parametrize(
+    "plugin",
+    [
+        "bdpm_opt3",
+        "path",
+        *(pytest.param(p, marks=pytest.mark.full) for p in ("bdpt", "vcm", "volpath_multiview")),
+    ],
+)
 def test_memory_does_not_grow(scene, plugin):
     """One hundred iterations more: less than 100 kB each would show as 10 MB."""
     result = run([sys.executable, "-c", MEMORY, str(scene), plugin])

@@ -1,26 +1,27 @@
-"""What the benchmarks conclude from figures: breaks, choices, fronts, regressions, styles, pages."""
+"""What the benchmarks conclude from figures: breaks, choices, fronts, regressions, styles,
+pages."""
 
 import json
 import math
 from pathlib import Path
 from types import SimpleNamespace
 
-import mitsuba as mi
-import numpy as np
-import pytest
-
-from foggy import THREE_VIEWS
 from mis_integrators.analysis.fronts import pareto_front
 from mis_integrators.analysis.metrics import References
 from mis_integrators.analysis.stability import Point, breaks, choose, judge
 from mis_integrators.analysis.zooms import telling_windows
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from foggy import THREE_VIEWS
 from test_bdpm import box_scene
 
 SCENES = Path(__file__).parents[2] / "scenes"
 
 
 def points(*errors, off=()):
-    return [Point(2.0 ** i, error, 0.2 if i in off else 0.0, 0.001) for i, error in enumerate(errors)]
+    return [Point(2.0**i, error, 0.2 if i in off else 0.0, 0.001) for i, error in enumerate(errors)]
 
 
 # --- Analysis -------------------------------------------------------------------------------------------
@@ -37,7 +38,11 @@ def test_breaks_by_error_and_by_mean():
 
 
 def test_mean_that_is_off_within_the_noise_is_not_off():
-    assert Point(1, 1, 0.06, 0.001).mean_is_off and not Point(1, 1, 0.06, 0.03).mean_is_off and not Point(1, 1, 0.04, 0.001).mean_is_off
+    assert (
+        Point(1, 1, 0.06, 0.001).mean_is_off
+        and not Point(1, 1, 0.06, 0.03).mean_is_off
+        and not Point(1, 1, 0.04, 0.001).mean_is_off
+    )
 
 
 @pytest.mark.parametrize("factor, off", [(1.0, False), (1.2, True), (0.85, True), (1.02, False)])
@@ -49,13 +54,19 @@ def test_judged_image(factor, off):
     noise = [truth * (1 + rng.normal(0, 0.1, truth.shape)) for _ in range(3)]
     judged = judge(1, noise[0] * factor, References(noise[1], noise[2], "", True))
     assert judged.mean_is_off == off
-    assert judge(1, np.where(truth > 100, np.nan, truth), References(noise[1], noise[2], "", True)).mean_is_off
+    assert judge(
+        1, np.where(truth > 100, np.nan, truth), References(noise[1], noise[2], "", True)
+    ).mean_is_off
 
 
 def test_choice_follows_from_the_figures():
-    a, b, c = points(1, 1, 1, 9), points(2, 0.9, 0.5, 0.4), points(0.1, 0.1, 0.1, 0.1, off=[0, 1, 2, 3])
+    a, b, c = (
+        points(1, 1, 1, 9),
+        points(2, 0.9, 0.5, 0.4),
+        points(0.1, 0.1, 0.1, 0.1, off=[0, 1, 2, 3]),
+    )
     first, second = choose({"a": a, "b": b, "c": c})
-    assert (first.low, first.high, first.best) == (1, 2, "a")          # b is better at 2, but hardly
+    assert (first.low, first.high, first.best) == (1, 2, "a")  # b is better at 2, but hardly
     assert (second.low, second.high, second.best, second.close) == (4, 8, "b", ())
     assert "c" in first.broken and "a" in second.broken and "b" not in second.broken
     assert [choice.best for choice in choose({"c": c})] == ["none"]
@@ -64,14 +75,17 @@ def test_choice_follows_from_the_figures():
 def test_zoom_shows_where_methods_differ():
     maps = [np.full((64, 64), 0.1) for _ in range(4)]
     maps[0][40:56, 8:24] = maps[1][40:56, 8:24] = 0.8
-    maps[3][:] = 1.0                                                   # fails everywhere, tells nothing
+    maps[3][:] = 1.0  # fails everywhere, tells nothing
     (y, x), second = telling_windows(maps, 16)
     assert (y, x) == (40, 8) and (abs(second[0] - y) >= 16 or abs(second[1] - x) >= 16)
 
 
 def test_method_keeps_its_style():
     charts = pytest.importorskip("mis_integrators.analysis.charts")
-    few, many = charts.styles(["path", "bdpm:bdd=0", "new"]), charts.styles(["vcm", "bdpm:bdd=0", "path", "bdpm:bdd=1", "new"])
+    few, many = (
+        charts.styles(["path", "bdpm:bdd=0", "new"]),
+        charts.styles(["vcm", "bdpm:bdd=0", "path", "bdpm:bdd=1", "new"]),
+    )
     assert all(few[label] == many[label] for label in few)
     assert len({(s.colour, s.marker) for s in many.values()}) == len(many)
 
@@ -80,19 +94,39 @@ def test_method_keeps_its_style():
 
 
 def row(method, ratio, error=0.01, seeds=6):
-    figures = {name: value for ratio_name in ("cost ratio", "relMSE ratio", "trimmed ratio")
-               for name, value in ((ratio_name, ratio), (f"{ratio_name} error", error))}
-    return {"scene": "s", "size": "8x8", "method": method, "asked": "1 s", "seeds": seeds, **figures}
+    figures = {
+        name: value
+        for ratio_name in ("cost ratio", "relMSE ratio", "trimmed ratio")
+        for name, value in ((ratio_name, ratio), (f"{ratio_name} error", error))
+    }
+    return {
+        "scene": "s",
+        "size": "8x8",
+        "method": method,
+        "asked": "1 s",
+        "seeds": seeds,
+        **figures,
+    }
 
 
 def test_regressions_beyond_the_noise_are_named(module, tmp_path, capsys):
     regressions = module("regressions")
     before = [row("path", 1.0, 0.0), row("a", 1.0), row("b", 2.0)]
-    now = [row("path", 1.0, 0.0), {**row("a", 1.02), "cost ratio": 1.3}, {**row("b", 2.02), "relMSE ratio": 1.0}, row("new", 1.0)]
+    now = [
+        row("path", 1.0, 0.0),
+        {**row("a", 1.02), "cost ratio": 1.3},
+        {**row("b", 2.02), "relMSE ratio": 1.0},
+        row("new", 1.0),
+    ]
     changes, compared = regressions.find_changes(now, before)
     assert compared == 6
-    assert [(change["method"], change["what"]) for change in changes] == [("a", "slower"), ("b", "less so: noisier")]
-    assert changes[0]["change"] == pytest.approx(1.3) and changes[0]["from"] < 1.3 < changes[0]["to"]
+    assert [(change["method"], change["what"]) for change in changes] == [
+        ("a", "slower"),
+        ("b", "less so: noisier"),
+    ]
+    assert (
+        changes[0]["change"] == pytest.approx(1.3) and changes[0]["from"] < 1.3 < changes[0]["to"]
+    )
     assert regressions.find_changes(now, [row("a", 1.0, None)]) == ([], 0)
     kept = tmp_path / "before.json"
     kept.write_text(json.dumps(module("reports").document(before, {})))
@@ -100,13 +134,23 @@ def test_regressions_beyond_the_noise_are_named(module, tmp_path, capsys):
 
 
 def test_regressions_raise_few_false_alarms(module):
-    """Two runs of the same program, 60 figures each: some change is named in 5 % of the pairs (binomial, four standard deviations)."""
-    find_changes, rng, trials, count = module("regressions").find_changes, np.random.default_rng(2), 150, 60
+    """Two runs of the same program, 60 figures each: some change is named in 5 % of the pairs
+    (binomial, four standard deviations)."""
+    find_changes, rng, trials, count = (
+        module("regressions").find_changes,
+        np.random.default_rng(2),
+        150,
+        60,
+    )
 
     def run():
         values = rng.normal(0, 0.1, (count, 5))
-        rows = [row(str(i), float(np.exp(v.mean())), float(v.std(ddof=1) / 5 ** 0.5), 5) for i, v in enumerate(values)]
+        rows = [
+            row(str(i), float(np.exp(v.mean())), float(v.std(ddof=1) / 5**0.5), 5)
+            for i, v in enumerate(values)
+        ]
         return [{**r, "relMSE ratio": None, "trimmed ratio": None} for r in rows]
+
     alarms = sum(bool(find_changes(run(), run())[0]) for _ in range(trials))
     assert alarms <= trials * 0.05 + 4 * math.sqrt(trials * 0.05 * 0.95)
 
@@ -115,28 +159,52 @@ def test_winner_and_those_that_cannot_be_told_apart(module):
     compare = module("compare")
 
     def of(method, *values):
-        return {"scene": "s", "method": method, "trimmed ratio": np.mean(values), "trimmed by seed": " ".join(map(str, values)),
-                "iterations": 5, "seconds": 1.0}
-    rows = [of("path", 1, 1.01, 0.99), of("a", 0.5, 0.51, 0.49), of("b", 0.55, 0.56, 0.54), of("c", 0.2, 2.0, 0.4), of("d", 0.7, 0.72, 0.69)]
+        return {
+            "scene": "s",
+            "method": method,
+            "trimmed ratio": np.mean(values),
+            "trimmed by seed": " ".join(map(str, values)),
+            "iterations": 5,
+            "seconds": 1.0,
+        }
+
+    rows = [
+        of("path", 1, 1.01, 0.99),
+        of("a", 0.5, 0.51, 0.49),
+        of("b", 0.55, 0.56, 0.54),
+        of("c", 0.2, 2.0, 0.4),
+        of("d", 0.7, 0.72, 0.69),
+    ]
     assert compare.told_apart(rows[2], rows[1]) and not compare.told_apart(rows[3], rows[1])
     (winner,) = compare.winners(rows)
     assert winner["best"] == "a" and winner["about as good"] == "b, c"
-    late = [{**of("e", 0.1, 0.1, 0.1), "iterations": 1, "seconds": 1.3}, {**of("f", 0.3, 0.3, 0.3), "iterations": 1, "seconds": 1.1}]
+    late = [
+        {**of("e", 0.1, 0.1, 0.1), "iterations": 1, "seconds": 1.3},
+        {**of("f", 0.3, 0.3, 0.3), "iterations": 1, "seconds": 1.1},
+    ]
     assert compare.winners(rows + late)[0]["best"] == "f"
 
 
 def test_radius_for_a_number_of_photons(module):
     """Throughput is measured at the same number of photons a gather everywhere."""
-    session = mi.load_dict({"type": "bdpm", "bdd": 0, "initial_radius": 0.1, "photon_count": 20000}).session(box_scene(16))
+    session = mi.load_dict(
+        {"type": "bdpm", "bdd": 0, "initial_radius": 0.1, "photon_count": 20000}
+    ).session(box_scene(16))
     radius, photons, vertices, found = module("throughput").radius_for(session, 10.0)
-    assert found == pytest.approx(10, rel=0.2) and 0.001 < radius < 1 and photons > 1000 and 0 < vertices <= 256
+    assert (
+        found == pytest.approx(10, rel=0.2)
+        and 0.001 < radius < 1
+        and photons > 1000
+        and 0 < vertices <= 256
+    )
 
 
 # --- The commands ---------------------------------------------------------------------------------------
 
 
 def test_bundled_scenes_are_as_frozen(module, monkeypatch, tmp_path, capsys):
-    """Figures of different versions are about the same scenes. A file that changed, one that is new, and one that is gone are named."""
+    """Figures of different versions are about the same scenes. A file that changed, one that is
+    new, and one that is gone are named."""
     freezing = module("freezing")
     freezing.check(None)
     frozen = json.loads(freezing.RECORD.read_text())
@@ -147,7 +215,11 @@ def test_bundled_scenes_are_as_frozen(module, monkeypatch, tmp_path, capsys):
     capsys.readouterr()
     with pytest.raises(SystemExit) as exit:
         freezing.check(None)
-    assert exit.value.code == 1 and capsys.readouterr().out.splitlines() == ["attic.xml: gone", "door.xml: new", "sds.xml: changed"]
+    assert exit.value.code == 1 and capsys.readouterr().out.splitlines() == [
+        "attic.xml: gone",
+        "door.xml: new",
+        "sds.xml: changed",
+    ]
 
 
 def test_sweeps_of_views(module):
@@ -158,8 +230,14 @@ def test_sweeps_of_views(module):
         assert [method.label for method in sweep.methods([])] == list(sweep.labels)
         (_, low), *_, (_, high) = sweep.scenes(coarse=True)
         scenes = [sweep.scene(16, **change) for change in (low, high)]
-        assert scenes[0].size == (32, 8) and scenes[0].name != scenes[1].name and scenes[0].made != scenes[1].made
-        parameters = [{name: str(value) for name, value in mi.traverse(opened.scene)} for opened in scenes]
+        assert (
+            scenes[0].size == (32, 8)
+            and scenes[0].name != scenes[1].name
+            and scenes[0].made != scenes[1].made
+        )
+        parameters = [
+            {name: str(value) for name, value in mi.traverse(opened.scene)} for opened in scenes
+        ]
         assert parameters[0].keys() == parameters[1].keys() and parameters[0] != parameters[1]
 
 
@@ -176,7 +254,10 @@ def test_first_views_of_a_scene(module):
 
 def test_defaults_name_registered_plugins_only(module):
     methods = module("methods")
-    assert [m.label for m in methods.registered(("path", "nonsense", "bdpm:bdd=0"))] == ["path", "bdpm:bdd=0"]
+    assert [m.label for m in methods.registered(("path", "nonsense", "bdpm:bdd=0"))] == [
+        "path",
+        "bdpm:bdd=0",
+    ]
     assert methods.registered(methods.COMPARED)[0].label == methods.BASE
 
 
@@ -187,20 +268,68 @@ TINY = """<scene version="3.0.0"><integrator type="path"><integer name="max_dept
 
 
 def test_page_of_one_small_scene(module, tmp_path):
-    """The whole way, small: every part of the page is there, everything it shows is embedded, and it names what cannot be rendered."""
+    """The whole way, small: every part of the page is there, everything it shows is embedded, and
+    it names what cannot be rendered."""
     pytest.importorskip("matplotlib")
     scene = tmp_path / "tiny.xml"
     scene.write_text(TINY)
     views = tmp_path / "views.xml"
     views.write_text(THREE_VIEWS)
-    argv = ["page", "--scenes", str(scene), "--view-scenes", str(views), "--view-counts", "2", "3", "4", "--view-time", "0.01", "--view-seeds", "2",
-            "--integrators", "path", "bdpm:bdd=0", "bdpm:bdd=0,bogus=1", "--varied", "bdpm:bdd=0", "--time", "0.3",
-            "--seeds", "2", "--reference-time", "0.2", "--references", str(tmp_path / "references"), "--iterations", "2", "--sweeps", "camera_paths",
-            "--size", "16", "--point-time", "0.05", "--room-reference-time", "0.3", "--resampled", "--out", str(tmp_path / "out")]
+    argv = [
+        "page",
+        "--scenes",
+        str(scene),
+        "--view-scenes",
+        str(views),
+        "--view-counts",
+        "2",
+        "3",
+        "4",
+        "--view-time",
+        "0.01",
+        "--view-seeds",
+        "2",
+        "--integrators",
+        "path",
+        "bdpm:bdd=0",
+        "bdpm:bdd=0,bogus=1",
+        "--varied",
+        "bdpm:bdd=0",
+        "--time",
+        "0.3",
+        "--seeds",
+        "2",
+        "--reference-time",
+        "0.2",
+        "--references",
+        str(tmp_path / "references"),
+        "--iterations",
+        "2",
+        "--sweeps",
+        "camera_paths",
+        "--size",
+        "16",
+        "--point-time",
+        "0.05",
+        "--room-reference-time",
+        "0.3",
+        "--resampled",
+        "--out",
+        str(tmp_path / "out"),
+    ]
     module("run").main(argv)
     page = (tmp_path / "out" / "index.html").read_text()
-    assert "src=\"http" not in page and page.count('src="data:') >= 12
-    for part in ("Many views at once", "view 3 of 3", "geometric mean", "error against time", "variance of one iteration", "Which method where", "bogus", "HDR-FLIP"):
+    assert 'src="http' not in page and page.count('src="data:') >= 12
+    for part in (
+        "Many views at once",
+        "view 3 of 3",
+        "geometric mean",
+        "error against time",
+        "variance of one iteration",
+        "Which method where",
+        "bogus",
+        "HDR-FLIP",
+    ):
         assert part in page or (part == "HDR-FLIP" and "relative error" in page), part
     references, opened = module("references"), module("scene_files").open_scene(scene)
     kept = {"references": tmp_path / "references", "reference_method": None}
@@ -210,42 +339,97 @@ def test_page_of_one_small_scene(module, tmp_path):
     assert [r["method"] for r in rows] == ["path", "bdpm:bdd=0"]
     assert rows[0]["relMSE ratio"] == 1 and 0.9 < rows[1]["mean ratio"] < 1.1
     counts = json.loads((tmp_path / "out" / "view_counts.json").read_text())["rows"]
-    assert [r["views"] for r in counts] == [2, 3]                      # there are no four
-    assert all(r["ratio"] == pytest.approx(r["variance x s"] / r["volpath variance x s"]) and r["samples"] > 0 for r in counts)
-    for name in ("converge.csv", "views_views.png", "views_views_2_volpath.png", "variance.csv", "stability.csv", "which_method.md", "which_scene.md", "tiny_time.png",
-                 "tiny_path.png", "variance_tiny_1.png"):
+    assert [r["views"] for r in counts] == [2, 3]  # there are no four
+    assert all(
+        r["ratio"] == pytest.approx(r["variance x s"] / r["volpath variance x s"])
+        and r["samples"] > 0
+        for r in counts
+    )
+    for name in (
+        "converge.csv",
+        "views_views.png",
+        "views_views_2_volpath.png",
+        "variance.csv",
+        "stability.csv",
+        "which_method.md",
+        "which_scene.md",
+        "tiny_time.png",
+        "tiny_path.png",
+        "variance_tiny_1.png",
+    ):
         assert (tmp_path / "out" / name).stat().st_size > 0
 
 
 @pytest.mark.full
 def test_resampling_is_swept(module, tmp_path):
-    """N_c of two values: each method beside `bdpt`, whose own ratios are one, and error, noise and cost agree with each other."""
+    """N_c of two values: each method beside `bdpt`, whose own ratios are one, and error, noise and
+    cost agree with each other."""
     pytest.importorskip("matplotlib")
     scene = tmp_path / "tiny.xml"
     scene.write_text(TINY)
     resampling = module("resampling")
-    module("run").main(["resampling", "--scenes", str(scene), "--parameters", "cache_neighbors", "--coarse", "--draw-time", "0.2", "--draw-seeds", "2",
-                        "--resampling-scale", "1", "--reference-time", "0.3", "--references", str(tmp_path / "references"), "--out", str(tmp_path)])
+    module("run").main(
+        [
+            "resampling",
+            "--scenes",
+            str(scene),
+            "--parameters",
+            "cache_neighbors",
+            "--coarse",
+            "--draw-time",
+            "0.2",
+            "--draw-seeds",
+            "2",
+            "--resampling-scale",
+            "1",
+            "--reference-time",
+            "0.3",
+            "--references",
+            str(tmp_path / "references"),
+            "--out",
+            str(tmp_path),
+        ]
+    )
     rows = json.loads((tmp_path / "resampling.json").read_text())["rows"]
-    assert [(r["value"], r["method"]) for r in rows] == [(value, method) for value in (1, 5) for method in resampling.METHODS]
+    assert [(r["value"], r["method"]) for r in rows] == [
+        (value, method) for value in (1, 5) for method in resampling.METHODS
+    ]
     for r in rows:
-        assert (r["MAPE ratio"] == r["cost ratio"] == 1) == (r["method"] == "bdpt") and 0.05 < r["cost ratio"] < 20
+        assert (r["MAPE ratio"] == r["cost ratio"] == 1) == (r["method"] == "bdpt") and 0.05 < r[
+            "cost ratio"
+        ] < 20
     page = (tmp_path / "resampling.html").read_text()
-    assert 'id="resampling"' in page and page.count('src="data:image/svg') == 1 and (tmp_path / "resampling_tiny.png").stat().st_size > 0
+    assert (
+        'id="resampling"' in page
+        and page.count('src="data:image/svg') == 1
+        and (tmp_path / "resampling_tiny.png").stat().st_size > 0
+    )
 
 
 def test_ratios_of_resampling(module):
-    """What a method needs is said as ratios to `bdpt`: half the error in a quarter of the iterations that each cost four times as much."""
+    """What a method needs is said as ratios to `bdpt`: half the error in a quarter of the
+    iterations that each cost four times as much."""
     resampling = module("resampling")
     base = [{"MAPE": 0.2, "relMSE": 0.04, "noise": 4.0, "cost": 0.01, "iterations": 100}] * 2
     mine = [{"MAPE": 0.1, "relMSE": 0.01, "noise": 0.25, "cost": 0.04, "iterations": 25}] * 2
     found = resampling.row(SimpleNamespace(name="s"), resampling.SWEEPS[0], 50, "pcbpt", mine, base)
-    assert (found["MAPE ratio"], found["relMSE ratio"], found["noise ratio"], found["cost ratio"]) == pytest.approx((0.5, 0.25, 1 / 16, 4))
+    assert (
+        found["MAPE ratio"],
+        found["relMSE ratio"],
+        found["noise ratio"],
+        found["cost ratio"],
+    ) == pytest.approx((0.5, 0.25, 1 / 16, 4))
     line = resampling.lines([found], resampling.SWEEPS[0], "noise ratio")["pcbpt"]
     assert (line.values, line.ratios) == ([50], [found["noise ratio"]])
     method = module("methods").parse_method("bdpt_ris:target=f_y_f_yz")
-    assert resampling.with_value(method, "resamples", 4).parameters == {"target": "f_y_f_yz", "resamples": 4}
-    assert resampling.with_value(module("methods").parse_method("bdpt"), "resamples", 4).parameters == {}
+    assert resampling.with_value(method, "resamples", 4).parameters == {
+        "target": "f_y_f_yz",
+        "resamples": 4,
+    }
+    assert (
+        resampling.with_value(module("methods").parse_method("bdpt"), "resamples", 4).parameters
+        == {}
+    )
 
 
 def test_a_slow_start_does_not_end_a_rendering(module):
@@ -258,9 +442,15 @@ def test_a_slow_start_does_not_end_a_rendering(module):
     assert contender.wants(2.2) and not contender.wants(2.1)
 
 
-@pytest.mark.parametrize("arguments, message", [
-    (["--integrators", "bdpmm"], '"bdpmm" not found'), (["--integrators", "bdpm:bdd"], "name=value"),
-    (["--scenes", "none.xml"], "no file none.xml"), (["--time", "-1"], "-1 is not a number above 0")])
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        (["--integrators", "bdpmm"], '"bdpmm" not found'),
+        (["--integrators", "bdpm:bdd"], "name=value"),
+        (["--scenes", "none.xml"], "no file none.xml"),
+        (["--time", "-1"], "-1 is not a number above 0"),
+    ],
+)
 def test_what_is_asked_for_is_checked_before_it_is_measured(module, capsys, arguments, message):
     with pytest.raises(SystemExit) as exit:
         module("run").main(["compare", *arguments])

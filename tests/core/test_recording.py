@@ -1,35 +1,49 @@
-"""Recorded passes: the second and all later calls, which launch the recording's kernels, do all that the first one did."""
+"""Recorded passes: the second and all later calls, which launch the recording's kernels, do all
+that the first one did."""
+
+from mis_integrators.core.recording import frozen, lanes
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 
-from mis_integrators.core.recording import frozen, lanes
-
 
 @pytest.fixture
 def scene(rgb):
-    """Shapes whose BSDFs differ, so that asking them is a virtual function call with data of its own."""
-    spheres = {f"s{i}": {"type": "sphere", "center": [3 * i, 0, 0], "bsdf": bsdf} for i, bsdf in enumerate([
-        {"type": "diffuse"}, {"type": "roughplastic", "alpha": 0.3}, {"type": "twosided", "bsdf": {"type": "roughconductor"}}])}
+    """Shapes whose BSDFs differ, so that asking them is a virtual function call with data of its
+    own."""
+    spheres = {
+        f"s{i}": {"type": "sphere", "center": [3 * i, 0, 0], "bsdf": bsdf}
+        for i, bsdf in enumerate(
+            [
+                {"type": "diffuse"},
+                {"type": "roughplastic", "alpha": 0.3},
+                {"type": "twosided", "bsdf": {"type": "roughconductor"}},
+            ]
+        )
+    }
     return mi.load_dict({"type": "scene", **spheres})
 
 
 def ask(count):
     """A pass of so many lanes with nothing but gathers and a virtual call."""
+
     def launch(shapes, weights):
         index = lanes(count)
         si = dr.zeros(mi.SurfaceInteraction3f)
         si.wi = mi.Vector3f(0, 0.6, 0.8)
         shape = dr.gather(mi.ShapePtr, shapes, index % 3)
-        return dr.mean(shape.bsdf().eval(mi.BSDFContext(), si, mi.Vector3f(0.6, 0, 0.8))) * dr.gather(mi.Float, weights, index % 5)
+        return dr.mean(
+            shape.bsdf().eval(mi.BSDFContext(), si, mi.Vector3f(0.6, 0, 0.8))
+        ) * dr.gather(mi.Float, weights, index % 5)
 
     return launch
 
 
 def test_replays_have_all_their_lanes(scene):
-    """Of every size that is a multiple of 64 up to 4096, as the data of a virtual call have: Dr.Jit would take some of them for the size of that."""
+    """Of every size that is a multiple of 64 up to 4096, as the data of a virtual call have: Dr.Jit
+    would take some of them for the size of that."""
     shapes, weights = scene.shapes_dr(), mi.Float([1, 2, 3, 4, 5])
     dr.eval(shapes, weights)
     short = []
@@ -47,4 +61,4 @@ def test_lanes_count(rgb):
     recorded = frozen(lambda scale: lanes(7) * scale)
     for scale in (2, 3):
         assert np.array_equal(np.array(recorded(dr.opaque(mi.UInt32, scale))), scale * np.arange(7))
-    assert np.array_equal(np.array(lanes(5)), np.arange(5))             # nothing of the recording is left
+    assert np.array_equal(np.array(lanes(5)), np.arange(5))  # nothing of the recording is left

@@ -1,10 +1,15 @@
-"""Headers of images and checkpoints that anyone may have written: what is not exactly a render's is one clear line, and nothing of it takes effect."""
+"""Headers of images and checkpoints that anyone may have written: what is not exactly a render's is
+one clear line, and nothing of it takes effect."""
 
 import copy
 import hashlib
 import json
 import os
 import string
+
+from mis_integrators.app import checkpoint, cli, cluster, loading, reproduce
+from mis_integrators.core.session import make_session
+from mis_integrators.core.untrusted import Fields, Malformed, parse
 
 import hypothesis
 import hypothesis.strategies as st
@@ -14,36 +19,97 @@ import OpenEXR
 import pytest
 from lamplit import read, render, write_scene
 
-from mis_integrators.app import checkpoint, cli, cluster, loading, reproduce
-from mis_integrators.core.session import make_session
-from mis_integrators.core.untrusted import Fields, Malformed, parse
-
 NAN = float("nan")
 GOOD = {
-    "options": {"plugin": "bdpm", "variables": [["size", "8"]], "parameters": [["bdd", "0"]], "variant": "llvm_ad_rgb", "sensor": 0, "all_views": False,
-                "seed": 3, "spp": 2},
+    "options": {
+        "plugin": "bdpm",
+        "variables": [["size", "8"]],
+        "parameters": [["bdd", "0"]],
+        "variant": "llvm_ad_rgb",
+        "sensor": 0,
+        "all_views": False,
+        "seed": 3,
+        "spp": 2,
+    },
     "learned": {},
     "versions": "mis_integrators 0",
 }
 REMOVE = object()
 
-# What an option must not be, and the same for what is outside the options. Each entry is one hostile header.
+# What an option must not be, and the same for what is outside the options. Each entry is one
+# hostile header.
 OPTIONS = {
-    "plugin": ["../../evil2", "/tmp/evil", "no_such_plugin", "", 7, ["bdpm"], {"type": "bdpm"}, "bdpm\n", "path\0", "independent", "batch", True, REMOVE],
-    "variables": [{"size": "8"}, [["size"]], [["size", 8]], [["size", "8", "9"]], [["", "8"]], [["a b", "8"]], [["size", "8\x1b[2J"]], "size=8", None,
-                  [["size", "8" * 5000]], REMOVE],
-    "parameters": [[["bdd", 0]], [["bdd", None]], {"bdd": "0"}, [["../bdd", "0"]], [["bdd", "\u202e0"]], [[["bdd"], "0"]], 3, REMOVE],
+    "plugin": [
+        "../../evil2",
+        "/tmp/evil",
+        "no_such_plugin",
+        "",
+        7,
+        ["bdpm"],
+        {"type": "bdpm"},
+        "bdpm\n",
+        "path\0",
+        "independent",
+        "batch",
+        True,
+        REMOVE,
+    ],
+    "variables": [
+        {"size": "8"},
+        [["size"]],
+        [["size", 8]],
+        [["size", "8", "9"]],
+        [["", "8"]],
+        [["a b", "8"]],
+        [["size", "8\x1b[2J"]],
+        "size=8",
+        None,
+        [["size", "8" * 5000]],
+        REMOVE,
+    ],
+    "parameters": [
+        [["bdd", 0]],
+        [["bdd", None]],
+        {"bdd": "0"},
+        [["../bdd", "0"]],
+        [["bdd", "\u202e0"]],
+        [[["bdd"], "0"]],
+        3,
+        REMOVE,
+    ],
     "variant": ["llvm", "scalar_rgb; import os", 0, None, ["llvm_ad_rgb"], REMOVE],
     "sensor": [-1, 1.0, "0", True, 10**30, None, REMOVE],
     "all_views": [0, "yes", None, [], REMOVE],
     "seed": [-1, 2**32, 1.5, "x", None, True, REMOVE],
     "spp": [0, -5, "x", 1.5, NAN, float("inf"), 10**400, None, [4], True, 2**31, REMOVE],
     # Options of the command that no header may set, and what is none.
-    "scheduler": ["tcp://192.0.2.1:8786"], "scene": ["/etc/passwd"], "output": ["/tmp/other.exr"], "checkpoint": [1.0], "resume": [True], "workers": [4],
-    "time": [1e9], "target_error": [1e-9], "like": ["other.exr"], "preview": [1.0], "frames": [True], "quiet": [True], "\x1b]0;title\x07": [1],
+    "scheduler": ["tcp://192.0.2.1:8786"],
+    "scene": ["/etc/passwd"],
+    "output": ["/tmp/other.exr"],
+    "checkpoint": [1.0],
+    "resume": [True],
+    "workers": [4],
+    "time": [1e9],
+    "target_error": [1e-9],
+    "like": ["other.exr"],
+    "preview": [1.0],
+    "frames": [True],
+    "quiet": [True],
+    "\x1b]0;title\x07": [1],
 }
-WHOLE = [None, 3, "text", [], {}, {"options": {}}, {**GOOD, "options": []}, {**GOOD, "versions": 3}, {**GOOD, "versions": "\x1b[31mred"}, {**GOOD, "more": 1},
-         {name: value for name, value in GOOD.items() if name != "learned"}]
+WHOLE = [
+    None,
+    3,
+    "text",
+    [],
+    {},
+    {"options": {}},
+    {**GOOD, "options": []},
+    {**GOOD, "versions": 3},
+    {**GOOD, "versions": "\x1b[31mred"},
+    {**GOOD, "more": 1},
+    {name: value for name, value in GOOD.items() if name != "learned"},
+]
 TEXTS = ["", "{", "nul", "[" * 100_000, '{"options": NaN}', "\x00", '{"a": ' * 20_000, "1" * 5000]
 
 
@@ -56,7 +122,11 @@ def changed(name, value) -> dict:
     return header
 
 
-CORPUS = [json.dumps(changed(name, value)) for name, values in OPTIONS.items() for value in values] + [json.dumps(whole) for whole in WHOLE] + TEXTS
+CORPUS = (
+    [json.dumps(changed(name, value)) for name, values in OPTIONS.items() for value in values]
+    + [json.dumps(whole) for whole in WHOLE]
+    + TEXTS
+)
 
 
 @pytest.fixture
@@ -65,16 +135,25 @@ def scene(tmp_path, rgb):
 
 
 def write_image(path, header) -> None:
-    OpenEXR.File({"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **header}, {"Y": np.zeros((2, 2), np.float32)}).write(str(path))
+    OpenEXR.File(
+        {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **header},
+        {"Y": np.zeros((2, 2), np.float32)},
+    ).write(str(path))
 
 
 def one_line(error: str) -> bool:
-    return error.count("\n") == 1 and error[:-1].isprintable() and len(error) < 1200 and "Traceback" not in error
+    return (
+        error.count("\n") == 1
+        and error[:-1].isprintable()
+        and len(error) < 1200
+        and "Traceback" not in error
+    )
 
 
 @pytest.fixture
 def nothing_happens(monkeypatch):
     """Fails the test where a scene is loaded, a checkpoint is read or a cluster is looked for."""
+
     def refuse(*_, **__):
         raise AssertionError("the header took effect")
 
@@ -117,20 +196,34 @@ def test_files_that_are_no_images(scene, tmp_path, capsys, nothing_happens):
 def test_good_header_is_rendered(scene, tmp_path):
     """Else all tests above would pass whatever is in a header."""
     write_image(tmp_path / "told.exr", {reproduce.ATTRIBUTE: json.dumps(GOOD)})
-    assert render(scene, "--like", tmp_path / "told.exr", "-o", tmp_path / "new.exr", "--quiet") == 0
+    assert (
+        render(scene, "--like", tmp_path / "told.exr", "-o", tmp_path / "new.exr", "--quiet") == 0
+    )
     header, image = read(tmp_path / "new.exr")
-    assert (header["integrator"], header["seed"], header["spp"], header["bdd"], image.shape[:2]) == ("bdpm", 3, 2, 0, (8, 8))
+    assert (
+        header["integrator"],
+        header["seed"],
+        header["spp"],
+        header["bdd"],
+        image.shape[:2],
+    ) == ("bdpm", 3, 2, 0, (8, 8))
 
 
-JSON = st.recursive(st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=20),
-                    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=10), inner, max_size=4), max_leaves=10)
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=20),
+    lambda inner: (
+        st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=10), inner, max_size=4)
+    ),
+    max_leaves=10,
+)
 OTHER_TEXT = st.text(st.characters(exclude_characters=string.printable), min_size=1, max_size=5)
 
 
 @hypothesis.settings(max_examples=300, deadline=None, derandomize=True)
 @hypothesis.given(st.sampled_from([*GOOD["options"], "scheduler", "scene"]), JSON | OTHER_TEXT)
 def test_any_value_of_an_option_is_refused_or_of_its_type(tmp_path_factory, name, value):
-    """What is taken has the type and the range of the command's own option; what is not is one printable line."""
+    """What is taken has the type and the range of the command's own option; what is not is one
+    printable line."""
     path = tmp_path_factory.getbasetemp() / "told.exr"
     write_image(path, {reproduce.ATTRIBUTE: json.dumps(changed(name, value))})
     try:
@@ -140,8 +233,16 @@ def test_any_value_of_an_option_is_refused_or_of_its_type(tmp_path_factory, name
         return
     options = recipe.options
     assert set(options) == set(GOOD["options"]) and name in options
-    assert options["plugin"] in (None, *reproduce.MITSUBA_INTEGRATORS, *reproduce._plugins.PLUGINS) and options["variant"] in mi.variants()
-    assert 1 <= options["spp"] < 2**31 and 0 <= options["seed"] < 2**32 and type(options["all_views"]) is bool and options["sensor"] >= 0
+    assert (
+        options["plugin"] in (None, *reproduce.MITSUBA_INTEGRATORS, *reproduce._plugins.PLUGINS)
+        and options["variant"] in mi.variants()
+    )
+    assert (
+        1 <= options["spp"] < 2**31
+        and 0 <= options["seed"] < 2**32
+        and type(options["all_views"]) is bool
+        and options["sensor"] >= 0
+    )
     for pairs in (options["variables"], options["parameters"]):
         assert all(type(one) is type(other) is str and other.isprintable() for one, other in pairs)
 
@@ -158,32 +259,96 @@ def test_any_text_is_refused_or_read(text):
 # --- What a session has learned -----------------------------------------------------------------------
 
 LEARNED = {
-    "bdpm": [{"radii": {}}, {"radii": {"indirect": 0.1}, "corrected": {"indirect": False}, "camera_paths": 1},
-             {"radii": {"indirect": -1, "caustic": 0.1}, "corrected": {"indirect": True, "caustic": True}, "camera_paths": 1},
-             {"radii": {"indirect": 1, "caustic": 1e999}, "corrected": {"indirect": True, "caustic": True}, "camera_paths": 1},
-             {"radii": {"indirect": 1, "caustic": 1}, "corrected": {"indirect": True, "caustic": 1}, "camera_paths": 1},
-             {"radii": {"indirect": 1, "caustic": 1}, "corrected": {"indirect": True, "caustic": True}, "camera_paths": 0},
-             {"radii": {"indirect": 1, "caustic": 1}, "corrected": {"indirect": True, "caustic": True}, "camera_paths": 10**12},
-             {"radii": {"indirect": 1, "caustic": 1, "more": 1}, "corrected": {"indirect": True, "caustic": True}, "camera_paths": 1}],
-    "bdpm_auto": [{"plugin": "../../evil2", "parameters": {}, "reasons": [], "errors": {}, "session": {}},
-                  {"plugin": "bdpm", "parameters": {"bdd": 7}, "reasons": [], "errors": {}, "session": {}},
-                  {"plugin": "bdpm", "parameters": {"bdd": 0, "type": "evil"}, "reasons": [], "errors": {}, "session": {}},
-                  {"plugin": "path", "parameters": {}, "reasons": ["\x1b[2J"], "errors": {}, "session": {"camera_paths": 1}},
-                  {"plugin": "path", "parameters": {}, "reasons": [], "errors": {"path": "small"}, "session": {"camera_paths": 1}},
-                  {"plugin": "path", "parameters": {}, "reasons": [], "errors": {}, "session": {"camera_paths": -1}},
-                  {"plugin": "path", "parameters": {}, "reasons": [], "errors": {}, "session": [1]},
-                  {"plugin": "path", "parameters": {}, "reasons": [], "errors": {}}],
+    "bdpm": [
+        {"radii": {}},
+        {"radii": {"indirect": 0.1}, "corrected": {"indirect": False}, "camera_paths": 1},
+        {
+            "radii": {"indirect": -1, "caustic": 0.1},
+            "corrected": {"indirect": True, "caustic": True},
+            "camera_paths": 1,
+        },
+        {
+            "radii": {"indirect": 1, "caustic": 1e999},
+            "corrected": {"indirect": True, "caustic": True},
+            "camera_paths": 1,
+        },
+        {
+            "radii": {"indirect": 1, "caustic": 1},
+            "corrected": {"indirect": True, "caustic": 1},
+            "camera_paths": 1,
+        },
+        {
+            "radii": {"indirect": 1, "caustic": 1},
+            "corrected": {"indirect": True, "caustic": True},
+            "camera_paths": 0,
+        },
+        {
+            "radii": {"indirect": 1, "caustic": 1},
+            "corrected": {"indirect": True, "caustic": True},
+            "camera_paths": 10**12,
+        },
+        {
+            "radii": {"indirect": 1, "caustic": 1, "more": 1},
+            "corrected": {"indirect": True, "caustic": True},
+            "camera_paths": 1,
+        },
+    ],
+    "bdpm_auto": [
+        {"plugin": "../../evil2", "parameters": {}, "reasons": [], "errors": {}, "session": {}},
+        {"plugin": "bdpm", "parameters": {"bdd": 7}, "reasons": [], "errors": {}, "session": {}},
+        {
+            "plugin": "bdpm",
+            "parameters": {"bdd": 0, "type": "evil"},
+            "reasons": [],
+            "errors": {},
+            "session": {},
+        },
+        {
+            "plugin": "path",
+            "parameters": {},
+            "reasons": ["\x1b[2J"],
+            "errors": {},
+            "session": {"camera_paths": 1},
+        },
+        {
+            "plugin": "path",
+            "parameters": {},
+            "reasons": [],
+            "errors": {"path": "small"},
+            "session": {"camera_paths": 1},
+        },
+        {
+            "plugin": "path",
+            "parameters": {},
+            "reasons": [],
+            "errors": {},
+            "session": {"camera_paths": -1},
+        },
+        {"plugin": "path", "parameters": {}, "reasons": [], "errors": {}, "session": [1]},
+        {"plugin": "path", "parameters": {}, "reasons": [], "errors": {}},
+    ],
     "bdpt": [{"radius": 1}],
-    "bdpt_ris": [{"light_tracing": 0}, {"light_tracing": "1"}, {"light_tracing": 1e30}, {"radius": 1}],
+    "bdpt_ris": [
+        {"light_tracing": 0},
+        {"light_tracing": "1"},
+        {"light_tracing": 1e30},
+        {"radius": 1},
+    ],
     "vcm": [{"radius": 0}, {"radius": None}, {"radius": 1, "more": 1}],
     "volpath_multiview": [{"radius": 1}],
-    "path": [{"samples_per_iteration": 0}, {"samples_per_iteration": 10**9}, {"samples_per_iteration": 2.0}, {"samples_per_iteration": 2, "more": 1}],
+    "path": [
+        {"samples_per_iteration": 0},
+        {"samples_per_iteration": 10**9},
+        {"samples_per_iteration": 2.0},
+        {"samples_per_iteration": 2, "more": 1},
+    ],
 }
 
 
 @pytest.fixture
 def sessions(scene):
     """Makes sessions of small renders."""
+
     def make(plugin):
         loaded = loading.load(scene, {"size": "8"}, plugin, {})
         return make_session(loaded.integrator, loaded.scene, loaded.scene.sensors()[0], 3, 2)
@@ -199,7 +364,14 @@ def test_what_no_session_can_have_learned(scene, sessions, tmp_path, capsys, plu
             sessions(plugin).recall(learned)
         assert str(error.value).isprintable()
         options = {**GOOD["options"], "plugin": plugin, "parameters": []}
-        write_image(tmp_path / "told.exr", {reproduce.ATTRIBUTE: json.dumps({**GOOD, "options": options, "learned": learned, "versions": cli.versions()})})
+        write_image(
+            tmp_path / "told.exr",
+            {
+                reproduce.ATTRIBUTE: json.dumps(
+                    {**GOOD, "options": options, "learned": learned, "versions": cli.versions()}
+                )
+            },
+        )
         assert render(scene, "--like", tmp_path / "told.exr", "-o", tmp_path / "new.exr") == 1
         assert one_line(capsys.readouterr().err)
 
@@ -212,17 +384,30 @@ def test_what_a_session_has_learned_is_taken(sessions, plugin):
     assert other.learned == one.learned
 
 
-@hypothesis.settings(max_examples=60, deadline=None, derandomize=True, suppress_health_check=[hypothesis.HealthCheck.function_scoped_fixture])
+@hypothesis.settings(
+    max_examples=60,
+    deadline=None,
+    derandomize=True,
+    suppress_health_check=[hypothesis.HealthCheck.function_scoped_fixture],
+)
 @hypothesis.given(st.sampled_from(["radii", "corrected", "camera_paths", "more"]), JSON)
 def test_any_value_that_was_learned(sessions, name, value):
-    learned = {"radii": {"indirect": 0.1, "caustic": 0.1}, "corrected": {"indirect": False, "caustic": False}, "camera_paths": 1, name: value}
+    learned = {
+        "radii": {"indirect": 0.1, "caustic": 0.1},
+        "corrected": {"indirect": False, "caustic": False},
+        "camera_paths": 1,
+        name: value,
+    }
     session = sessions("bdpm")
     try:
         session.recall(json.loads(json.dumps(learned)))
     except Malformed as error:
         assert str(error).isprintable()
     else:
-        assert all(0 < radius < float("inf") for radius in session.radii.values()) and 0 < session.samples_per_iteration < 2**32
+        assert (
+            all(0 < radius < float("inf") for radius in session.radii.values())
+            and 0 < session.samples_per_iteration < 2**32
+        )
 
 
 # --- Checkpoints ----------------------------------------------------------------------------------------
@@ -231,17 +416,45 @@ def test_any_value_that_was_learned(sessions, name, value):
 @pytest.fixture
 def kept(scene, tmp_path):
     """The checkpoint of a finished render."""
-    assert render(scene, "-i", "bdpm", "-o", tmp_path / "a.exr", "-D", "size=8", "--spp", 2, "--checkpoint", 100, "--quiet") == 0
+    assert (
+        render(
+            scene,
+            "-i",
+            "bdpm",
+            "-o",
+            tmp_path / "a.exr",
+            "-D",
+            "size=8",
+            "--spp",
+            2,
+            "--checkpoint",
+            100,
+            "--quiet",
+        )
+        == 0
+    )
     return tmp_path / "a.checkpoint"
 
 
 def resume(scene, kept) -> int:
-    return render(scene, "-i", "bdpm", "-o", kept.with_suffix(".exr"), "-D", "size=8", "--spp", 4, "--resume", "--quiet")
+    return render(
+        scene,
+        "-i",
+        "bdpm",
+        "-o",
+        kept.with_suffix(".exr"),
+        "-D",
+        "size=8",
+        "--spp",
+        4,
+        "--resume",
+        "--quiet",
+    )
 
 
 def forge(content: bytes, change, tail: bytes = b"") -> bytes:
     """A checkpoint that has its checksum, with a header that ``change`` has changed."""
-    body = content[len(checkpoint.MAGIC) + 32:]
+    body = content[len(checkpoint.MAGIC) + 32 :]
     end = 8 + int.from_bytes(body[:8], "little")
     header = json.loads(body[8:end])
     header = json.dumps(header if (changed := change(header)) is None else changed).encode()
@@ -250,12 +463,35 @@ def forge(content: bytes, change, tail: bytes = b"") -> bytes:
 
 
 FORGED = {
-    **{f"without {name}": lambda header, name=name: header.pop(name) and None for name in ("identity", "learned", "done", "seconds", "compiling", "arrays")},
-    **{f"identity without {name}": lambda header, name=name: header["identity"].pop(name) and None
-       for name in ("plugin", "files", "variables", "settings", "versions", "seed")},
-    **{f"done {value}": lambda header, value=value: header.update(done=value)
-       for value in (10**9, [10**9, []], [1e9, []], [2, [1]], [-1, []], [2, [3, 3]], ["2", []], [2], [2, {}], None, [True, []], [10**8, [10**8 + 7]])},
-    **{f"seconds {value}": lambda header, value=value: header.update(seconds=value) for value in (-1, "1", None, 1e999, [1])},
+    **{
+        f"without {name}": lambda header, name=name: header.pop(name) and None
+        for name in ("identity", "learned", "done", "seconds", "compiling", "arrays")
+    },
+    **{
+        f"identity without {name}": lambda header, name=name: header["identity"].pop(name) and None
+        for name in ("plugin", "files", "variables", "settings", "versions", "seed")
+    },
+    **{
+        f"done {value}": lambda header, value=value: header.update(done=value)
+        for value in (
+            10**9,
+            [10**9, []],
+            [1e9, []],
+            [2, [1]],
+            [-1, []],
+            [2, [3, 3]],
+            ["2", []],
+            [2],
+            [2, {}],
+            None,
+            [True, []],
+            [10**8, [10**8 + 7]],
+        )
+    },
+    **{
+        f"seconds {value}": lambda header, value=value: header.update(seconds=value)
+        for value in (-1, "1", None, 1e999, [1])
+    },
     "list": lambda header: [1, 2],
     "text": lambda header: "text",
     "learned list": lambda header: header.update(learned=[1]),
@@ -266,11 +502,15 @@ FORGED = {
     "identity list": lambda header: header.update(identity=[1]),
     "another field": lambda header: header.update(scheduler="tcp://192.0.2.1:1"),
     "shape": lambda header: header["arrays"].update(total=[1, 1, 1]),
-    "shapes swapped": lambda header: header["arrays"].update(total=list(reversed(header["arrays"]["total"]))),
+    "shapes swapped": lambda header: header["arrays"].update(
+        total=list(reversed(header["arrays"]["total"]))
+    ),
     "shape of floats": lambda header: header["arrays"].update(total=[1.5, 2]),
     "shape negative": lambda header: header["arrays"].update(total=[-1, 8, 4]),
     "shape huge": lambda header: header["arrays"].update(total=[2**31, 2**31, 2**31]),
-    "other sums": lambda header: header.update(arrays={f"{name}x": shape for name, shape in header["arrays"].items()}),
+    "other sums": lambda header: header.update(
+        arrays={f"{name}x": shape for name, shape in header["arrays"].items()}
+    ),
     "no sums": lambda header: header.update(arrays={}),
     "sums list": lambda header: header.update(arrays=[[1, 2]]),
 }
@@ -285,15 +525,19 @@ def test_forged_checkpoint_is_one_line(scene, kept, capsys, name):
 
 
 def test_other_odd_checkpoints(scene, kept, tmp_path, capsys):
-    """Bytes that follow, sums that are not finite, a header longer than the file, no header at all, a FIFO, a folder."""
+    """Bytes that follow, sums that are not finite, a header longer than the file, no header at all,
+    a FIFO, a folder."""
     content = kept.read_bytes()
-    assert resume(scene, kept) == 0                                    # as it is, it is taken
+    assert resume(scene, kept) == 0  # as it is, it is taken
     kept.write_bytes(forge(content, lambda header: None))
     assert resume(scene, kept) == 0
-    body = content[len(checkpoint.MAGIC) + 32:]
+    body = content[len(checkpoint.MAGIC) + 32 :]
     nan = body[:-8] + np.array([np.nan], "<f8").tobytes()
     odd = [forge(content, lambda header: None, b"12345678")]
-    odd += [checkpoint.MAGIC + hashlib.sha256(each).digest() + each for each in (nan, b"\xff" * 8 + body[8:], b"", b"\x01")]
+    odd += [
+        checkpoint.MAGIC + hashlib.sha256(each).digest() + each
+        for each in (nan, b"\xff" * 8 + body[8:], b"", b"\x01")
+    ]
     for each in odd:
         kept.write_bytes(each)
         assert resume(scene, kept) == 4

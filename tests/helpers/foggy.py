@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import mitsuba as mi
 import numpy as np
-
 from comparing import Estimate, assert_same, collect_until
 from worlds import T, bitmap, film, grey, look, waves
 
@@ -26,21 +25,40 @@ THREE_VIEWS = """<scene version="3.0.0">
 
 def view(origin, target=(0, 0, 0), size=SIZE, fov=36.0, kind="perspective", **extra):
     """A sensor that looks at the origin; its film counts only outside a batch."""
-    return {"type": kind, "fov": fov, "to_world": look(origin, target, (0, 1, 0.01)), "film": film(size), "sampler": {"type": "independent"}, **extra}
+    return {
+        "type": kind,
+        "fov": fov,
+        "to_world": look(origin, target, (0, 1, 0.01)),
+        "film": film(size),
+        "sampler": {"type": "independent"},
+        **extra,
+    }
 
 
 def orbit(count, step=0.25, radius=4.5, height=1.2):
-    return [view((radius * np.sin(step * i), height, radius * np.cos(step * i))) for i in range(count)]
+    return [
+        view((radius * np.sin(step * i), height, radius * np.cos(step * i))) for i in range(count)
+    ]
 
 
 def uneven():
-    """Three views that differ in distance, in field of view, and in how much of the medium lies before what they see."""
-    return [view((0, 1.2, 4.5)), view((1.6, 0.4, 2.2), (0, 0, -0.4), fov=60.0), view((-3.5, 3.2, 4.5), fov=20.0)]
+    """Three views that differ in distance, in field of view, and in how much of the medium lies
+    before what they see."""
+    return [
+        view((0, 1.2, 4.5)),
+        view((1.6, 0.4, 2.2), (0, 0, -0.4), fov=60.0),
+        view((-3.5, 3.2, 4.5), fov=20.0),
+    ]
 
 
 def around():
-    """Three views from different sides of the origin: what lies near to one lies far from another, and one sees a part closely."""
-    return [view((0, 0.6, 4.0), fov=15.0), view((0.4, 0.2, -3.0), fov=50.0), view((2.2, 1.0, 0.3), fov=60.0)]
+    """Three views from different sides of the origin: what lies near to one lies far from another,
+    and one sees a part closely."""
+    return [
+        view((0, 0.6, 4.0), fov=15.0),
+        view((0.4, 0.2, -3.0), fov=50.0),
+        view((2.2, 1.0, 0.3), fov=60.0),
+    ]
 
 
 def sparse(rng, n):
@@ -52,15 +70,29 @@ def sparse(rng, n):
 
 def batch(views, size=SIZE, **film_options):
     whole = film(size, **film_options) | {"width": size * len(views)}
-    return {"type": "batch", "film": whole, "sampler": {"type": "independent"}, **{f"view{i}": v for i, v in enumerate(views)}}
+    return {
+        "type": "batch",
+        "film": whole,
+        "sampler": {"type": "independent"},
+        **{f"view{i}": v for i, v in enumerate(views)},
+    }
 
 
 def grid(density, cells=5, seed=1, scale=1.0, albedo=0.8, g=0.0, half=1.0):
-    """A heterogeneous medium in the cube [-half, half]^3: `density(rng, cells)` gives its values."""
+    """A heterogeneous medium in the cube [-half, half]^3: `density(rng, cells)` gives its
+    values."""
     values = density(np.random.default_rng(seed), cells).astype(np.float32)[..., None]
-    return {"type": "heterogeneous", "scale": scale, "albedo": {"type": "constvolume", "value": albedo},
-            "sigma_t": {"type": "gridvolume", "grid": mi.VolumeGrid(values), "to_world": T().translate([-half] * 3).scale(2 * half)},
-            "phase": {"type": "hg", "g": g}}
+    return {
+        "type": "heterogeneous",
+        "scale": scale,
+        "albedo": {"type": "constvolume", "value": albedo},
+        "sigma_t": {
+            "type": "gridvolume",
+            "grid": mi.VolumeGrid(values),
+            "to_world": T().translate([-half] * 3).scale(2 * half),
+        },
+        "phase": {"type": "hg", "g": g},
+    }
 
 
 def even(rng, n):
@@ -76,32 +108,72 @@ def pockets(rng, n):
 
 def container(medium, scale=1.0, at=(0, 0, 0), shape="cube"):
     """A shape with an index-matched boundary around a medium."""
-    return {"type": shape, "to_world": T().translate(list(at)).scale(scale), "bsdf": {"type": "null"}, "interior": medium}
+    return {
+        "type": shape,
+        "to_world": T().translate(list(at)).scale(scale),
+        "bsdf": {"type": "null"},
+        "interior": medium,
+    }
 
 
 def lamp(at=(1.5, 3, 1.5), size=0.7, radiance=12.0):
-    return {"type": "rectangle", "to_world": look(at, (0, 0, 0)) @ T().scale(size), "emitter": {"type": "area", "radiance": grey(radiance)}}
+    return {
+        "type": "rectangle",
+        "to_world": look(at, (0, 0, 0)) @ T().scale(size),
+        "emitter": {"type": "area", "radiance": grey(radiance)},
+    }
 
 
 def floor():
-    return {"type": "rectangle", "to_world": T().translate([0, -1.1, 0]).rotate([1, 0, 0], -90).scale(4),
-            "bsdf": {"type": "diffuse", "reflectance": bitmap(np.stack([0.5 + 0.3 * waves(2, 2)] * 3, axis=-1), raw=False)}}
+    return {
+        "type": "rectangle",
+        "to_world": T().translate([0, -1.1, 0]).rotate([1, 0, 0], -90).scale(4),
+        "bsdf": {
+            "type": "diffuse",
+            "reflectance": bitmap(np.stack([0.5 + 0.3 * waves(2, 2)] * 3, axis=-1), raw=False),
+        },
+    }
 
 
 def world(sensor, medium=None, **objects):
-    """A medium over a textured floor, a glossy ball inside, lit by a lamp, a dim sky and a point light."""
-    scene = {"type": "scene", "sensor": sensor, "floor": floor(), "lamp": lamp(), "sky": {"type": "constant", "radiance": grey(0.3)},
-             "point": {"type": "point", "position": [-2, 2.5, 1], "intensity": grey(4.0)},
-             "ball": {"type": "sphere", "radius": 0.35, "bsdf": {"type": "roughconductor", "alpha": 0.3}}}
+    """A medium over a textured floor, a glossy ball inside, lit by a lamp, a dim sky and a point
+    light."""
+    scene = {
+        "type": "scene",
+        "sensor": sensor,
+        "floor": floor(),
+        "lamp": lamp(),
+        "sky": {"type": "constant", "radiance": grey(0.3)},
+        "point": {"type": "point", "position": [-2, 2.5, 1], "intensity": grey(4.0)},
+        "ball": {
+            "type": "sphere",
+            "radius": 0.35,
+            "bsdf": {"type": "roughconductor", "alpha": 0.3},
+        },
+    }
     if medium is not None:
         scene["medium"] = container(medium)
     scene.update(objects)
-    first = {name: scene.pop(name) for name in ("fog",) if name in scene}               # media that others refer to
-    return mi.load_dict({"type": "scene"} | first | {name: thing for name, thing in scene.items() if thing is not None})
+    first = {
+        name: scene.pop(name) for name in ("fog",) if name in scene
+    }  # media that others refer to
+    return mi.load_dict(
+        {"type": "scene"}
+        | first
+        | {name: thing for name, thing in scene.items() if thing is not None}
+    )
 
 
 def multiview(**parameters):
-    return mi.load_dict({"type": "volpath_multiview", "max_depth": 8, "rr_depth": 50, "camera_paths": 16, **parameters})
+    return mi.load_dict(
+        {
+            "type": "volpath_multiview",
+            "max_depth": 8,
+            "rr_depth": 50,
+            "camera_paths": 16,
+            **parameters,
+        }
+    )
 
 
 def volpath(plugin="volpath", **parameters):
@@ -113,7 +185,11 @@ def regions(images, blocks=2):
     found = []
     for image in images:
         height, width, channels = image.shape
-        tiles = image.astype(np.float64).reshape(blocks, height // blocks, blocks, width // blocks, channels).mean(axis=(1, 3))
+        tiles = (
+            image.astype(np.float64)
+            .reshape(blocks, height // blocks, blocks, width // blocks, channels)
+            .mean(axis=(1, 3))
+        )
         found.append(tiles.reshape(-1, channels))
     found = np.concatenate(found)
     return np.concatenate([found.mean(axis=0)[None], found])
@@ -124,17 +200,29 @@ def split(image, count):
 
 
 def arrived(accumulator):
-    """What the sum of the weights at each pixel is over what it is expected to be, view by view (height, width, 1)."""
-    weight = np.array((accumulator.shared[0] + accumulator.shared[1])[:, :, 3:] / (accumulator.expected * accumulator.iterations))
+    """What the sum of the weights at each pixel is over what it is expected to be, view by view
+    (height, width, 1)."""
+    weight = np.array(
+        (accumulator.shared[0] + accumulator.shared[1])[:, :, 3:]
+        / (accumulator.expected * accumulator.iterations)
+    )
     left = accumulator.views.margin
-    return [weight[top:top + h, left:left + w] for (w, h), top in zip(accumulator.views.sizes, accumulator.views.tops)]
+    return [
+        weight[top : top + h, left : left + w]
+        for (w, h), top in zip(accumulator.views.sizes, accumulator.views.tops)
+    ]
 
 
 class MultiviewBatches:
-    """Region means of independent renders of all views, each of so many iterations, by one session."""
+    """Region means of independent renders of all views, each of so many iterations, by one
+    session."""
 
     def __init__(self, integrator, scene, blocks=2, iterations=2, seed=1, sensor=0):
-        self.session = integrator.session(scene, sensor, spp=0) if sensor is not None else integrator.views_session(scene)
+        self.session = (
+            integrator.session(scene, sensor, spp=0)
+            if sensor is not None
+            else integrator.views_session(scene)
+        )
         self.blocks, self.iterations, self.seed, self.batches = blocks, iterations, seed, []
         self.statistics = {"tried": 0, "reached": 0, "lost": 0}
         self.weights = []
@@ -144,7 +232,9 @@ class MultiviewBatches:
             self.session.restart(1000 * self.seed + len(self.batches))
             for _ in range(self.iterations):
                 self.session.iterate()
-            self.batches.append(regions([np.array(t)[:, :, :3] for t in self.session.view_tensors()], self.blocks))
+            self.batches.append(
+                regions([np.array(t)[:, :, :3] for t in self.session.view_tensors()], self.blocks)
+            )
             self.weights.append(regions(arrived(self.session.accumulator), self.blocks))
             for name, value in self.session.statistics.items():
                 self.statistics[name] += value
@@ -154,17 +244,33 @@ class MultiviewBatches:
 
 
 class OracleBatches:
-    """Region means of independent renders of all views by one of Mitsuba's own integrators: side by side, or sensor by sensor."""
+    """Region means of independent renders of all views by one of Mitsuba's own integrators: side by
+    side, or sensor by sensor."""
 
     def __init__(self, integrator, scene, blocks=2, spp=64, first_seed=1000):
-        self.integrator, self.scene, self.blocks, self.spp, self.first_seed, self.batches = integrator, scene, blocks, spp, first_seed, []
+        self.integrator, self.scene, self.blocks, self.spp, self.first_seed, self.batches = (
+            integrator,
+            scene,
+            blocks,
+            spp,
+            first_seed,
+            [],
+        )
 
     def add(self, count):
         for _ in range(count):
             seed = self.first_seed + len(self.batches)
             images = []
             for number, sensor in enumerate(self.scene.sensors()):
-                image = np.array(mi.render(self.scene, integrator=self.integrator, sensor=number, seed=seed * 64 + number, spp=self.spp))
+                image = np.array(
+                    mi.render(
+                        self.scene,
+                        integrator=self.integrator,
+                        sensor=number,
+                        seed=seed * 64 + number,
+                        spp=self.spp,
+                    )
+                )
                 image = image if image.ndim == 3 else image[:, :, None]
                 images += split(image, image.shape[1] // image.shape[0])
             self.batches.append(regions(images, self.blocks))
@@ -173,16 +279,32 @@ class OracleBatches:
         return Estimate.of(self.batches)
 
 
-def views_agree(integrator, oracle, scene, whole=0.015, block=0.06, iterations=2, oracle_spp=128, most=600, blocks=2, seed=1):
-    """Renders all views together and by an oracle until a difference of `whole` or `block` would be seen, and asserts that there is none.
+def views_agree(
+    integrator,
+    oracle,
+    scene,
+    whole=0.015,
+    block=0.06,
+    iterations=2,
+    oracle_spp=128,
+    most=600,
+    blocks=2,
+    seed=1,
+):
+    """Renders all views together and by an oracle until a difference of `whole` or `block` would be
+    seen, and asserts that there is none.
 
-    `oracle` is an integrator or an `Estimate`. Returns the batches of the former and the estimate of the latter, which can judge again.
+    `oracle` is an integrator or an `Estimate`. Returns the batches of the former and the estimate
+    of the latter, which can judge again.
     """
     together = MultiviewBatches(integrator, scene, blocks, iterations, seed, sensor=None)
-    apart = oracle if isinstance(oracle, Estimate) else OracleBatches(oracle, scene, blocks, oracle_spp)
+    apart = (
+        oracle if isinstance(oracle, Estimate) else OracleBatches(oracle, scene, blocks, oracle_spp)
+    )
     estimates = collect_until(together, apart, whole, block, most=most)
     assert_same(*estimates, whole, block)
-    # Weights sum to one on the mean. Pictures say little about that: their means are nearly ratios of two sums that err alike.
+    # Weights sum to one on the mean. Pictures say little about that: their means are nearly ratios
+    # of two sums that err alike.
     weights = Estimate.of(together.weights)
     assert_same(weights, Estimate.exact(np.ones_like(weights.mean)), whole, block)
     return together, estimates[1]

@@ -4,11 +4,11 @@ import subprocess
 import sys
 from pathlib import Path
 
+from mis_integrators.app import cli
+
 import mitsuba as mi
 import numpy as np
 import OpenEXR
-
-from mis_integrators.app import cli
 
 ROOT = Path(cli.__file__).parents[2]
 SCENE = """<scene version="3.0.0">
@@ -55,14 +55,20 @@ def command(scene: Path, *arguments) -> list[str]:
 
 
 def run(arguments, **options) -> subprocess.CompletedProcess:
-    return subprocess.run(arguments, capture_output=True, text=True, cwd=ROOT, timeout=200, **options)
+    return subprocess.run(
+        arguments, capture_output=True, text=True, cwd=ROOT, timeout=200, **options
+    )
 
 
 def read(file: Path) -> tuple[dict, np.ndarray]:
     exr = OpenEXR.File(str(file), separate_channels=True)
-    return exr.header(), np.stack([channel.pixels for _, channel in sorted(exr.channels().items())], axis=-1)
+    return exr.header(), np.stack(
+        [channel.pixels for _, channel in sorted(exr.channels().items())], axis=-1
+    )
 
 
 def same(one: np.ndarray, other: np.ndarray) -> bool:
     """Whether two images are the same up to the order of their sums."""
-    return one.shape == other.shape and np.allclose(one, other, rtol=1e-4, atol=1e-5 * abs(one).mean())
+    return one.shape == other.shape and np.allclose(
+        one, other, rtol=1e-4, atol=1e-5 * abs(one).mean()
+    )

@@ -1,21 +1,22 @@
-"""The plugin `bdpm_auto`: `path` as iterations, the census that costs rest on, the choice, and the image that follows.
+"""The plugin `bdpm_auto`: `path` as iterations, the census that costs rest on, the choice, and the
+image that follows.
 
-Comparisons of renders as in `test_against_path`: false-alarm rate 1e-6 each, and an error of 1 % in the image and of 3 or 8 % in a block is seen
-with a probability of 0.95.
+Comparisons of renders as in `test_against_path`: false-alarm rate 1e-6 each, and an error of 1 % in
+the image and of 3 or 8 % in a block is seen with a probability of 0.95.
 """
 
 import json
 
+from mis_integrators.integrators import costs
+from mis_integrators.paths.path_length_statistics import mean_segments
+
 import mitsuba as mi
 import numpy as np
 import pytest
-
 from comparing import agree, pictures
 from foggy import even, view, volpath
 from foggy import grid as smoke
 from foggy import world as foggy_world
-from mis_integrators.integrators import costs
-from mis_integrators.paths.path_length_statistics import mean_segments
 from test_against_path import MONO, RGB, SPECTRAL, caustic_scene
 from test_bdpm import always_choose_camera_paths, box_scene, glossy_box, last_words
 from worlds import diffuse, film, look, path, tray
@@ -34,7 +35,9 @@ def decided(scene, spp=8, **parameters):
 
 def set_price_of_path(monkeypatch, price):
     """Lets a segment of `path` cost so much, and nothing else of it."""
-    monkeypatch.setitem(costs.PRICES, "path", {"camera": price, "light": 0, "gathered": 0, "pixel": 0})
+    monkeypatch.setitem(
+        costs.PRICES, "path", {"camera": price, "light": 0, "gathered": 0, "pixel": 0}
+    )
 
 
 class Unidirectional:
@@ -44,17 +47,30 @@ class Unidirectional:
         self.parameters = auto(**{"camera_paths": 1, **parameters})
 
     def session(self, scene, sensor, seed, spp):
-        from mis_integrators.integrators.unidirectional import PathSession          # of the active variant
+        from mis_integrators.integrators.unidirectional import PathSession  # of the active variant
+
         return PathSession(self.parameters, scene, scene.sensors()[sensor], seed, None)
 
 
 # --- What the choice rests on ----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("variant_name, kind, rfilter", [(RGB, "perspective", "gaussian"), (MONO, "thinlens", "box"), pytest.param(SPECTRAL, "orthographic", "tent", marks=pytest.mark.full)])
+@pytest.mark.parametrize(
+    "variant_name, kind, rfilter",
+    [
+        (RGB, "perspective", "gaussian"),
+        (MONO, "thinlens", "box"),
+        pytest.param(SPECTRAL, "orthographic", "tent", marks=pytest.mark.full),
+    ],
+)
 def test_path_as_iterations(variant_name, kind, rfilter):
     mi.set_variant(variant_name)
-    agree(Unidirectional(camera_paths=8), path(), tray("smooth1", "rectangle", kind, rfilter=rfilter), block=0.08)
+    agree(
+        Unidirectional(camera_paths=8),
+        path(),
+        tray("smooth1", "rectangle", kind, rfilter=rfilter),
+        block=0.08,
+    )
 
 
 def test_path_in_parts(rgb, monkeypatch):
@@ -71,33 +87,73 @@ def test_path_in_parts(rgb, monkeypatch):
     assert abs(a.mean() / b.mean() - 1) < 0.03
     assert np.corrcoef(a[0::2].ravel(), b[0::2].ravel())[0, 1] > 0.9
     noise -= noise.mean(axis=0)
-    noise = (noise / np.maximum(noise.std(axis=0), 1e-6)).reshape(24, 3, -1)          # a part is 16 rows
+    noise = (noise / np.maximum(noise.std(axis=0), 1e-6)).reshape(24, 3, -1)  # a part is 16 rows
     for one, other in ((0, 1), (1, 2), (0, 2)):
-        assert abs(np.mean(noise[:, one] * noise[:, other])) < 5.3 / np.sqrt(noise[:, 0].size)      # 1e-7
+        assert abs(np.mean(noise[:, one] * noise[:, other])) < 5.3 / np.sqrt(
+            noise[:, 0].size
+        )  # 1e-7
 
 
 def test_census(rgb):
-    """In a closed diffuse box each path has as many segments as `max_depth` allows, and its vertices scatter smoothly; a mirror's do not."""
-    box = {"type": "scene", "walls": {"type": "cube", "bsdf": {"type": "twosided", "bsdf": diffuse(0.9)}},
-           "sensor": {"type": "perspective", "fov": 70, "to_world": look((0, -0.9, 0), (0.1, 0, 0), (0, 0, 1)), "film": film(16)}}
+    """In a closed diffuse box each path has as many segments as `max_depth` allows, and its
+    vertices scatter smoothly; a mirror's do not."""
+    box = {
+        "type": "scene",
+        "walls": {"type": "cube", "bsdf": {"type": "twosided", "bsdf": diffuse(0.9)}},
+        "sensor": {
+            "type": "perspective",
+            "fov": 70,
+            "to_world": look((0, -0.9, 0), (0.1, 0, 0), (0, 0, 1)),
+            "film": film(16),
+        },
+    }
     scene = mi.load_dict(box)
     assert mean_segments(scene, scene.sensors()[0], 1, 1, 256, 3, 50).tolist() == [1, 1, 1, 0, 0]
     assert mean_segments(scene, scene.sensors()[0], 1, 1, 256, 7, 50).tolist() == [1, 1, 1, 1, 3]
-    survivors = mean_segments(scene, scene.sensors()[0], 1, 1, 256, 4, 2)[2:4]         # roulette lets nine tenths go on
+    survivors = mean_segments(scene, scene.sensors()[0], 1, 1, 256, 4, 2)[
+        2:4
+    ]  # roulette lets nine tenths go on
     assert np.all(np.abs(survivors - [0.9, 0.81]) < 5 * 0.02)
-    mirrors = mi.load_dict({**box, "walls": {"type": "cube", "bsdf": {"type": "twosided", "bsdf": {"type": "conductor", "material": "none"}}}})
-    assert mean_segments(mirrors, mirrors.sensors()[0], 1, 1, 256, 3, 50).tolist() == [3, 0, 0, 0, 0]
+    mirrors = mi.load_dict(
+        {
+            **box,
+            "walls": {
+                "type": "cube",
+                "bsdf": {"type": "twosided", "bsdf": {"type": "conductor", "material": "none"}},
+            },
+        }
+    )
+    assert mean_segments(mirrors, mirrors.sensors()[0], 1, 1, 256, 3, 50).tolist() == [
+        3,
+        0,
+        0,
+        0,
+        0,
+    ]
 
 
 def test_prices(rgb):
     """Whatever counts costs has a price for every event, and more of anything is dearer."""
     from mis_integrators.integrators.choice import PHOTON_MAPPERS
-    assert set(costs.PRICES) == {"path", *(plugin for plugin, _ in PHOTON_MAPPERS), "pcbpt", "bdpt_ris"}        # the last two: `light_tracing`
+
+    assert set(costs.PRICES) == {
+        "path",
+        *(plugin for plugin, _ in PHOTON_MAPPERS),
+        "pcbpt",
+        "bdpt_ris",
+    }  # the last two: `light_tracing`
     for plugin in costs.PRICES:
-        few, many = costs.cost(plugin, (1.0, 1.0, 1.0, 1.0)), costs.cost(plugin, (2.0, 2.0, 2.0, 1.0))
+        few, many = (
+            costs.cost(plugin, (1.0, 1.0, 1.0, 1.0)),
+            costs.cost(plugin, (2.0, 2.0, 2.0, 1.0)),
+        )
         assert 0 < few < many
     assert costs.cost("path", (3.5, 9.0, 9.0, 9.0)) == 3.5
-    assert costs.cost("bdpm", (1, 1, 0, 1)) < costs.cost("bdpm", (1, 1, 100, 1)) < 10 * costs.cost("bdpm", (1, 1, 0, 1))
+    assert (
+        costs.cost("bdpm", (1, 1, 0, 1))
+        < costs.cost("bdpm", (1, 1, 100, 1))
+        < 10 * costs.cost("bdpm", (1, 1, 0, 1))
+    )
 
 
 # --- The choice ------------------------------------------------------------------------------------------
@@ -111,11 +167,22 @@ def test_what_needs_no_photons(rgb):
 
 def test_no_light(rgb):
     scene = tray("smooth1", "rectangle")
-    dark = mi.load_dict({"type": "scene", "floor": {"type": "rectangle", "bsdf": diffuse(0.5)},
-                         "lamp": {"type": "point", "intensity": 0.0, "position": [0, 0, 1]},
-                         "sensor": {"type": "perspective", "to_world": look((0, 0, 3), (0, 0, 0), (0, 1, 0)), "film": film(16)}})
+    dark = mi.load_dict(
+        {
+            "type": "scene",
+            "floor": {"type": "rectangle", "bsdf": diffuse(0.5)},
+            "lamp": {"type": "point", "intensity": 0.0, "position": [0, 0, 1]},
+            "sensor": {
+                "type": "perspective",
+                "to_world": look((0, 0, 3), (0, 0, 0), (0, 1, 0)),
+                "film": film(16),
+            },
+        }
+    )
     session = decided(dark)
-    assert session.settings["choice"] == "path" and "no light" in session.settings["choice.because.1"]
+    assert (
+        session.settings["choice"] == "path" and "no light" in session.settings["choice.because.1"]
+    )
     assert session.image().max() == 0 and decided(scene).image().max() > 0
 
 
@@ -124,15 +191,21 @@ def test_path_is_not_chosen_where_it_is_blind(rgb, emitter):
     """However cheap `path` were: caustics of lights without extent it cannot see."""
     settings = decided(caustic_scene(emitter)).settings
     assert settings["choice"] != "path"
-    assert any("cannot see" in reason for name, reason in settings.items() if name.startswith("choice.because"))
+    assert any(
+        "cannot see" in reason
+        for name, reason in settings.items()
+        if name.startswith("choice.because")
+    )
     assert "choice.relmse.path" not in settings
 
 
 def test_the_cheaper_wins(rgb, monkeypatch):
     """The same scene, the same pilot: what is chosen follows the costs."""
+
     def at(price):
         set_price_of_path(monkeypatch, price)
         return decided(tray("lambertian", "rectangle")).settings
+
     cheap, dear = at(1e-4), at(1e4)
     assert cheap["choice"] == "path" and dear["choice"] != "path"
     assert cheap["choice.relmse.path"] < cheap["choice.relmse.bdpm bdd=0"]
@@ -141,10 +214,14 @@ def test_the_cheaper_wins(rgb, monkeypatch):
 
 @pytest.mark.parametrize("seconds, samples", [(1000.0, 8), (None, 1)])
 def test_a_path_of_given_time_keeps_the_processor_busy(rgb, monkeypatch, seconds, samples):
-    """A launch of one sample a pixel is too small on small films; what is predicted of `path` is the same, however many it takes together."""
+    """A launch of one sample a pixel is too small on small films; what is predicted of `path` is
+    the same, however many it takes together."""
     set_price_of_path(monkeypatch, 1e-4)
     scene = tray("lambertian", "rectangle")
-    monkeypatch.setattr("mis_integrators.integrators.unidirectional.BUSY", 8 * int(np.prod(scene.sensors()[0].film().size())))
+    monkeypatch.setattr(
+        "mis_integrators.integrators.unidirectional.BUSY",
+        8 * int(np.prod(scene.sensors()[0].film().size())),
+    )
     session = auto().session(scene, spp=0 if seconds else 8)
     if seconds:
         session.plan_time(seconds)
@@ -162,33 +239,65 @@ def test_a_path_of_given_time_keeps_the_processor_busy(rgb, monkeypatch, seconds
 def test_longer_renders_try_more(rgb):
     """The pilot keeps to its share of the time."""
     scene = glossy_box()
-    short, long = (sum(name.startswith("choice.relmse") for name in decided(scene, spp).settings) for spp in (4, 4000))
+    short, long = (
+        sum(name.startswith("choice.relmse") for name in decided(scene, spp).settings)
+        for spp in (4, 4000)
+    )
     assert short <= 2 < long
 
 
-@pytest.mark.parametrize("behind, spp, tried", [(2, 24, {"bdpm_opt2"}), (100, 24, set()), (0.1, 24, set()), (2, 4, set())])
+@pytest.mark.parametrize(
+    "behind, spp, tried",
+    [(2, 24, {"bdpm_opt2"}), (100, 24, set()), (0.1, 24, set()), (2, 4, set())],
+)
 def test_weights_are_worth_more_time_where_path_keeps_up(rgb, monkeypatch, behind, spp, tried):
-    """One mixture is tried beyond the pilot's usual share, if there is some time left, where camera paths find much of the light by themselves, but not so
-    much that `path` is ahead."""
-    metal = {"type": "sphere", "center": [0, -1.3, 0.4], "radius": 0.3, "bsdf": {"type": "roughconductor", "alpha": 0.3}}
+    """One mixture is tried beyond the pilot's usual share, if there is some time left, where camera
+    paths find much of the light by themselves, but not so much that `path` is ahead."""
+    metal = {
+        "type": "sphere",
+        "center": [0, -1.3, 0.4],
+        "radius": 0.3,
+        "bsdf": {"type": "roughconductor", "alpha": 0.3},
+    }
     set_price_of_path(monkeypatch, 1)
     errors = decided(box_scene(metal=metal), spp).settings
-    set_price_of_path(monkeypatch, behind * errors["choice.relmse.bdpm bdd=0"] / errors["choice.relmse.path"])
+    set_price_of_path(
+        monkeypatch, behind * errors["choice.relmse.bdpm bdd=0"] / errors["choice.relmse.path"]
+    )
     settings = decided(box_scene(metal=metal), spp).settings
-    errors = {name.removeprefix("choice.relmse.") for name in settings if name.startswith("choice.relmse.")}
+    errors = {
+        name.removeprefix("choice.relmse.")
+        for name in settings
+        if name.startswith("choice.relmse.")
+    }
     assert errors == {"path", "bdpm bdd=0"} | tried
-    assert any(("30%" if behind == 2 and not tried else "5%") in reason for name, reason in settings.items() if name.startswith("choice.because"))
+    assert any(
+        ("30%" if behind == 2 and not tried else "5%") in reason
+        for name, reason in settings.items()
+        if name.startswith("choice.because")
+    )
 
 
-@pytest.mark.parametrize("material, first", [({"type": "roughdielectric", "alpha": 0.1}, "bdpm_opt3"), ({"type": "roughplastic"}, "bdpm_opt2"),
-                                             ({"type": "dielectric"}, "bdpm_opt2")])
+@pytest.mark.parametrize(
+    "material, first",
+    [
+        ({"type": "roughdielectric", "alpha": 0.1}, "bdpm_opt3"),
+        ({"type": "roughplastic"}, "bdpm_opt2"),
+        ({"type": "dielectric"}, "bdpm_opt2"),
+    ],
+)
 def test_rough_glass_is_for_three_strategies(rgb, material, first):
     """Its two sides are in the way of what photons are good at."""
-    from mis_integrators.integrators.choice import PHOTON_MAPPERS, later_candidates
     from mis_integrators.core.traits import SceneTraits
-    scene = mi.load_dict({"type": "scene", "ball": {"type": "sphere", "bsdf": material}, "sky": {"type": "constant"}})
+    from mis_integrators.integrators.choice import PHOTON_MAPPERS, later_candidates
+
+    scene = mi.load_dict(
+        {"type": "scene", "ball": {"type": "sphere", "bsdf": material}, "sky": {"type": "constant"}}
+    )
     candidates = later_candidates(SceneTraits(scene))
-    assert candidates[0][0] == first and {name for name, _ in candidates} == {name for name, _ in PHOTON_MAPPERS}
+    assert candidates[0][0] == first and {name for name, _ in candidates} == {
+        name for name, _ in PHOTON_MAPPERS
+    }
 
 
 @pytest.mark.parametrize("seconds, tried", [(0.5, False), (1000.0, True)])
@@ -207,27 +316,41 @@ def test_camera_paths_of_the_chosen_are_its_own(rgb, monkeypatch):
     session = auto().session(caustic_scene("point"))
     session.plan_time(1000.0)
     session.iterate()
-    assert session.samples_per_iteration == session.settings["camera_paths"] == session.decision.session.samples_per_iteration == 3
+    assert (
+        session.samples_per_iteration
+        == session.settings["camera_paths"]
+        == session.decision.session.samples_per_iteration
+        == 3
+    )
     trial = session.decision.trials[0]
-    assert 1.5 < trial.cost / costs.cost(trial.plugin, costs.events(trial.session, [1.0] * 5, 0, session.decision.session.forecast.gathered))
+    assert 1.5 < trial.cost / costs.cost(
+        trial.plugin,
+        costs.events(trial.session, [1.0] * 5, 0, session.decision.session.forecast.gathered),
+    )
     other = auto().session(caustic_scene("point"))
     other.recall(json.loads(json.dumps(session.learned)))
     assert other.samples_per_iteration == 3
 
 
 def test_prediction_is_checked(rgb):
-    """The error that is predicted for `path` is what independent renders have: within a factor of two, the pilot's pixels being few."""
+    """The error that is predicted for `path` is what independent renders have: within a factor of
+    two, the pilot's pixels being few."""
     scene = tray("lambertian", "rectangle")
     session = auto().session(scene, spp=64)
     session.iterate()
     predicted = session.settings["choice.relmse.path"]
     trial = next(t for t in session.decision.trials if t.name == "path")
-    samples = 64 * session.decision.usual_cost / trial.cost                      # as many as cost the same as 64 iterations of bdpm
-    images = [np.array(mi.render(scene, integrator=path(), spp=16, seed=seed)).mean(axis=-1) for seed in range(12)]
+    samples = (
+        64 * session.decision.usual_cost / trial.cost
+    )  # as many as cost the same as 64 iterations of bdpm
+    images = [
+        np.array(mi.render(scene, integrator=path(), spp=16, seed=seed)).mean(axis=-1)
+        for seed in range(12)
+    ]
     mean = np.mean(images, axis=0)
-    weights = 1 / (mean ** 2 + 0.1 * np.mean(np.minimum(mean, np.quantile(mean, 0.95))) ** 2)
+    weights = 1 / (mean**2 + 0.1 * np.mean(np.minimum(mean, np.quantile(mean, 0.95))) ** 2)
     relative = np.sort((weights * np.var(images, axis=0, ddof=1)).ravel())
-    measured = relative[:int(0.999 * relative.size)].mean() * 16 / samples
+    measured = relative[: int(0.999 * relative.size)].mean() * 16 / samples
     assert 0.5 < predicted / measured < 2
 
 
@@ -244,8 +367,14 @@ def test_image_is_that_of_the_integrator_chosen(variant_name):
     settings = session.settings
     if settings["choice"] == "path":
         pytest.fail("this scene is there for its photons")
-    given = {name: settings[name] for name in ("bdd", "weights") if name in settings and settings["choice"].startswith("bdpm")}
-    alone = mi.load_dict({"type": settings["choice"], "max_depth": 4, "variance": True, **given}).session(scene, seed=3, spp=6)
+    given = {
+        name: settings[name]
+        for name in ("bdd", "weights")
+        if name in settings and settings["choice"].startswith("bdpm")
+    }
+    alone = mi.load_dict(
+        {"type": settings["choice"], "max_depth": 4, "variance": True, **given}
+    ).session(scene, seed=3, spp=6)
     while alone.iterations < 6:
         alone.iterate()
     assert settings["radius.indirect"] == alone.settings["radius.indirect"]
@@ -254,7 +383,8 @@ def test_image_is_that_of_the_integrator_chosen(variant_name):
 
 
 def test_what_was_decided_can_be_recalled(rgb):
-    """Another session of the same render (after a kill, on another machine) goes on with the same integrator, without a pilot."""
+    """Another session of the same render (after a kill, on another machine) goes on with the same
+    integrator, without a pilot."""
     scene = glossy_box()
     first, second = (auto().session(scene, seed=3, spp=6) for _ in range(2))
     first.iterate()
@@ -273,7 +403,9 @@ def test_media_are_handed_over(rgb):
     scene = foggy_world(view((0, 1, 4)), smoke(even, 4))
     session = auto(max_depth=6).session(scene, spp=16)
     session.iterate()
-    assert session.settings["integrator"] == "volpath_multiview" and session.settings["max_depth"] == 6
+    assert (
+        session.settings["integrator"] == "volpath_multiview" and session.settings["max_depth"] == 6
+    )
     image = np.array(mi.render(scene, integrator=auto(max_depth=6, camera_paths=16), spp=256))
     oracle = np.array(mi.render(scene, integrator=volpath(max_depth=6, rr_depth=5), spp=256))
     assert abs(image.mean() / oracle.mean() - 1) < 0.03

@@ -3,44 +3,98 @@
 import gc
 import sys
 
+from mis_integrators._plugins import PLUGINS
+from mis_integrators.pilot.radius import relative_weights, usual_mean
+from mis_integrators.pilot.run import Pilot, choose_camera_paths
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-
-from mis_integrators.pilot.run import Pilot, choose_camera_paths
-from mis_integrators.pilot.radius import relative_weights, usual_mean
-from comparing import (Estimate, PathBatches, SessionBatches, agree, assert_same, block_means, collect_until, differences, extrapolate,
-                       kernels_of, pictures, smallest_visible)
+from comparing import (
+    Estimate,
+    PathBatches,
+    SessionBatches,
+    agree,
+    assert_same,
+    block_means,
+    collect_until,
+    differences,
+    extrapolate,
+    kernels_of,
+    pictures,
+    smallest_visible,
+)
 from worlds import T, bdpm, diffuse, film, grey, look, path, sensor, tray
-from mis_integrators._plugins import PLUGINS
 
 
 def box_scene(size=32, rfilter="box", film_options=None, light="area", **entries):
     """An open box of three walls with a ball, lit from above."""
     lights = {
-        "area": {"type": "rectangle", "to_world": look((0, 0, 3), (0, 0, 0)) @ T().scale(0.8),
-                 "emitter": {"type": "area", "radiance": grey(4.0)}},
+        "area": {
+            "type": "rectangle",
+            "to_world": look((0, 0, 3), (0, 0, 0)) @ T().scale(0.8),
+            "emitter": {"type": "area", "radiance": grey(4.0)},
+        },
         "point": {"type": "point", "position": [0.5, -0.5, 3], "intensity": grey(8.0)},
-        "none": diffuse(0.1)}
-    return mi.load_dict({
-        "type": "scene", "floor": {"type": "rectangle", "to_world": T().scale(2.5), "bsdf": diffuse(0.7)},
-        "back": {"type": "rectangle", "to_world": T().translate([0, 2.5, 0]).rotate([1, 0, 0], 90).scale(2.5), "bsdf": diffuse(0.5)},
-        "ball": {"type": "sphere", "center": [0, 0, 1], "radius": 0.5, "bsdf": diffuse(0.6)}, "light": lights[light],
-        "sensor": {"type": "perspective", "fov": 45, "to_world": look((0, -5, 2.5), (0, 0, 0.6), (0, 0, 1)),
-                   "film": film(size, rfilter, **(film_options or {}))}, **entries})
+        "none": diffuse(0.1),
+    }
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "floor": {"type": "rectangle", "to_world": T().scale(2.5), "bsdf": diffuse(0.7)},
+            "back": {
+                "type": "rectangle",
+                "to_world": T().translate([0, 2.5, 0]).rotate([1, 0, 0], 90).scale(2.5),
+                "bsdf": diffuse(0.5),
+            },
+            "ball": {"type": "sphere", "center": [0, 0, 1], "radius": 0.5, "bsdf": diffuse(0.6)},
+            "light": lights[light],
+            "sensor": {
+                "type": "perspective",
+                "fov": 45,
+                "to_world": look((0, -5, 2.5), (0, 0, 0.6), (0, 0, 1)),
+                "film": film(size, rfilter, **(film_options or {})),
+            },
+            **entries,
+        }
+    )
 
 
 def glossy_box(**options):
     """As `box_scene`, with a glass and a plastic ball and a rough mirror: every pass is needed."""
-    return box_scene(glass={"type": "sphere", "center": [-1.2, -0.5, 0.6], "radius": 0.4, "bsdf": {"type": "dielectric"}},
-                     plastic={"type": "sphere", "center": [1.2, -0.5, 0.6], "radius": 0.4, "bsdf": {"type": "plastic"}},
-                     metal={"type": "sphere", "center": [0, -1.3, 0.4], "radius": 0.3,
-                            "bsdf": {"type": "roughconductor", "alpha": 0.3}}, **options)
+    return box_scene(
+        glass={
+            "type": "sphere",
+            "center": [-1.2, -0.5, 0.6],
+            "radius": 0.4,
+            "bsdf": {"type": "dielectric"},
+        },
+        plastic={
+            "type": "sphere",
+            "center": [1.2, -0.5, 0.6],
+            "radius": 0.4,
+            "bsdf": {"type": "plastic"},
+        },
+        metal={
+            "type": "sphere",
+            "center": [0, -1.3, 0.4],
+            "radius": 0.3,
+            "bsdf": {"type": "roughconductor", "alpha": 0.3},
+        },
+        **options,
+    )
 
 
 def render(scene, seed=0, spp=8, **parameters):
-    return np.array(mi.render(scene, integrator=bdpm(camera_paths=1, photon_count=3000, **parameters), seed=seed, spp=spp))
+    return np.array(
+        mi.render(
+            scene,
+            integrator=bdpm(camera_paths=1, photon_count=3000, **parameters),
+            seed=seed,
+            spp=spp,
+        )
+    )
 
 
 def last_words(error):
@@ -56,32 +110,55 @@ def last_words(error):
 @pytest.mark.parametrize("first, second", [(0, 1), (1, 2), (2, 3)])
 def test_strategies_agree(rgb, first, second):
     scene = glossy_box(size=48)
-    a, b = (SessionBatches(bdpm(bdd=bdd, initial_radius=0.03), scene, 3, seed=bdd + 1) for bdd in (first, second))
+    a, b = (
+        SessionBatches(bdpm(bdd=bdd, initial_radius=0.03), scene, 3, seed=bdd + 1)
+        for bdd in (first, second)
+    )
     assert_same(*collect_until(a, b, block=0.05, most=600), block=0.05)
 
 
 def test_bias_falls_with_the_square_of_the_radius(rgb):
-    """Where irradiance is curved, E'' R^2 / 8: the bias at R over that at R / 2 is 4, and R -> 0 is unbiased.
+    """Where irradiance is curved, E'' R^2 / 8: the bias at R over that at R / 2 is 4, and R -> 0 is
+    unbiased.
 
-    The middle of the floor right under a low point light seen through a pane: E = I h / (r^2 + h^2)^1.5 exactly, Laplacian at the
-    middle -6 E / h^2; so a disk of radius R is off by -(3/4) (R / h)^2 there, to first order.
+    The middle of the floor right under a low point light seen through a pane: E = I h / (r^2 +
+    h^2)^1.5 exactly, Laplacian at the middle -6 E / h^2; so a disk of radius R is off by -(3/4) (R
+    / h)^2 there, to first order.
     """
     height = 0.5
-    scene = mi.load_dict({
-        "type": "scene", "light": {"type": "point", "position": [0, 0, height], "intensity": 1.0},
-        "floor": {"type": "rectangle", "to_world": T().scale(3), "bsdf": diffuse(0.5)},
-        "pane": {"type": "rectangle", "to_world": T().translate([0, 0, 0.3]).scale(3),
-                 "bsdf": {"type": "thindielectric", "int_ior": 1.0, "ext_ior": 1.0}},
-        "sensor": {"type": "orthographic", "to_world": look((0, 0, 0.2), (0, 0, 0)) @ T().scale([0.004, 0.004, 1]),
-                   "film": film(4)}})
-    exact = 0.5 / np.pi / height ** 2
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "light": {"type": "point", "position": [0, 0, height], "intensity": 1.0},
+            "floor": {"type": "rectangle", "to_world": T().scale(3), "bsdf": diffuse(0.5)},
+            "pane": {
+                "type": "rectangle",
+                "to_world": T().translate([0, 0, 0.3]).scale(3),
+                "bsdf": {"type": "thindielectric", "int_ior": 1.0, "ext_ior": 1.0},
+            },
+            "sensor": {
+                "type": "orthographic",
+                "to_world": look((0, 0, 0.2), (0, 0, 0)) @ T().scale([0.004, 0.004, 1]),
+                "film": film(4),
+            },
+        }
+    )
+    exact = 0.5 / np.pi / height**2
     radii, estimates = (0.2, 0.1414, 0.1), []
     for seed, radius in enumerate(radii):
-        batches = SessionBatches(bdpm(bdd=0, max_depth=3, initial_radius=radius, photon_count=40000, camera_paths=1), scene, 1, seed)
+        batches = SessionBatches(
+            bdpm(bdd=0, max_depth=3, initial_radius=radius, photon_count=40000, camera_paths=1),
+            scene,
+            1,
+            seed,
+        )
         batches.add(80)
         estimates.append(batches.estimate())
-    disk = [2 * height * (1 / height - 1 / np.hypot(height, r)) / r ** 2 * height ** 2 * exact for r in radii]
-    for estimate, expected in zip(estimates, disk):              # the mean over the disk in closed form
+    disk = [
+        2 * height * (1 / height - 1 / np.hypot(height, r)) / r**2 * height**2 * exact
+        for r in radii
+    ]
+    for estimate, expected in zip(estimates, disk):  # the mean over the disk in closed form
         assert not differences(estimate, Estimate.exact(np.full_like(estimate.mean, expected)))
     bias = [1 - e.mean[0, 0] / exact for e in estimates]
     slope = np.polyfit(np.log(radii), np.log(bias), 1)[0]
@@ -90,14 +167,15 @@ def test_bias_falls_with_the_square_of_the_radius(rgb):
 
 
 def test_alpha_shrinks_the_radius(rgb):
-    """R_i^2 = R_0^2 (i + 1)^(alpha - 1): two iterations with alpha = 0.5 are the mean of one at R_0 and one at R_0 2^-1/4."""
+    """R_i^2 = R_0^2 (i + 1)^(alpha - 1): two iterations with alpha = 0.5 are the mean of one at R_0
+    and one at R_0 2^-1/4."""
     scene = box_scene()
     both = bdpm(bdd=0, alpha=0.5, initial_radius=0.2).session(scene, 0, 3, 0)
     both.iterate()
     first = both.image()
     both.iterate()
     second = 2 * both.image() - first
-    small = bdpm(bdd=0, initial_radius=0.2 * 2 ** -0.25).session(scene, 0, 3, 0)
+    small = bdpm(bdd=0, initial_radius=0.2 * 2**-0.25).session(scene, 0, 3, 0)
     small.iterate()
     one = small.image()
     small.iterate()
@@ -105,7 +183,9 @@ def test_alpha_shrinks_the_radius(rgb):
 
 
 def test_alpha_leaves_the_mean(rgb):
-    agree(bdpm(alpha=0.7, initial_radius=0.08, bdd=0), path(rr_depth=50), tray("lambertian", "point"))
+    agree(
+        bdpm(alpha=0.7, initial_radius=0.08, bdd=0), path(rr_depth=50), tray("lambertian", "point")
+    )
 
 
 # --- Seeds ------------------------------------------------------------------------------------------------
@@ -119,11 +199,20 @@ def test_same_seed_same_image(rgb, bdd):
 
 
 def test_same_seed_same_edges(rgb):
-    """The probes of the correction at edges belong to a path's vertices, not to their places in a buffer, which chance decides."""
+    """The probes of the correction at edges belong to a path's vertices, not to their places in a
+    buffer, which chance decides."""
     images = []
     for _ in range(2):
-        session = bdpm(bdd=0, initial_radius=0.0, photon_count=3000).session(glossy_box(size=128), seed=5)
-        session.recall({"radii": dict.fromkeys(session.kinds(), 0.3), "corrected": {"caustic": False, "indirect": True}, "camera_paths": 1})
+        session = bdpm(bdd=0, initial_radius=0.0, photon_count=3000).session(
+            glossy_box(size=128), seed=5
+        )
+        session.recall(
+            {
+                "radii": dict.fromkeys(session.kinds(), 0.3),
+                "corrected": {"caustic": False, "indirect": True},
+                "camera_paths": 1,
+            }
+        )
         session.iterate()
         images.append(session.image())
     np.testing.assert_allclose(*images, rtol=1e-4, atol=1e-6)
@@ -142,27 +231,38 @@ def test_iteration_depends_on_its_index_alone(rgb):
 
 
 def test_seeds_and_iterations_are_uncorrelated(rgb):
-    """Correlation of the pixels' noise over pairs of renders, of different seeds and iterations: below 0.2, four to five standard deviations of
-    chance (0.04 to 0.06: neighbouring pixels share photons). With random numbers in common it is far above."""
+    """Correlation of the pixels' noise over pairs of renders, of different seeds and iterations:
+    below 0.2, four to five standard deviations of chance (0.04 to 0.06: neighbouring pixels share
+    photons). With random numbers in common it is far above."""
     scene = glossy_box(size=32)
     mean = render(scene, 1000, 256).mean(axis=2)
     session = bdpm(camera_paths=1, photon_count=3000).session(scene, 0, 3, 0)
     images = [render(scene, seed, 1).mean(axis=2) for seed in (0, 1, 2, 3)]
     images += [picture.mean(axis=2) for picture in pictures(session, 3)]
     noise = [(i - mean).ravel() for i in images[:3]] + [(i - mean).ravel() for i in images[4:]]
-    noise = [np.clip(n, *np.quantile(n, [0.02, 0.98])) for n in noise]       # a caustic's fireflies would be all that counts
+    noise = [
+        np.clip(n, *np.quantile(n, [0.02, 0.98])) for n in noise
+    ]  # a caustic's fireflies would be all that counts
     table = np.corrcoef(noise) - np.eye(len(noise))
     assert np.abs(table).max() < 0.2, table.round(2)
     assert not np.array_equal(images[0], images[1])
-    np.testing.assert_allclose(images[3], images[4], rtol=1e-3, atol=1e-6)    # seed 3 is the session's
+    np.testing.assert_allclose(
+        images[3], images[4], rtol=1e-3, atol=1e-6
+    )  # seed 3 is the session's
 
 
 def test_error_falls_with_iterations(rgb):
-    """Variance of block means over seeds: with 4 times the iterations, a quarter (within a factor of 2.5)."""
+    """Variance of block means over seeds: with 4 times the iterations, a quarter (within a factor
+    of 2.5)."""
     scene = box_scene(light="point")
-    few, many = (np.array([block_means(render(scene, seed + 100 * n, n, bdd=0), 2)[:, 0] for seed in range(24)]) for n in (2, 8))
+    few, many = (
+        np.array(
+            [block_means(render(scene, seed + 100 * n, n, bdd=0), 2)[:, 0] for seed in range(24)]
+        )
+        for n in (2, 8)
+    )
     ratio = (few.var(axis=0, ddof=1) / many.var(axis=0, ddof=1)).mean()
-    assert 1.6 < ratio < 10, ratio                                # 24 seeds, 5 regions: a factor 2.5 is 4 sigma
+    assert 1.6 < ratio < 10, ratio  # 24 seeds, 5 regions: a factor 2.5 is 4 sigma
 
 
 # --- Variance AOV -------------------------------------------------------------------------------------------
@@ -170,7 +270,8 @@ def test_error_falls_with_iterations(rgb):
 
 @pytest.mark.parametrize("rfilter", ["box", pytest.param("gaussian", marks=pytest.mark.full)])
 def test_variance_is_that_of_the_mean(rgb, rfilter):
-    """Mean over the image of the estimated variance, against that of 32 seeds: within 15 % (its own error is 3 %)."""
+    """Mean over the image of the estimated variance, against that of 32 seeds: within 15 % (its own
+    error is 3 %)."""
     scene = box_scene(16, rfilter)
     images = np.array([render(scene, seed, 8, variance=True) for seed in range(32)])
     assert images.shape[-1] == 6
@@ -178,26 +279,38 @@ def test_variance_is_that_of_the_mean(rgb, rfilter):
     assert estimated == pytest.approx(empirical, rel=0.15)
 
 
-@pytest.mark.parametrize("variant_name, names", [("llvm_ad_rgb", ["var.R", "var.G", "var.B"]), ("llvm_ad_mono", ["var.Y"]),
-                                                 ("llvm_ad_spectral", ["var.R", "var.G", "var.B"])])
+@pytest.mark.parametrize(
+    "variant_name, names",
+    [
+        ("llvm_ad_rgb", ["var.R", "var.G", "var.B"]),
+        ("llvm_ad_mono", ["var.Y"]),
+        ("llvm_ad_spectral", ["var.R", "var.G", "var.B"]),
+    ],
+)
 def test_variance_channels(variant_name, names):
     mi.set_variant(variant_name)
     scene = box_scene(8, film_options={"pixel_format": "luminance" if len(names) == 1 else "rgb"})
     integrator = bdpm(variance=True)
     assert integrator.aov_names() == names
     session = integrator.session(scene, 0, 0, 16)
-    assert session.channels[-len(names):] == names and session.iterations_planned == 2
+    assert session.channels[-len(names) :] == names and session.iterations_planned == 2
     session.iterate()
     session.iterate()
     image = session.image()
-    assert image.shape == (8, 8, len(session.channels)) and (image[..., -len(names):] >= 0).all() and image[..., -1].max() > 0
+    assert (
+        image.shape == (8, 8, len(session.channels))
+        and (image[..., -len(names) :] >= 0).all()
+        and image[..., -1].max() > 0
+    )
     assert np.array(mi.render(scene, integrator=integrator, spp=16)).shape == image.shape
 
 
 def test_variance_needs_two_iterations(rgb):
     with pytest.raises(Exception) as error:
         render(box_scene(8), spp=1, variance=True)
-    assert "bdpm" in last_words(error.value) and "at least two iterations" in last_words(error.value)
+    assert "bdpm" in last_words(error.value) and "at least two iterations" in last_words(
+        error.value
+    )
 
 
 # --- Film -------------------------------------------------------------------------------------------------------
@@ -214,24 +327,39 @@ def test_crop_is_the_cropped_window(rgb, rfilter, bdd):
     assert image.shape == (8, 16, 3)
 
     def off(dx, dy):
-        there = whole[16 + dy:24 + dy, 8 + dx:24 + dx]
+        there = whole[16 + dy : 24 + dy, 8 + dx : 24 + dx]
         return np.abs(image / there - 1).mean()
 
-    np.testing.assert_allclose(image.mean(axis=(0, 1)), whole[16:24, 8:24].mean(axis=(0, 1)), rtol=0.02)
+    np.testing.assert_allclose(
+        image.mean(axis=(0, 1)), whole[16:24, 8:24].mean(axis=(0, 1)), rtol=0.02
+    )
     assert off(0, 0) < 0.06
     # No other place fits as well: the window is not a pixel off, to any side.
-    assert all(off(dx, dy) > 3 * off(0, 0) for dx in (-1, 0, 1) for dy in (-1, 0, 1) if (dx, dy) != (0, 0))
+    assert all(
+        off(dx, dy) > 3 * off(0, 0) for dx in (-1, 0, 1) for dy in (-1, 0, 1) if (dx, dy) != (0, 0)
+    )
 
 
 @pytest.mark.thinned(5, 2)
 @pytest.mark.parametrize("rfilter", ["gaussian", "tent", "mitchell", "lanczos", "catmullrom"])
 @pytest.mark.parametrize("border", [False, True])
 def test_reconstruction_filters(rgb, rfilter, border):
-    """Means of border rows and columns and of the whole agree with `path`, whatever the filter and its border."""
+    """Means of border rows and columns and of the whole agree with `path`, whatever the filter and
+    its border."""
     scene = box_scene(16, rfilter, {"sample_border": border})
-    a, b = (np.array([np.array(mi.render(scene, integrator=i, seed=seed, spp=spp)) for seed in range(12)])
-            for i, spp in ((bdpm(), 64), (path(), 256)))
-    for region in (np.s_[:, :, :], np.s_[:, 0, :], np.s_[:, -1, :], np.s_[:, :, 0], np.s_[:, :, -1]):
+    a, b = (
+        np.array(
+            [np.array(mi.render(scene, integrator=i, seed=seed, spp=spp)) for seed in range(12)]
+        )
+        for i, spp in ((bdpm(), 64), (path(), 256))
+    )
+    for region in (
+        np.s_[:, :, :],
+        np.s_[:, 0, :],
+        np.s_[:, -1, :],
+        np.s_[:, :, 0],
+        np.s_[:, :, -1],
+    ):
         means = [Estimate.of(x[region].reshape(12, -1, 3).mean(axis=1)[:, None]) for x in (a, b)]
         assert not differences(*means), region
         assert np.sqrt(means[0].error2.max()) < 0.02 * means[0].mean.max()
@@ -239,31 +367,71 @@ def test_reconstruction_filters(rgb, rfilter, border):
 
 def test_alpha_channel_is_that_of_path(rgb):
     for hide in (False, True):
-        scene = mi.load_dict({
-            "type": "scene", "ball": {"type": "sphere", "bsdf": diffuse()},
-            "glass": {"type": "sphere", "center": [2, 0, 0], "radius": 0.7, "bsdf": {"type": "dielectric"}},
-            "mask": {"type": "rectangle", "to_world": T().translate([-2, 0, 0]).scale(0.7),
-                     "bsdf": {"type": "mask", "opacity": 0.5, "bsdf": diffuse()}},
-            "lamp": {"type": "sphere", "center": [0, 2, 0], "radius": 0.6, "emitter": {"type": "area", "radiance": 2.0}},
-            "sky": {"type": "constant", "radiance": 0.5},
-            "sensor": {"type": "orthographic", "to_world": look((0, 0, 5), (0, 0, 0)) @ T().scale([3, 3, 1]),
-                       "film": film(24, pixel_format="rgba")}})
-        images = [np.array(mi.render(scene, integrator=i, spp=256)) for i in (bdpm(hide_emitters=hide), path(hide_emitters=hide))]
+        scene = mi.load_dict(
+            {
+                "type": "scene",
+                "ball": {"type": "sphere", "bsdf": diffuse()},
+                "glass": {
+                    "type": "sphere",
+                    "center": [2, 0, 0],
+                    "radius": 0.7,
+                    "bsdf": {"type": "dielectric"},
+                },
+                "mask": {
+                    "type": "rectangle",
+                    "to_world": T().translate([-2, 0, 0]).scale(0.7),
+                    "bsdf": {"type": "mask", "opacity": 0.5, "bsdf": diffuse()},
+                },
+                "lamp": {
+                    "type": "sphere",
+                    "center": [0, 2, 0],
+                    "radius": 0.6,
+                    "emitter": {"type": "area", "radiance": 2.0},
+                },
+                "sky": {"type": "constant", "radiance": 0.5},
+                "sensor": {
+                    "type": "orthographic",
+                    "to_world": look((0, 0, 5), (0, 0, 0)) @ T().scale([3, 3, 1]),
+                    "film": film(24, pixel_format="rgba"),
+                },
+            }
+        )
+        images = [
+            np.array(mi.render(scene, integrator=i, spp=256))
+            for i in (bdpm(hide_emitters=hide), path(hide_emitters=hide))
+        ]
         assert images[0].shape == (24, 24, 4)
-        np.testing.assert_allclose(images[0][..., 3], images[1][..., 3], atol=0.2)      # 256 samples: 5 sigma is 0.16
+        np.testing.assert_allclose(
+            images[0][..., 3], images[1][..., 3], atol=0.2
+        )  # 256 samples: 5 sigma is 0.16
         assert np.abs(images[0][..., 3] - images[1][..., 3]).mean() < 0.02
-        np.testing.assert_allclose(images[0].mean(axis=(0, 1)), images[1].mean(axis=(0, 1)), rtol=0.03)
+        np.testing.assert_allclose(
+            images[0].mean(axis=(0, 1)), images[1].mean(axis=(0, 1)), rtol=0.03
+        )
 
 
 @pytest.mark.parametrize("hide", [False, True])
 @pytest.mark.parametrize("bdd", [0, 1])
 def test_hidden_emitters(rgb, hide, bdd):
     """A lamp and a sky in view."""
-    scene = mi.load_dict({
-        "type": "scene", "ball": {"type": "sphere", "bsdf": diffuse()},
-        "lamp": {"type": "sphere", "center": [1.2, 1.2, 0.6], "radius": 0.6, "emitter": {"type": "area", "radiance": 1.0}},
-        "sky": {"type": "constant", "radiance": 0.5},
-        "sensor": {"type": "orthographic", "to_world": look((0, 0, 5), (0, 0, 0)) @ T().scale([1.4, 1.4, 1]), "film": film(32)}})
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "ball": {"type": "sphere", "bsdf": diffuse()},
+            "lamp": {
+                "type": "sphere",
+                "center": [1.2, 1.2, 0.6],
+                "radius": 0.6,
+                "emitter": {"type": "area", "radiance": 1.0},
+            },
+            "sky": {"type": "constant", "radiance": 0.5},
+            "sensor": {
+                "type": "orthographic",
+                "to_world": look((0, 0, 5), (0, 0, 0)) @ T().scale([1.4, 1.4, 1]),
+                "film": film(32),
+            },
+        }
+    )
     agree(bdpm(bdd=bdd, hide_emitters=hide), path(hide_emitters=hide), scene, blocks=2)
 
 
@@ -272,20 +440,32 @@ def test_hidden_emitters(rgb, hide, bdd):
 
 @pytest.mark.parametrize("scene", ["nothing", "no emitters", "black emitter"])
 def test_darkness(rgb, scene):
-    scene = {"nothing": mi.load_dict({"type": "scene", "sensor": sensor(size=8)}), "no emitters": box_scene(8, light="none"),
-             "black emitter": box_scene(8, light="none", lamp={"type": "point", "intensity": 0.0})}[scene]
+    scene = {
+        "nothing": mi.load_dict({"type": "scene", "sensor": sensor(size=8)}),
+        "no emitters": box_scene(8, light="none"),
+        "black emitter": box_scene(8, light="none", lamp={"type": "point", "intensity": 0.0}),
+    }[scene]
     for bdd in (0, 1):
         assert not render(scene, bdd=bdd).any()
 
 
 def test_light_that_meets_nothing(rgb):
-    scene = mi.load_dict({"type": "scene", "lamp": {"type": "point", "position": [0, 0, 0]}, "sensor": sensor(size=8)})
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "lamp": {"type": "point", "position": [0, 0, 0]},
+            "sensor": sensor(size=8),
+        }
+    )
     assert not render(scene).any()
 
 
-@pytest.mark.parametrize("max_depth", [0, 1, 2, 3, *(pytest.param(depth, marks=pytest.mark.full) for depth in (4, 5))])
+@pytest.mark.parametrize(
+    "max_depth", [0, 1, 2, 3, *(pytest.param(depth, marks=pytest.mark.full) for depth in (4, 5))]
+)
 def test_max_depth(rgb, max_depth):
-    """Whole paths are cut at the same length as `path` cuts them, for all bdd (1.5 % of the whole image)."""
+    """Whole paths are cut at the same length as `path` cuts them, for all bdd (1.5 % of the whole
+    image)."""
     scene = glossy_box(size=24)
     if max_depth == 0:
         assert not any(render(scene, bdd=bdd, max_depth=0).any() for bdd in range(4))
@@ -293,33 +473,59 @@ def test_max_depth(rgb, max_depth):
     oracle = PathBatches(path(max_depth=max_depth, rr_depth=50), scene, 1, spp=256)
     oracle.add(16)
     for bdd in range(4):
-        side = SessionBatches(bdpm(bdd=bdd, max_depth=max_depth, initial_radius=0.03), scene, 1, seed=bdd)
+        side = SessionBatches(
+            bdpm(bdd=bdd, max_depth=max_depth, initial_radius=0.03), scene, 1, seed=bdd
+        )
         assert_same(*collect_until(side, oracle, whole=0.015), whole=0.015)
 
 
 @pytest.mark.parametrize("bdd", [0, 1])
 def test_direct_light_of_directionalarea(rgb, bdd):
-    """Next-event estimation cannot make it, so photons do, at max_depth = 2 as well: L = rho / pi M cos(theta)."""
-    scene = mi.load_dict({"type": "scene", "floor": {"type": "rectangle", "to_world": T().scale(3), "bsdf": diffuse(0.5)},
-                          "lamp": {"type": "rectangle", "to_world": look((0, 0, 3), (0, 0, 0)) @ T().scale(2),
-                                   "emitter": {"type": "directionalarea", "radiance": 2.0}},
-                          "sensor": {"type": "perspective", "fov": 20, "to_world": look((0, 0, 2), (0, 0, 0)), "film": film(16)}})
-    oracle = np.array(mi.render(scene, integrator=mi.load_dict({"type": "ptracer", "max_depth": 2}), spp=4096)).mean()
+    """Next-event estimation cannot make it, so photons do, at max_depth = 2 as well: L = rho / pi M
+    cos(theta)."""
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "floor": {"type": "rectangle", "to_world": T().scale(3), "bsdf": diffuse(0.5)},
+            "lamp": {
+                "type": "rectangle",
+                "to_world": look((0, 0, 3), (0, 0, 0)) @ T().scale(2),
+                "emitter": {"type": "directionalarea", "radiance": 2.0},
+            },
+            "sensor": {
+                "type": "perspective",
+                "fov": 20,
+                "to_world": look((0, 0, 2), (0, 0, 0)),
+                "film": film(16),
+            },
+        }
+    )
+    oracle = np.array(
+        mi.render(scene, integrator=mi.load_dict({"type": "ptracer", "max_depth": 2}), spp=4096)
+    ).mean()
     for max_depth in (2, 3, -1):
         image = render(scene, bdd=bdd, max_depth=max_depth, initial_radius=0.1, spp=64)
-        assert image.mean() == pytest.approx(oracle, rel=0.02)    # 5 sigma of 200,000 photons
+        assert image.mean() == pytest.approx(oracle, rel=0.02)  # 5 sigma of 200,000 photons
 
 
 @pytest.mark.thinned(2, 2)
 @pytest.mark.parametrize("bdd", [0, 2])
 @pytest.mark.parametrize("rr_depth", [1, 2, 50])
 def test_roulette_leaves_the_mean(rgb, bdd, rr_depth):
-    agree(bdpm(bdd=bdd, rr_depth=rr_depth, max_depth=-1), path(max_depth=-1, rr_depth=50), tray("lambertian", "rectangle"))
+    agree(
+        bdpm(bdd=bdd, rr_depth=rr_depth, max_depth=-1),
+        path(max_depth=-1, rr_depth=50),
+        tray("lambertian", "rectangle"),
+    )
 
 
 @pytest.mark.parametrize("camera_paths, photon_count", [(2, 50000), (7, 3000), (16, 0)])
 def test_numbers_of_paths_leave_the_mean(rgb, camera_paths, photon_count):
-    agree(bdpm(bdd=0, camera_paths=camera_paths, photon_count=photon_count), path(rr_depth=50), tray("lambertian", "rectangle"))
+    agree(
+        bdpm(bdd=0, camera_paths=camera_paths, photon_count=photon_count),
+        path(rr_depth=50),
+        tray("lambertian", "rectangle"),
+    )
 
 
 def test_rounding_up_is_said_once(rgb):
@@ -364,12 +570,23 @@ def with_capacity(scene, photons=None, vertices=None, **parameters):
 @pytest.mark.parametrize("bdd", [0, 1])
 def test_photons_that_overflow_are_not_lost(rgb, bdd):
     scene = glossy_box()
-    np.testing.assert_allclose(with_capacity(scene, photons=7, bdd=bdd), with_capacity(scene, bdd=bdd), rtol=1e-3, atol=1e-6)
+    np.testing.assert_allclose(
+        with_capacity(scene, photons=7, bdd=bdd),
+        with_capacity(scene, bdd=bdd),
+        rtol=1e-3,
+        atol=1e-6,
+    )
 
 
 def test_photons_that_overflow_later_are_not_lost(rgb):
-    """The passes are recorded when an iteration overflows: none of them may go on with the old room."""
-    sessions = [bdpm(bdd=0, camera_paths=2, photon_count=3000, initial_radius=0.05).session(box_scene(16), 0, 3, 0) for _ in range(2)]
+    """The passes are recorded when an iteration overflows: none of them may go on with the old
+    room."""
+    sessions = [
+        bdpm(bdd=0, camera_paths=2, photon_count=3000, initial_radius=0.05).session(
+            box_scene(16), 0, 3, 0
+        )
+        for _ in range(2)
+    ]
     room, tight = sessions
     room.photon_capacity = 1 << 16
     room._freeze()
@@ -384,13 +601,20 @@ def test_photons_that_overflow_later_are_not_lost(rgb):
     for done, number in enumerate(order):
         before = done * tight.image().astype(np.float64) if done else 0.0
         tight.iterate(number)
-        np.testing.assert_allclose((done + 1) * tight.image().astype(np.float64) - before, images[number], rtol=1e-3, atol=1e-4)
+        np.testing.assert_allclose(
+            (done + 1) * tight.image().astype(np.float64) - before,
+            images[number],
+            rtol=1e-3,
+            atol=1e-4,
+        )
     assert tight.photon_capacity > found[order[-1]] > found[order[4]]
 
 
 def test_vertices_that_overflow_are_not_lost(rgb):
-    scene = glossy_box()                                          # plastic and glass: several vertices a path
-    np.testing.assert_allclose(with_capacity(scene, vertices=11), with_capacity(scene), rtol=1e-3, atol=1e-6)
+    scene = glossy_box()  # plastic and glass: several vertices a path
+    np.testing.assert_allclose(
+        with_capacity(scene, vertices=11), with_capacity(scene), rtol=1e-3, atol=1e-6
+    )
 
 
 def test_vertices_that_overflow_in_the_pilot_are_not_lost(rgb, monkeypatch):
@@ -422,106 +646,242 @@ def two_sided(*bsdfs):
 
 
 def lit_from_one_side(thickness=0.0):
-    """A wall between a lit half space and a dark one, seen from the dark side (`thickness` 0: one surface, else two)."""
+    """A wall between a lit half space and a dark one, seen from the dark side (`thickness` 0: one
+    surface, else two)."""
     walls = {"wall": {"type": "rectangle", "bsdf": two_sided(diffuse(0.9))}}
     if thickness or thickness is None:
         gap = thickness or 0.0
-        walls = {"wall": {"type": "rectangle", "bsdf": diffuse(0.9)},
-                 "behind": {"type": "rectangle", "to_world": T().translate([0, 0, -gap]).rotate([1, 0, 0], 180), "bsdf": diffuse(0.8)}}
-    return mi.load_dict({
-        "type": "scene", **walls, "lamp": {"type": "point", "position": [0, 0, 1], "intensity": 5.0},
-        "ceiling": {"type": "rectangle", "to_world": T().translate([0, 0, 1.5]).rotate([1, 0, 0], 180), "bsdf": diffuse(0.91)},
-        "sensor": {"type": "orthographic", "to_world": look((0, 0, -3), (0, 0, 0)) @ T().scale([0.8, 0.8, 1]), "film": film(16)}})
+        walls = {
+            "wall": {"type": "rectangle", "bsdf": diffuse(0.9)},
+            "behind": {
+                "type": "rectangle",
+                "to_world": T().translate([0, 0, -gap]).rotate([1, 0, 0], 180),
+                "bsdf": diffuse(0.8),
+            },
+        }
+    return mi.load_dict(
+        {
+            "type": "scene",
+            **walls,
+            "lamp": {"type": "point", "position": [0, 0, 1], "intensity": 5.0},
+            "ceiling": {
+                "type": "rectangle",
+                "to_world": T().translate([0, 0, 1.5]).rotate([1, 0, 0], 180),
+                "bsdf": diffuse(0.91),
+            },
+            "sensor": {
+                "type": "orthographic",
+                "to_world": look((0, 0, -3), (0, 0, 0)) @ T().scale([0.8, 0.8, 1]),
+                "film": film(16),
+            },
+        }
+    )
 
 
 @pytest.mark.parametrize("thickness", [0.0, None, 1e-4, 0.01])
 @pytest.mark.parametrize("bdd", [0, 1])
 def test_no_light_leaks_through_a_wall(rgb, thickness, bdd):
-    """The dark side of a wall is black: one two-sided surface, two opposite faces in one plane, and thin walls (R = 0.2)."""
+    """The dark side of a wall is black: one two-sided surface, two opposite faces in one plane, and
+    thin walls (R = 0.2)."""
     image = render(lit_from_one_side(thickness), bdd=bdd, initial_radius=0.2, spp=32)
     assert image.max() == 0
 
 
 def test_no_light_leaks_around_a_corner(rgb):
-    """A wall that the light only grazes from its front does not catch the photons of a bright floor beside it."""
-    scene = mi.load_dict({
-        "type": "scene",
-        "floor": {"type": "rectangle", "to_world": T().scale(1), "bsdf": diffuse(0.9)},
-        "wall": {"type": "rectangle", "to_world": T().translate([0, 1, 0]).rotate([1, 0, 0], -90), "bsdf": diffuse(0.9)},
-        "ceiling": {"type": "rectangle", "to_world": T().translate([0, 0, 2]).rotate([1, 0, 0], 180), "bsdf": diffuse(0.91)},
-        "lamp": {"type": "point", "position": [0, 0, 1.5], "intensity": 5.0},
-        "sensor": {"type": "orthographic", "to_world": look((0, 3, 0.5), (0, 1, 0.5), (0, 0, 1)) @ T().scale([0.5, 0.4, 1]),
-                   "film": film(16)}})                            # the wall's front looks away from the lamp
+    """A wall that the light only grazes from its front does not catch the photons of a bright floor
+    beside it."""
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "floor": {"type": "rectangle", "to_world": T().scale(1), "bsdf": diffuse(0.9)},
+            "wall": {
+                "type": "rectangle",
+                "to_world": T().translate([0, 1, 0]).rotate([1, 0, 0], -90),
+                "bsdf": diffuse(0.9),
+            },
+            "ceiling": {
+                "type": "rectangle",
+                "to_world": T().translate([0, 0, 2]).rotate([1, 0, 0], 180),
+                "bsdf": diffuse(0.91),
+            },
+            "lamp": {"type": "point", "position": [0, 0, 1.5], "intensity": 5.0},
+            "sensor": {
+                "type": "orthographic",
+                "to_world": look((0, 3, 0.5), (0, 1, 0.5), (0, 0, 1)) @ T().scale([0.5, 0.4, 1]),
+                "film": film(16),
+            },
+        }
+    )  # the wall's front looks away from the lamp
     assert render(scene, bdd=0, initial_radius=0.3, spp=32).max() == 0
 
 
 def test_sheets_that_let_light_through_keep_their_photons(rgb):
-    """Two thin diffusers back to back, far closer than R, pass light on in all directions: each gathers its own photons, not both."""
-    sheet = {"type": "principledthin", "base_color": {"type": "rgb", "value": 0.8}, "roughness": 0.9, "diff_trans": 1.0}
-    scene = mi.load_dict({
-        "type": "scene", "upper": {"type": "rectangle", "to_world": T().scale(5), "bsdf": sheet},
-        "lower": {"type": "rectangle", "to_world": T().translate([0, 0, -0.002]).rotate([1, 0, 0], 180).scale(5), "bsdf": sheet},
-        "ceiling": {"type": "rectangle", "to_world": T().translate([0, 0, 2]).rotate([1, 0, 0], 180).scale(5), "bsdf": diffuse(0.9)},
-        "lamp": {"type": "point", "position": [0, 0, 1], "intensity": 5.0},
-        "sensor": {"type": "orthographic", "to_world": look((0, 0, -3), (0, 0, 0)), "film": film(16)}})
+    """Two thin diffusers back to back, far closer than R, pass light on in all directions: each
+    gathers its own photons, not both."""
+    sheet = {
+        "type": "principledthin",
+        "base_color": {"type": "rgb", "value": 0.8},
+        "roughness": 0.9,
+        "diff_trans": 1.0,
+    }
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "upper": {"type": "rectangle", "to_world": T().scale(5), "bsdf": sheet},
+            "lower": {
+                "type": "rectangle",
+                "to_world": T().translate([0, 0, -0.002]).rotate([1, 0, 0], 180).scale(5),
+                "bsdf": sheet,
+            },
+            "ceiling": {
+                "type": "rectangle",
+                "to_world": T().translate([0, 0, 2]).rotate([1, 0, 0], 180).scale(5),
+                "bsdf": diffuse(0.9),
+            },
+            "lamp": {"type": "point", "position": [0, 0, 1], "intensity": 5.0},
+            "sensor": {
+                "type": "orthographic",
+                "to_world": look((0, 0, -3), (0, 0, 0)),
+                "film": film(16),
+            },
+        }
+    )
     agree(bdpm(bdd=0, max_depth=5, initial_radius=0.05), path(max_depth=5), scene, blocks=2)
 
 
 @pytest.mark.parametrize("bdd", [0, 1])
 def test_merged_shapes(rgb, bdd):
     """Mitsuba merges shapes that share a BSDF into one mesh: photons must be found there too."""
-    scene = mi.load_dict({
-        "type": "scene", "floor": {"type": "rectangle", "to_world": T().scale(6), "bsdf": diffuse(0.6)},
-        "wall": {"type": "rectangle", "to_world": T().translate([0, 3, 0]).rotate([1, 0, 0], 90).scale(6), "bsdf": diffuse(0.6)},
-        "lamp": {"type": "point", "position": [0, 0, 3], "intensity": 6.0},
-        "sensor": {"type": "perspective", "fov": 40, "to_world": look((0, 0, 2), (1, 0, 0)), "film": film(24)}})
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "floor": {"type": "rectangle", "to_world": T().scale(6), "bsdf": diffuse(0.6)},
+            "wall": {
+                "type": "rectangle",
+                "to_world": T().translate([0, 3, 0]).rotate([1, 0, 0], 90).scale(6),
+                "bsdf": diffuse(0.6),
+            },
+            "lamp": {"type": "point", "position": [0, 0, 3], "intensity": 6.0},
+            "sensor": {
+                "type": "perspective",
+                "fov": 40,
+                "to_world": look((0, 0, 2), (1, 0, 0)),
+                "film": film(24),
+            },
+        }
+    )
     agree(bdpm(bdd=bdd, max_depth=4, initial_radius=0.1), path(max_depth=4), scene, blocks=2)
 
 
 @pytest.mark.parametrize("lamps", [1, 2])
 def test_shapes_without_points_to_sample(rgb, tmp_path, lamps):
-    """Instances and curves have no points on them to give, and are not asked for any: they are no lamps. (`path` 2 % and 5 %.)"""
+    """Instances and curves have no points on them to give, and are not asked for any: they are no
+    lamps. (`path` 2 % and 5 %.)"""
     curve = tmp_path / "curve.txt"
     curve.write_text("".join(f"{i * 0.3 - 1.2} -1 0.4 0.15\n" for i in range(9)))
-    lamp = {"type": "sphere", "center": [1.5, -1, 2.5], "radius": 0.5, "emitter": {"type": "area", "radiance": grey(2.0)}}
-    scene = box_scene(size=24, curve={"type": "bsplinecurve", "filename": str(curve), "bsdf": diffuse(0.6)},
-                      group={"type": "shapegroup", "cube": {"type": "cube", "to_world": T().scale(0.3), "bsdf": diffuse(0.8)},
-                             "ball": {"type": "sphere", "center": [0, 0, 0.7], "radius": 0.4, "bsdf": {"type": "roughconductor", "alpha": 0.3}}},
-                      copy={"type": "instance", "to_world": T().translate([1.3, 0, 0.5]).rotate([0, 0, 1], 30), "of": {"type": "ref", "id": "group"}},
-                      **({"lamp": lamp} if lamps == 2 else {}))
+    lamp = {
+        "type": "sphere",
+        "center": [1.5, -1, 2.5],
+        "radius": 0.5,
+        "emitter": {"type": "area", "radiance": grey(2.0)},
+    }
+    scene = box_scene(
+        size=24,
+        curve={"type": "bsplinecurve", "filename": str(curve), "bsdf": diffuse(0.6)},
+        group={
+            "type": "shapegroup",
+            "cube": {"type": "cube", "to_world": T().scale(0.3), "bsdf": diffuse(0.8)},
+            "ball": {
+                "type": "sphere",
+                "center": [0, 0, 0.7],
+                "radius": 0.4,
+                "bsdf": {"type": "roughconductor", "alpha": 0.3},
+            },
+        },
+        copy={
+            "type": "instance",
+            "to_world": T().translate([1.3, 0, 0.5]).rotate([0, 0, 1], 30),
+            "of": {"type": "ref", "id": "group"},
+        },
+        **({"lamp": lamp} if lamps == 2 else {}),
+    )
     agree(bdpm(bdd=1), path(), scene, blocks=2, whole=0.02, block=0.05, most=200)
 
 
 def point_film():
-    return {"type": "hdrfilm", "width": 1, "height": 1, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
+    return {
+        "type": "hdrfilm",
+        "width": 1,
+        "height": 1,
+        "rfilter": {"type": "box"},
+        "pixel_format": "rgb",
+    }
 
 
 def test_a_camera_that_sees_one_point(rgb):
-    """The automatic radius then follows from the photons, not from the spread of what is seen: indirect light, two fifths here, is not lost."""
-    scene = box_scene(sensor={"type": "radiancemeter", "origin": [0, -5, 2.5], "direction": [0, 5, -2.3], "film": point_film()})
-    a = SessionBatches(mi.load_dict({"type": "bdpm", "bdd": 0, "max_depth": 4, "photon_count": 4000, "camera_paths": 64}), scene, 1, seed=2)
+    """The automatic radius then follows from the photons, not from the spread of what is seen:
+    indirect light, two fifths here, is not lost."""
+    scene = box_scene(
+        sensor={
+            "type": "radiancemeter",
+            "origin": [0, -5, 2.5],
+            "direction": [0, 5, -2.3],
+            "film": point_film(),
+        }
+    )
+    a = SessionBatches(
+        mi.load_dict(
+            {"type": "bdpm", "bdd": 0, "max_depth": 4, "photon_count": 4000, "camera_paths": 64}
+        ),
+        scene,
+        1,
+        seed=2,
+    )
     b = PathBatches(path(), scene, 1, spp=8192)
     a.add(150)
     b.add(16)
     assert smallest_visible(a.estimate(), b.estimate())[0] < 0.25, "test too weak"
-    assert not differences(a.estimate(), b.estimate(), slack=0.05)                  # a disk around one point is as wrong as its light is curved
+    assert not differences(
+        a.estimate(), b.estimate(), slack=0.05
+    )  # a disk around one point is as wrong as its light is curved
     assert a.session.radii["indirect"] > 0.03
 
 
 @pytest.mark.parametrize("plugin", ["bdpm", "bdpt"])
 def test_irradiance_meter(rgb, plugin):
     """A sensor of another kind, on a surface, under a lamp and a sky (5 % of its one value)."""
-    scene = box_scene(sensor=diffuse(0.1), sky={"type": "constant", "radiance": 0.3},
-                      ball={"type": "sphere", "center": [0, 0, 1], "radius": 0.5, "sensor": {"type": "irradiancemeter", "film": point_film()}})
-    agree(mi.load_dict({"type": plugin, "max_depth": 4, "camera_paths": 4096}), path(), scene, blocks=1, whole=0.05, block=0.05, spp=16384)
+    scene = box_scene(
+        sensor=diffuse(0.1),
+        sky={"type": "constant", "radiance": 0.3},
+        ball={
+            "type": "sphere",
+            "center": [0, 0, 1],
+            "radius": 0.5,
+            "sensor": {"type": "irradiancemeter", "film": point_film()},
+        },
+    )
+    agree(
+        mi.load_dict({"type": plugin, "max_depth": 4, "camera_paths": 4096}),
+        path(),
+        scene,
+        blocks=1,
+        whole=0.05,
+        block=0.05,
+        spp=16384,
+    )
 
 
 def test_rare_photons_get_no_smallest_radius(rgb):
-    """Where the pilot meets no photon at all, nothing speaks for the smallest radius that it tries."""
+    """Where the pilot meets no photon at all, nothing speaks for the smallest radius that it
+    tries."""
     scene = box_scene(16)
     session = bdpm(bdd=0, photon_count=1, initial_radius=0.0).session(scene, seed=1, spp=4)
     pilot = Pilot(session)
-    pilot.ladder, pilot.photons, pilot.direct = np.array([0.01 * 2 ** i for i in range(7)]), {"indirect": 0.0}, [np.ones((2, 256))] * 4
+    pilot.ladder, pilot.photons, pilot.direct = (
+        np.array([0.01 * 2**i for i in range(7)]),
+        {"indirect": 0.0},
+        [np.ones((2, 256))] * 4,
+    )
     pilot.samples = {key: [np.zeros((7, 2, 256))] * 4 for key in pilot.samples}
     pilot.decide(100)
     assert session.radii["indirect"] == pytest.approx(0.16)
@@ -531,51 +891,82 @@ def test_rare_photons_get_no_smallest_radius(rgb):
 
 
 def made_up_pilot(scene, direct_noise, shared=True):
-    """A pilot of three iterations over a constant image: photons make half of it, with a noise that falls with the radius and that the camera paths of a
-    pixel have in common if it is `shared`; `direct_noise` is that of the other half, relative to the image."""
-    session = bdpm(bdd=0, camera_paths=0, photon_count=3000, initial_radius=0.0).session(scene, seed=1)
+    """A pilot of three iterations over a constant image: photons make half of it, with a noise that
+    falls with the radius and that the camera paths of a pixel have in common if it is `shared`;
+    `direct_noise` is that of the other half, relative to the image."""
+    session = bdpm(bdd=0, camera_paths=0, photon_count=3000, initial_radius=0.0).session(
+        scene, seed=1
+    )
     session.plan_time(1000.0)
     pilot, rng = Pilot(session), np.random.default_rng(5)
     shape = pilot.copies, pilot.pixels
     pilot.ladder, pilot.photons = 0.1 * 2.0 ** -np.arange(6, -1, -1.0), {"indirect": 10.0}
     pilot.direct = [0.5 + direct_noise * rng.normal(size=shape) for _ in range(3)]
-    photons = [0.5 + 0.05 * rng.normal(size=(7, 1 if shared else pilot.copies, pilot.pixels)) * (0.1 / pilot.ladder)[:, None, None] for _ in range(3)]
-    pilot.samples = {key: [np.broadcast_to(values, (7, *shape)) for values in photons] for key in pilot.samples}
+    photons = [
+        0.5
+        + 0.05
+        * rng.normal(size=(7, 1 if shared else pilot.copies, pilot.pixels))
+        * (0.1 / pilot.ladder)[:, None, None]
+        for _ in range(3)
+    ]
+    pilot.samples = {
+        key: [np.broadcast_to(values, (7, *shape)) for values in photons] for key in pilot.samples
+    }
     pilot.decide(100)
     return pilot
 
 
-@pytest.mark.parametrize("direct_noise, cost, expected", [(1.0, 0.15, {4, 8}), (1.0, 0.9, {2}), (0.3, 0.3, {2, 4}), (0.02, 0.15, {1})])
+@pytest.mark.parametrize(
+    "direct_noise, cost, expected",
+    [(1.0, 0.15, {4, 8}), (1.0, 0.9, {2}), (0.3, 0.3, {2, 4}), (0.02, 0.15, {1})],
+)
 def test_camera_paths_follow_noise_and_cost(rgb, monkeypatch, direct_noise, cost, expected):
-    """Several where camera paths make most of the noise and little of the cost; where they make little of the noise, two are not even tried."""
+    """Several where camera paths make most of the noise and little of the cost; where they make
+    little of the noise, two are not even tried."""
     pilot, tried = made_up_pilot(box_scene(), direct_noise), []
 
     def rehearse(session, guess, left):
         tried.append(session.samples_per_iteration)
         return 1 + cost, 1 + cost
+
     monkeypatch.setattr("mis_integrators.pilot.run.rehearse", rehearse)
     choose_camera_paths(pilot, 1.0, 200, 200)
-    assert pilot.camera_paths == pilot.session.samples_per_iteration and pilot.camera_paths in expected
+    assert (
+        pilot.camera_paths == pilot.session.samples_per_iteration and pilot.camera_paths in expected
+    )
     assert tried == ([2] if expected != {1} else [])
 
 
 @pytest.mark.parametrize("shared", [True, False])
 def test_camera_paths_average_their_own_noise_only(rgb, shared):
-    """Of what photons bring, too, where it differs between the camera paths of a pixel (5 % of noise in the estimate)."""
+    """Of what photons bring, too, where it differs between the camera paths of a pixel (5 % of
+    noise in the estimate)."""
     pilot = made_up_pilot(box_scene(), 0.0, shared)
     found = []
     for camera_paths in (1, 2, 8):
         choice = pilot._best_radii(camera_paths, 100)["indirect"]
-        found.append(choice.variance * choice.radius ** 2 * (1 if shared else camera_paths))
+        found.append(choice.variance * choice.radius**2 * (1 if shared else camera_paths))
     assert found[1:] == pytest.approx([found[0]] * 2, rel=0.25)
 
 
 @pytest.mark.parametrize("camera_paths", [2, 8])
-@pytest.mark.parametrize("plugin, given", [("bdpm", {"bdd": 0}), ("bdpm", {"bdd": 1}), ("bdpm_opt2", {})], ids=["bdd0", "bdd1", "opt2"])
+@pytest.mark.parametrize(
+    "plugin, given",
+    [("bdpm", {"bdd": 0}), ("bdpm", {"bdd": 1}), ("bdpm_opt2", {})],
+    ids=["bdd0", "bdd1", "opt2"],
+)
 def test_noise_of_several_camera_paths_is_foreseen(rgb, plugin, given, camera_paths):
-    """The pilot's two camera paths a pixel say what an iteration of more, or fewer, of them will have: within a factor 1.3 of twelve renders."""
-    session = mi.load_dict({"type": plugin, "max_depth": 4, "photon_count": 20000, "camera_paths": camera_paths, **given}).session(
-        glossy_box(size=48), spp=16 * camera_paths)
+    """The pilot's two camera paths a pixel say what an iteration of more, or fewer, of them will
+    have: within a factor 1.3 of twelve renders."""
+    session = mi.load_dict(
+        {
+            "type": plugin,
+            "max_depth": 4,
+            "photon_count": 20000,
+            "camera_paths": camera_paths,
+            **given,
+        }
+    ).session(glossy_box(size=48), spp=16 * camera_paths)
     session.keep_variance()
     for _ in range(12):
         session.iterate()
@@ -585,12 +976,15 @@ def test_noise_of_several_camera_paths_is_foreseen(rgb, plugin, given, camera_pa
 
 
 def always_choose_camera_paths(monkeypatch, camera_paths):
-    """Every pilot that may choose a number of camera paths chooses this one, however short the render."""
+    """Every pilot that may choose a number of camera paths chooses this one, however short the
+    render."""
     monkeypatch.setattr("mis_integrators.pilot.run.LONG", 0)
+
     def choose(pilot, *_):
         pilot.camera_paths = camera_paths
         pilot.session.send(camera_paths)
         return 0.0
+
     monkeypatch.setattr("mis_integrators.pilot.run.choose_camera_paths", choose)
 
 
@@ -598,13 +992,17 @@ def test_a_timed_render_chooses_its_camera_paths(rgb, monkeypatch):
     """What is chosen is rendered with, said, and rendered with again by whoever is told."""
     always_choose_camera_paths(monkeypatch, 4)
     scene = glossy_box()
-    timed = bdpm(bdd=0, camera_paths=0, photon_count=3000, initial_radius=0.0).session(scene, seed=4)
+    timed = bdpm(bdd=0, camera_paths=0, photon_count=3000, initial_radius=0.0).session(
+        scene, seed=4
+    )
     timed.plan_time(1000.0)
     for _ in range(3):
         timed.iterate()
     assert timed.settings["camera_paths"] == timed.samples_per_iteration == 4
     for camera_paths in (0, 4):
-        same = bdpm(bdd=0, camera_paths=camera_paths, photon_count=3000, initial_radius=0.0).session(scene, seed=4)
+        same = bdpm(
+            bdd=0, camera_paths=camera_paths, photon_count=3000, initial_radius=0.0
+        ).session(scene, seed=4)
         same.recall(timed.learned)
         for _ in range(3):
             same.iterate()
@@ -617,19 +1015,44 @@ def test_a_timed_render_chooses_its_camera_paths(rgb, monkeypatch):
 # --- Errors ---------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name, value, allowed", [
-    ("max_depth", -2, "-1"), ("max_depth", 2 ** 40, "at most 2147483647"), ("max_depth", 1.5, "integer"),
-    ("max_depth", "many", "integer"), ("rr_depth", 0, "at least 1"), ("rr_depth", -1, "at least 1"),
-    ("hide_emitters", 1, "true or false"), ("hide_emitters", "yes", "true or false"),
-    ("photon_count", -1, "at least 0"), ("photon_count", 1000.5, "integer"), ("photon_count", 2 ** 40, "at least 0"),
-    ("initial_radius", -0.1, "from 1e-15 to"), ("initial_radius", float("inf"), "from 1e-15 to"), ("initial_radius", float("nan"), "from 1e-15 to"),
-    ("initial_radius", 1e-40, "from 1e-15 to"), ("bdd", 10 ** 12, "at most 2147483647"), ("photon_count", 2 ** 30, "at most 268435456"),
-    ("initial_radius", "big", "number"), ("alpha", 0.0, "(0, 1]"), ("alpha", 1.1, "(0, 1]"), ("alpha", -1.0, "(0, 1]"),
-    ("camera_paths", -1, "at least 0"), ("camera_paths", 1.5, "integer"), ("camera_paths", True, "integer"),
-    ("variance", 1, "true or false"), ("bdd", -1, "at least 0"), ("bdd", 1.5, "integer"), ("bdd", True, "integer"),
-    ("samples_per_pass", 4, "camera_paths"), ("timeout", 3.0, "--time"), ("block_size", 32, "film"),
-    ("radius", 0.1, "initial_radius"), ("strategies", 3, "bdd"),
-])
+@pytest.mark.parametrize(
+    "name, value, allowed",
+    [
+        ("max_depth", -2, "-1"),
+        ("max_depth", 2**40, "at most 2147483647"),
+        ("max_depth", 1.5, "integer"),
+        ("max_depth", "many", "integer"),
+        ("rr_depth", 0, "at least 1"),
+        ("rr_depth", -1, "at least 1"),
+        ("hide_emitters", 1, "true or false"),
+        ("hide_emitters", "yes", "true or false"),
+        ("photon_count", -1, "at least 0"),
+        ("photon_count", 1000.5, "integer"),
+        ("photon_count", 2**40, "at least 0"),
+        ("initial_radius", -0.1, "from 1e-15 to"),
+        ("initial_radius", float("inf"), "from 1e-15 to"),
+        ("initial_radius", float("nan"), "from 1e-15 to"),
+        ("initial_radius", 1e-40, "from 1e-15 to"),
+        ("bdd", 10**12, "at most 2147483647"),
+        ("photon_count", 2**30, "at most 268435456"),
+        ("initial_radius", "big", "number"),
+        ("alpha", 0.0, "(0, 1]"),
+        ("alpha", 1.1, "(0, 1]"),
+        ("alpha", -1.0, "(0, 1]"),
+        ("camera_paths", -1, "at least 0"),
+        ("camera_paths", 1.5, "integer"),
+        ("camera_paths", True, "integer"),
+        ("variance", 1, "true or false"),
+        ("bdd", -1, "at least 0"),
+        ("bdd", 1.5, "integer"),
+        ("bdd", True, "integer"),
+        ("samples_per_pass", 4, "camera_paths"),
+        ("timeout", 3.0, "--time"),
+        ("block_size", 32, "film"),
+        ("radius", 0.1, "initial_radius"),
+        ("strategies", 3, "bdd"),
+    ],
+)
 def test_bad_parameter(rgb, name, value, allowed):
     """One message that names the plugin, the parameter and what is allowed."""
     with pytest.raises(Exception) as error:
@@ -652,10 +1075,14 @@ def test_polarised_variant():
     for plugin in PLUGINS:
         with pytest.raises(Exception) as error:
             mi.render(scene, integrator=mi.load_dict({"type": plugin}), spp=8)
-        assert last_words(error.value).startswith(f"{plugin}: ") and "polarised" in last_words(error.value)
+        assert last_words(error.value).startswith(f"{plugin}: ") and "polarised" in last_words(
+            error.value
+        )
 
 
-@pytest.mark.parametrize("case", ["medium", "homogeneous inside", "curve emitter", "sdfgrid emitter", "inside aov"])
+@pytest.mark.parametrize(
+    "case", ["medium", "homogeneous inside", "curve emitter", "sdfgrid emitter", "inside aov"]
+)
 def test_unrenderable_scene(rgb, case, tmp_path):
     fog = {"type": "homogeneous", "albedo": 0.8, "sigma_t": 1.0}
     curve = tmp_path / "curve.txt"
@@ -664,28 +1091,59 @@ def test_unrenderable_scene(rgb, case, tmp_path):
         if case == "inside aov":
             mi.load_dict({"type": "aov", "aovs": "d:depth", "inner": {"type": "bdpm"}})
         else:
-            entry = {"medium": {"type": "sphere", "bsdf": {"type": "null"}, "interior": fog},
-                     "homogeneous inside": {"type": "cube", "bsdf": {"type": "dielectric"}, "interior": fog},
-                     "curve emitter": {"type": "linearcurve", "filename": str(curve), "emitter": {"type": "area", "radiance": 1.0}},
-                     "sdfgrid emitter": {"type": "sdfgrid", "grid": mi.TensorXf(np.indices((4, 4, 4, 1)).sum(axis=0) - 3.5),
-                                         "emitter": {"type": "area", "radiance": 1.0}}}[case]
+            entry = {
+                "medium": {"type": "sphere", "bsdf": {"type": "null"}, "interior": fog},
+                "homogeneous inside": {
+                    "type": "cube",
+                    "bsdf": {"type": "dielectric"},
+                    "interior": fog,
+                },
+                "curve emitter": {
+                    "type": "linearcurve",
+                    "filename": str(curve),
+                    "emitter": {"type": "area", "radiance": 1.0},
+                },
+                "sdfgrid emitter": {
+                    "type": "sdfgrid",
+                    "grid": mi.TensorXf(np.indices((4, 4, 4, 1)).sum(axis=0) - 3.5),
+                    "emitter": {"type": "area", "radiance": 1.0},
+                },
+            }[case]
             render(box_scene(8, extra=entry))
     message = last_words(error.value)
-    words = {"medium": ("bdpm", "media"), "homogeneous inside": ("bdpm", "media"), "curve emitter": ("bdpm", "emitter"),
-             "sdfgrid emitter": ("bdpm", "SDFGrid", "emitter"),
-             "inside aov": ("AOVIntegrator", "Child objects must be of type 'SamplingIntegrator'")}[case]           # that is Mitsuba's
+    words = {
+        "medium": ("bdpm", "media"),
+        "homogeneous inside": ("bdpm", "media"),
+        "curve emitter": ("bdpm", "emitter"),
+        "sdfgrid emitter": ("bdpm", "SDFGrid", "emitter"),
+        "inside aov": ("AOVIntegrator", "Child objects must be of type 'SamplingIntegrator'"),
+    }[case]  # that is Mitsuba's
     assert all(word in message for word in words), message
 
 
 def test_special_film():
     mi.set_variant("llvm_ad_spectral")
-    scene = mi.load_dict({"type": "scene", "ball": {"type": "sphere"}, "sensor": {
-        "type": "perspective", "film": {"type": "specfilm", "width": 8, "height": 8,
-                                        "band": {"type": "spectrum", "value": [(400, 1.0), (700, 1.0)]}}}})
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "ball": {"type": "sphere"},
+            "sensor": {
+                "type": "perspective",
+                "film": {
+                    "type": "specfilm",
+                    "width": 8,
+                    "height": 8,
+                    "band": {"type": "spectrum", "value": [(400, 1.0), (700, 1.0)]},
+                },
+            },
+        }
+    )
     for plugin in PLUGINS:
         with pytest.raises(Exception) as error:
             mi.render(scene, integrator=mi.load_dict({"type": plugin}), spp=8)
-        assert last_words(error.value).startswith(f"{plugin}: ") and "specfilm" in last_words(error.value)
+        assert last_words(error.value).startswith(f"{plugin}: ") and "specfilm" in last_words(
+            error.value
+        )
 
 
 def test_gradients_are_refused(rgb):
@@ -718,22 +1176,42 @@ def test_missing_sensor(rgb):
 
 
 def test_every_variant_renders(variant):
-    """Mono and spectral agree with `path` of the same variant (the grey world's mean; hue of few wavelengths is chance)."""
+    """Mono and spectral agree with `path` of the same variant (the grey world's mean; hue of few
+    wavelengths is chance)."""
     scene = box_scene(16)
-    image, oracle = (np.array(mi.render(scene, integrator=i, spp=400)) for i in (bdpm(initial_radius=0.1, camera_paths=1), path()))
+    image, oracle = (
+        np.array(mi.render(scene, integrator=i, spp=400))
+        for i in (bdpm(initial_radius=0.1, camera_paths=1), path())
+    )
     assert np.isfinite(image).all() and image.mean() > 0
     assert image.mean() == pytest.approx(oracle.mean(), rel=0.3 if mi.is_spectral else 0.03)
 
 
 @pytest.mark.full
 def test_spectral_colour():
-    """Iterations share their wavelengths: their spread says how far the mean of 1500 may be off (t test at 1e-6)."""
+    """Iterations share their wavelengths: their spread says how far the mean of 1500 may be off (t
+    test at 1e-6)."""
     mi.set_variant("llvm_ad_spectral")
-    scene = mi.load_dict({
-        "type": "scene", "floor": {"type": "rectangle", "to_world": T().scale(4),
-                                   "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.7, 0.5, 0.3]}}},
-        "sky": {"type": "constant", "radiance": {"type": "rgb", "value": [0.5, 0.6, 0.8]}},
-        "sensor": {"type": "perspective", "to_world": look((0, 0, 5), (0, 0, 0)), "fov": 30, "film": film(8)}})
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "floor": {
+                "type": "rectangle",
+                "to_world": T().scale(4),
+                "bsdf": {
+                    "type": "diffuse",
+                    "reflectance": {"type": "rgb", "value": [0.7, 0.5, 0.3]},
+                },
+            },
+            "sky": {"type": "constant", "radiance": {"type": "rgb", "value": [0.5, 0.6, 0.8]}},
+            "sensor": {
+                "type": "perspective",
+                "to_world": look((0, 0, 5), (0, 0, 0)),
+                "fov": 30,
+                "film": film(8),
+            },
+        }
+    )
     a = SessionBatches(bdpm(camera_paths=1, photon_count=200), scene, 1)
     b = PathBatches(path(), scene, 1, spp=512)
     a.add(1500)
@@ -755,17 +1233,40 @@ def test_variants_in_turn():
 
 @pytest.mark.parametrize("max_depth", [1, 2, 3])
 def test_alpha_at_the_last_depth(rgb, max_depth):
-    """What a path meets at its very last segment covers the background too, as in `path`: opaque, half transparent, or through a pane. (Standard
-    error of a corner's mean 0.002; five of them.)"""
+    """What a path meets at its very last segment covers the background too, as in `path`: opaque,
+    half transparent, or through a pane. (Standard error of a corner's mean 0.002; five of them.)"""
     pane = {"type": "rectangle", "to_world": T().translate([0, 0, 1]).scale(0.7)}
-    scenes = [{"pane": {**pane, "bsdf": bsdf}} for bsdf in (diffuse(), {"type": "null"}, {"type": "mask", "opacity": 0.5, "nested": diffuse()})]
+    scenes = [
+        {"pane": {**pane, "bsdf": bsdf}}
+        for bsdf in (
+            diffuse(),
+            {"type": "null"},
+            {"type": "mask", "opacity": 0.5, "nested": diffuse()},
+        )
+    ]
     for extra in scenes:
-        scene = mi.load_dict({"type": "scene", "light": {"type": "point", "position": [0, 0, 3]}, **extra,
-                              "floor": {"type": "rectangle", "to_world": T().scale(0.5), "bsdf": diffuse()},
-                              "sensor": {"type": "perspective", "fov": 40, "to_world": look((0, 0, 4), (0, 0, 0), (0, 1, 0)),
-                                         "film": film(16, pixel_format="rgba")}})
-        ours, theirs = (np.array(mi.render(scene, integrator=mi.load_dict({"type": kind, "max_depth": max_depth}), spp=256))[:, :, 3]
-                        for kind in ("bdpm", "path"))
+        scene = mi.load_dict(
+            {
+                "type": "scene",
+                "light": {"type": "point", "position": [0, 0, 3]},
+                **extra,
+                "floor": {"type": "rectangle", "to_world": T().scale(0.5), "bsdf": diffuse()},
+                "sensor": {
+                    "type": "perspective",
+                    "fov": 40,
+                    "to_world": look((0, 0, 4), (0, 0, 0), (0, 1, 0)),
+                    "film": film(16, pixel_format="rgba"),
+                },
+            }
+        )
+        ours, theirs = (
+            np.array(
+                mi.render(
+                    scene, integrator=mi.load_dict({"type": kind, "max_depth": max_depth}), spp=256
+                )
+            )[:, :, 3]
+            for kind in ("bdpm", "path")
+        )
         assert abs(ours.mean() - theirs.mean()) < 0.01
 
 
@@ -774,7 +1275,8 @@ def test_alpha_at_the_last_depth(rgb, max_depth):
 
 @pytest.mark.parametrize("changed", [False, True], ids=["kept", "changed"])
 def test_timed_iterations_are_of_the_radii_rendered_with(rgb, monkeypatch, changed):
-    """Iterations by which a pilot measures time belong to the image, unless the time they took changes the radii."""
+    """Iterations by which a pilot measures time belong to the image, unless the time they took
+    changes the radii."""
     from mis_integrators.pilot.run import Pilot
 
     scene, decisions = box_scene(), []
@@ -783,12 +1285,16 @@ def test_timed_iterations_are_of_the_radii_rendered_with(rgb, monkeypatch, chang
     def decide_again(pilot, count, reluctance=None):
         choices = decide(pilot, count, 1.0 if reluctance is not None else None)
         if changed and decisions:
-            pilot.session.radii = {kind: 1.5 * radius for kind, radius in pilot.session.radii.items()}
+            pilot.session.radii = {
+                kind: 1.5 * radius for kind, radius in pilot.session.radii.items()
+            }
         decisions.append(count)
         return choices
 
     monkeypatch.setattr(Pilot, "decide", decide_again)
-    timed, same = (bdpm(bdd=0, initial_radius=0.0, photon_count=3000).session(scene, seed=4) for _ in range(2))
+    timed, same = (
+        bdpm(bdd=0, initial_radius=0.0, photon_count=3000).session(scene, seed=4) for _ in range(2)
+    )
     timed.plan_time(2.0)
     timed.start()
     assert len(decisions) == 2 and bool(timed.rehearsed) != changed
@@ -808,8 +1314,9 @@ def kernels(integrator, scene, seed):
 
 @pytest.mark.parametrize("plugin", ["bdpm", "bdpm_opt2"])
 def test_no_seed_has_kernels_of_its_own(rgb, plugin):
-    """Numbers that depend on chance are not literals: seconds of compiling would come again with each seed."""
-    gc.collect()                                 # kernels know all the scenes that there are
+    """Numbers that depend on chance are not literals: seconds of compiling would come again with
+    each seed."""
+    gc.collect()  # kernels know all the scenes that there are
     scene, integrator = glossy_box(), mi.load_dict({"type": plugin, "photon_count": 3000})
     first, second, third = (kernels(integrator, scene, seed) for seed in (1, 2, 3))
     assert first and second <= first and third <= first

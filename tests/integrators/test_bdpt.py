@@ -1,30 +1,59 @@
-"""The plugin `bdpt`: one weight function whichever technique makes a path, each technique alone, and the images.
+"""The plugin `bdpt`: one weight function whichever technique makes a path, each technique alone,
+and the images.
 
-Comparisons of renders as in `test_against_path`: false-alarm rate 1e-6 each, and an error of 1 or 2 % in the image and of 3 or 8 % in a block is
-seen with a probability of 0.95.
+Comparisons of renders as in `test_against_path`: false-alarm rate 1e-6 each, and an error of 1 or 2
+% in the image and of 3 or 8 % in a block is seen with a probability of 0.95.
 """
+
+from mis_integrators.core.random import next_2d, streams
+from mis_integrators.core.traits import SceneTraits
+from mis_integrators.integrators.pyramid import technique_names
+from mis_integrators.lights.environment_guide import EnvironmentGuide
+from mis_integrators.lights.lights import Lights
+from mis_integrators.mis.vertex_merging import ConnectionWeights
+from mis_integrators.paths.connect import join, join_sensor
+from mis_integrators.paths.sensor import Lens
+from mis_integrators.paths.subpaths import (
+    NO_PARENT,
+    read_vertices,
+    trace_camera_subpaths,
+    trace_light_subpaths,
+    vertex_layout,
+)
+from mis_integrators.paths.vertex import Junction
+from mis_integrators.photons.merge import merge, vertex_map
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-
-from comparing import Estimate, SessionBatches, agree, assert_same, block_means, collect_until, differences, pictures
+from comparing import (
+    Estimate,
+    SessionBatches,
+    agree,
+    assert_same,
+    block_means,
+    collect_until,
+    differences,
+    pictures,
+)
 from test_against_path import MONO, RGB, SPECTRAL, caustic_scene
 from test_analytic import block_average, floor_from_above, inside_sphere, point_irradiance, series
 from test_bdpm import box_scene, glossy_box, last_words
-from worlds import EMITTERS, POINT_LIKE, T, bitmap, bump_bsdf, diffuse, film, has_delta, look, path, ptracer, tray
-from mis_integrators.mis.vertex_merging import ConnectionWeights
-from mis_integrators.integrators.pyramid import technique_names
-from mis_integrators.paths.connect import join, join_sensor
-from mis_integrators.lights.environment_guide import EnvironmentGuide
-from mis_integrators.paths.vertex import Junction
-from mis_integrators.paths.sensor import Lens
-from mis_integrators.lights.lights import Lights
-from mis_integrators.photons.merge import merge, vertex_map
-from mis_integrators.core.random import next_2d, streams
-from mis_integrators.paths.subpaths import NO_PARENT, read_vertices, trace_camera_subpaths, trace_light_subpaths, vertex_layout
-from mis_integrators.core.traits import SceneTraits
+from worlds import (
+    EMITTERS,
+    POINT_LIKE,
+    T,
+    bitmap,
+    bump_bsdf,
+    diffuse,
+    film,
+    has_delta,
+    look,
+    path,
+    ptracer,
+    tray,
+)
 
 
 def bdpt(**parameters):
@@ -36,13 +65,38 @@ def bdpt(**parameters):
 
 def room(bsdf, light, sensor="perspective"):
     """A closed room of one material (open at both ends under a sky), with a lamp."""
-    lamps = {"point": {"type": "point", "position": [0.3, 0.2, 0.7], "intensity": 1.0},
-             "spot": {"type": "spot", "to_world": look((0.3, 0.2, 0.7), (0, 0, -0.5)), "cutoff_angle": 80, "beam_width": 79},
-             "area": {"type": "rectangle", "to_world": look((0.2, -0.1, 0.8), (0, 0, 0)) @ T().scale(0.3), "emitter": {"type": "area"}},
-             "sphere": {"type": "sphere", "center": [0.2, -0.1, 0.6], "radius": 0.2, "emitter": {"type": "area"}},
-             "constant": {"type": "constant"}}
-    bsdfs = {"diffuse": diffuse(0.7), "rough": {"type": "roughconductor", "alpha": 0.3}, "plastic": {"type": "plastic"}, "bump": bump_bsdf()}
-    walls = {"type": "cylinder", "p0": [0, 0, -1], "p1": [0, 0, 1]} if light == "constant" else {"type": "cube"}
+    lamps = {
+        "point": {"type": "point", "position": [0.3, 0.2, 0.7], "intensity": 1.0},
+        "spot": {
+            "type": "spot",
+            "to_world": look((0.3, 0.2, 0.7), (0, 0, -0.5)),
+            "cutoff_angle": 80,
+            "beam_width": 79,
+        },
+        "area": {
+            "type": "rectangle",
+            "to_world": look((0.2, -0.1, 0.8), (0, 0, 0)) @ T().scale(0.3),
+            "emitter": {"type": "area"},
+        },
+        "sphere": {
+            "type": "sphere",
+            "center": [0.2, -0.1, 0.6],
+            "radius": 0.2,
+            "emitter": {"type": "area"},
+        },
+        "constant": {"type": "constant"},
+    }
+    bsdfs = {
+        "diffuse": diffuse(0.7),
+        "rough": {"type": "roughconductor", "alpha": 0.3},
+        "plastic": {"type": "plastic"},
+        "bump": bump_bsdf(),
+    }
+    walls = (
+        {"type": "cylinder", "p0": [0, 0, -1], "p1": [0, 0, 1]}
+        if light == "constant"
+        else {"type": "cube"}
+    )
     view = {"to_world": look((0, -0.9, -0.3), (0.1, 0, 0), (0, 0, 1)), "film": film(8)}
     if sensor == "thinlens":
         view.update(aperture_radius=0.05, focus_distance=1.0)
@@ -50,13 +104,20 @@ def room(bsdf, light, sensor="perspective"):
         view["to_world"] = view["to_world"] @ T().scale([0.5, 0.5, 1])
     else:
         view["fov"] = 70
-    return mi.load_dict({"type": "scene", "walls": {**walls, "bsdf": {"type": "twosided", "bsdf": bsdfs[bsdf]}}, "lamp": lamps[light],
-                         "sensor": {"type": sensor, **view}})
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "walls": {**walls, "bsdf": {"type": "twosided", "bsdf": bsdfs[bsdf]}},
+            "lamp": lamps[light],
+            "sensor": {"type": sensor, **view},
+        }
+    )
 
 
 class JointPaths:
-    """Random paths from the sensor through `length` surface vertices to a point of a light, some of them scattering by delta functions, and the
-    weights that each technique's own code gives them."""
+    """Random paths from the sensor through `length` surface vertices to a point of a light, some of
+    them scattering by delta functions, and the weights that each technique's own code gives
+    them."""
 
     COUNT = 2000
 
@@ -70,7 +131,7 @@ class JointPaths:
         self.aperture = next_2d(rng)
         ray, _ = sensor.sample_ray(0, 0.5, next_2d(rng), self.aperture)
         self.valid = dr.full(mi.Bool, True, self.COUNT)
-        self.vertices = []                       # (si, bsdf, to_camera, to_light, delta)
+        self.vertices = []  # (si, bsdf, to_camera, to_light, delta)
         for number in range(length):
             hit = self.scene.ray_intersect_preliminary(ray, active=self.valid)
             si = hit.compute_surface_interaction(ray, mi.RayFlags.All, self.valid)
@@ -110,7 +171,9 @@ class JointPaths:
     def camera_states(self, weights):
         """Of the camera sub-path at each vertex, and after the last one's scattering."""
         _, si, _, to_camera, *_ = self.vertices[0]
-        density = self.lens.density(si.p, si.time, self.aperture, self.valid) * dr.abs(dr.dot(si.n, to_camera))
+        density = self.lens.density(si.p, si.time, self.aperture, self.valid) * dr.abs(
+            dr.dot(si.n, to_camera)
+        )
         states, state = [], weights.seen(density, self.valid)
         for number in range(self.length):
             states.append(state)
@@ -127,13 +190,19 @@ class JointPaths:
         last = self.vertices[-1][1]
         source = dr.zeros(mi.DirectionSample3f, self.COUNT)
         source.p, source.n, source.emitter = self.light.p, self.light.n, self.light.emitter
-        states = {self.length - 1: weights.lit(last, source, dr.full(mi.Bool, True, self.COUNT), self.valid)}
+        states = {
+            self.length - 1: weights.lit(
+                last, source, dr.full(mi.Bool, True, self.COUNT), self.valid
+            )
+        }
         for number in range(self.length - 1, 0, -1):
             p_camera, p_light = self.densities(number)
             delta = self.vertices[number][-1]
             left = weights.left(states[number], p_light, p_camera, delta)
             near, far, squared = self.segment(number, number - 1)
-            states[number - 1] = weights.arrived(left, dr.select(delta, 0, p_light * near * far / squared))
+            states[number - 1] = weights.arrived(
+                left, dr.select(delta, 0, p_light * near * far / squared)
+            )
             dr.eval(states[number - 1])
         return states
 
@@ -145,8 +214,18 @@ class JointPaths:
         seen.wi = si.to_local(towards)
         junction = Junction.at(self.traits, seen, si.bsdf(), self.valid)
         hit = mi.PreliminaryIntersection3f(hit)
-        return {"p": si.p, "n": junction.n, "ns": junction.ns, "towards": towards, "throughput": mi.Spectrum(1), "value": junction.value,
-                "density": junction.density, "near": state[0], "far": state[1], **({"hit": hit} if self.traits.has_rough else {})}
+        return {
+            "p": si.p,
+            "n": junction.n,
+            "ns": junction.ns,
+            "towards": towards,
+            "throughput": mi.Spectrum(1),
+            "value": junction.value,
+            "density": junction.density,
+            "near": state[0],
+            "far": state[1],
+            **({"hit": hit} if self.traits.has_rough else {}),
+        }
 
     def weights(self, weights):
         """{s: weight of technique s}, zero where it cannot make the path (numpy)."""
@@ -157,35 +236,82 @@ class JointPaths:
         facing = dr.abs(dr.dot(last.n, self.light.d))
         emission = self.lights.emission_ratio(last, self.light, self.valid)
         result = {}
-        met = dr.select(self.light.delta, 0, weights.met(left, self.lights.pdf_direct(last, self.light, self.valid), emission, p_camera * facing))
+        met = dr.select(
+            self.light.delta,
+            0,
+            weights.met(
+                left,
+                self.lights.pdf_direct(last, self.light, self.valid),
+                emission,
+                p_camera * facing,
+            ),
+        )
         result[0] = np.array(met)
-        result[1] = np.array(weights.direct(camera[-1], self.light_pdf, emission * facing, p_camera * facing, p_light, self.light.delta))
+        result[1] = np.array(
+            weights.direct(
+                camera[-1],
+                self.light_pdf,
+                emission * facing,
+                p_camera * facing,
+                p_light,
+                self.light.delta,
+            )
+        )
         for z in range(self.length - 2, -1, -1):
             pair = self.joined(camera, light, z)
-            result[self.length - z] = np.array(weights.connected(*pair)) * ~(delta[z] | delta[z + 1])
+            result[self.length - z] = np.array(weights.connected(*pair)) * ~(
+                delta[z] | delta[z + 1]
+            )
         y = self.record(0, "light", light[0])
-        seen = join_sensor(self.scene, None, self.traits, self.lens, y, self.aperture, mi.Float(0), [], False, self.valid)
+        seen = join_sensor(
+            self.scene,
+            None,
+            self.traits,
+            self.lens,
+            y,
+            self.aperture,
+            mi.Float(0),
+            [],
+            False,
+            self.valid,
+        )
         self.valid &= seen.active | mi.Bool(delta[0])
-        result[self.length + 1] = np.array(weights.seen_by_sensor(seen, y)) * ~delta[0] if self.lens.connects else 0 * result[0]
+        result[self.length + 1] = (
+            np.array(weights.seen_by_sensor(seen, y)) * ~delta[0]
+            if self.lens.connects
+            else 0 * result[0]
+        )
         if weights.eta:
             for number in range(self.length):
-                result["merge", number] = self.merged(weights, camera, light, number) * ~delta[number]
+                result["merge", number] = (
+                    self.merged(weights, camera, light, number) * ~delta[number]
+                )
         valid = np.array(self.valid)
         return {s: w[valid] for s, w in result.items()}
 
     def merged(self, weights, camera, light, number):
-        """Weight of a merge at a vertex: what a gather of just this light vertex brings, over what it would bring without weights."""
-        y, z = self.record(number, "light", light[number]), self.record(number, "camera", camera[number])
+        """Weight of a merge at a vertex: what a gather of just this light vertex brings, over what
+        it would bring without weights."""
+        y, z = (
+            self.record(number, "light", light[number]),
+            self.record(number, "camera", camera[number]),
+        )
         index = dr.arange(mi.UInt32, self.COUNT)
         zero = dr.zeros(mi.UInt32, self.COUNT)
         words = vertex_layout().room(self.COUNT)
-        vertex_layout().write(words, {**y, "path": zero, "depth": zero, "number": zero}, index, True)
+        vertex_layout().write(
+            words, {**y, "path": zero, "depth": zero, "number": zero}, index, True
+        )
         z["depth"] = zero
         dr.eval(words, z)
-        photons = vertex_map({"words": words}, mi.UInt32(self.COUNT), self.COUNT, self.traits.bounds, mi.Float(0.01))
+        photons = vertex_map(
+            {"words": words}, mi.UInt32(self.COUNT), self.COUNT, self.traits.bounds, mi.Float(0.01)
+        )
         brought = []
         for weigh in (lambda *args: weights.merged(z, *args), lambda *args: mi.Float(1)):
-            radiance = merge(self.traits, photons, z, dr.opaque(mi.Float, 1e-4), [], 1, -1, weigh, self.valid)
+            radiance = merge(
+                self.traits, photons, z, dr.opaque(mi.Float, 1e-4), [], 1, -1, weigh, self.valid
+            )
             brought.append(np.array(dr.mean(radiance)))
         self.valid &= mi.Bool(brought[1] > 0)
         return brought[0] / np.maximum(brought[1], 1e-30)
@@ -196,33 +322,61 @@ class JointPaths:
         return join(self.traits, a, b, [], self.valid), a, b
 
 
-@pytest.mark.parametrize("bsdf, light, sensor, length, beta, eta", [
-    ("diffuse", "area", "perspective", 3, 1, 2.0), ("rough", "area", "thinlens", 3, 2, 0.0), ("plastic", "point", "orthographic", 3, 1, 3.0),
-    ("plastic", "sphere", "perspective", 4, 1, 0.0), ("bump", "spot", "perspective", 2, 2, 0.0), ("rough", "constant", "perspective", 2, 1, 1.0)])
+@pytest.mark.parametrize(
+    "bsdf, light, sensor, length, beta, eta",
+    [
+        ("diffuse", "area", "perspective", 3, 1, 2.0),
+        ("rough", "area", "thinlens", 3, 2, 0.0),
+        ("plastic", "point", "orthographic", 3, 1, 3.0),
+        ("plastic", "sphere", "perspective", 4, 1, 0.0),
+        ("bump", "spot", "perspective", 2, 2, 0.0),
+        ("rough", "constant", "perspective", 2, 1, 1.0),
+    ],
+)
 def test_weights_sum_to_one(rgb, bsdf, light, sensor, length, beta, eta):
-    """Each technique's weight for the same joint path, from its own code, merges (eta = pi R^2 N) among them; some in a thousand lose by rounding
-    at grazing angles."""
+    """Each technique's weight for the same joint path, from its own code, merges (eta = pi R^2 N)
+    among them; some in a thousand lose by rounding at grazing angles."""
     paths = JointPaths(room(bsdf, light, sensor), length)
     by_technique = paths.weights(ConnectionWeights(paths.lights, beta, 0.7, eta))
     total = sum(by_technique.values())
     assert len(total) > 100
     assert np.mean(np.abs(total - 1) < 2e-3) > 0.995, np.sort(np.abs(total - 1))[-20:]
     smooth = [s for s, w in by_technique.items() if w.max() > 1e-3]
-    assert set(smooth) == set(by_technique) - ({0} if light in ("point", "spot") else set())      # each of them counts somewhere
+    assert set(smooth) == set(by_technique) - (
+        {0} if light in ("point", "spot") else set()
+    )  # each of them counts somewhere
 
 
 @pytest.mark.parametrize("kind", ["camera", "light"])
 def test_states_of_traced_subpaths(rgb, kind):
-    """Kept vertices carry what the hooks of `transport.subpaths` say, recomputed from the vertices before them, in a scene without delta
-    functions and with all kinds of junctions."""
+    """Kept vertices carry what the hooks of `transport.subpaths` say, recomputed from the vertices
+    before them, in a scene without delta functions and with all kinds of junctions."""
     scene, beta = room("rough", "area"), 2
     traits, lights, sensor = SceneTraits(scene), Lights(scene), scene.sensors()[0]
     weights, count, capacity = ConnectionWeights(lights, beta, 1.3), 300, 4000
     if kind == "light":
-        vertices, found, _ = trace_light_subpaths(scene, lights, traits, weights, mi.UInt32(3), count, capacity, [], 0.0, 0.0, 6, 50)
+        vertices, found, _ = trace_light_subpaths(
+            scene, lights, traits, weights, mi.UInt32(3), count, capacity, [], 0.0, 0.0, 6, 50
+        )
     else:
-        *_, vertices, found = trace_camera_subpaths(scene, sensor, None, lights, traits, weights, mi.UInt32(3), mi.UInt32(0), mi.UInt32(0), 64, 1, 0.5, 6, 50,
-                                                    False, capacity)
+        *_, vertices, found = trace_camera_subpaths(
+            scene,
+            sensor,
+            None,
+            lights,
+            traits,
+            weights,
+            mi.UInt32(3),
+            mi.UInt32(0),
+            mi.UInt32(0),
+            64,
+            1,
+            0.5,
+            6,
+            50,
+            False,
+            capacity,
+        )
     dr.eval(vertices, found)
     found = int(found[0])
     index = dr.arange(mi.UInt32, found)
@@ -231,16 +385,24 @@ def test_states_of_traced_subpaths(rgb, kind):
     before = read_vertices(vertices, here["parent"], later)
     dr.eval(here, before)
     d = -here["towards"]
-    si = before["hit"].compute_surface_interaction(mi.Ray3f(before["p"] + before["towards"] * before["hit"].t, -before["towards"]),
-                                                   mi.RayFlags.All, later)
+    si = before["hit"].compute_surface_interaction(
+        mi.Ray3f(before["p"] + before["towards"] * before["hit"].t, -before["towards"]),
+        mi.RayFlags.All,
+        later,
+    )
     sides = (before["towards"], d) if kind == "camera" else (d, before["towards"])
     _, p_camera, p_light = Junction.at(traits, si, si.bsdf(), later).between(*sides, later)
     forward, back = (p_camera, p_light) if kind == "camera" else (p_light, p_camera)
     left = weights.left([before["near"], before["far"]], forward, back, mi.Bool(False))
-    geometry = dr.abs(dr.dot(before["n"], d) * dr.dot(here["n"], d)) / dr.squared_norm(here["p"] - before["p"])
+    geometry = dr.abs(dr.dot(before["n"], d) * dr.dot(here["n"], d)) / dr.squared_norm(
+        here["p"] - before["p"]
+    )
     near, far = weights.arrived(left, forward * geometry)
     mask = np.array(later) & (np.array(here["depth"]) == np.array(before["depth"]) + 1)
-    assert mask.sum() > 100 and (np.array(here["number"]) == np.array(before["number"]) + 1)[mask].all()
+    assert (
+        mask.sum() > 100
+        and (np.array(here["number"]) == np.array(before["number"]) + 1)[mask].all()
+    )
     assert (np.array(here["path"]) == np.array(before["path"]))[mask].all()
     for mine, expected in ((here["near"], near), (here["far"], far)):
         ratio = np.array(mine)[mask] / np.array(expected)[mask]
@@ -258,16 +420,21 @@ def technique_estimates(scene, integrator, batches, blocks=1):
     result = {}
     for s, t in technique_names(integrator.techniques):
         first = channels.index(f"technique.s{s}.t{t}.R")
-        result[s, t] = Estimate.of([block_means(image[:, :, first:first + 3], blocks) for image in images])
+        result[s, t] = Estimate.of(
+            [block_means(image[:, :, first : first + 3], blocks) for image in images]
+        )
     return result
 
 
 def pyramid(longest, **parameters):
-    return bdpt(max_depth=longest, techniques=longest, technique_weights=False, rr_depth=50, **parameters)
+    return bdpt(
+        max_depth=longest, techniques=longest, technique_weights=False, rr_depth=50, **parameters
+    )
 
 
 def assert_each(estimates, expected, relative):
-    """Each technique agrees with the closed form of its path length, and is measured to `relative` (6 standard errors)."""
+    """Each technique agrees with the closed form of its path length, and is measured to `relative`
+    (6 standard errors)."""
     for technique, estimate in estimates.items():
         value = np.broadcast_to(np.reshape(expected(technique), (-1, 1)), estimate.mean.shape)
         assert not differences(estimate, Estimate.exact(value), slack=2e-3), technique
@@ -276,18 +443,31 @@ def assert_each(estimates, expected, relative):
 
 
 def test_each_technique_in_a_sphere(rgb):
-    """A point light in the middle: paths of k segments bring rho^(k - 1) I / pi, whichever technique makes them, but for meeting the light."""
+    """A point light in the middle: paths of k segments bring rho^(k - 1) I / pi, whichever
+    technique makes them, but for meeting the light."""
     rho, intensity = 0.6, 2.0
-    scene = inside_sphere({"light": {"type": "point", "position": [0, 0, 0], "intensity": intensity}}, diffuse(rho), size=32)
+    scene = inside_sphere(
+        {"light": {"type": "point", "position": [0, 0, 0], "intensity": intensity}},
+        diffuse(rho),
+        size=32,
+    )
     estimates = technique_estimates(scene, pyramid(5), 48)
-    assert_each(estimates, lambda st: 0 if st[0] == 0 else rho ** (st[0] + st[1] - 2) * intensity / np.pi, 0.06)
+    assert_each(
+        estimates,
+        lambda st: 0 if st[0] == 0 else rho ** (st[0] + st[1] - 2) * intensity / np.pi,
+        0.06,
+    )
 
 
 def test_no_technique_makes_longer_paths(rgb):
     """`max_depth` is exact for each of them, whatever its share."""
-    scene = inside_sphere({"light": {"type": "point", "position": [0, 0, 0], "intensity": 2.0}}, diffuse(0.6))
+    scene = inside_sphere(
+        {"light": {"type": "point", "position": [0, 0, 0], "intensity": 2.0}}, diffuse(0.6)
+    )
     for max_depth in (2, 3, 4):
-        session = bdpt(max_depth=max_depth, techniques=5, technique_weights=False).session(scene, 0, 1, 0)
+        session = bdpt(max_depth=max_depth, techniques=5, technique_weights=False).session(
+            scene, 0, 1, 0
+        )
         session.iterate()
         image, names = session.image(), session.channels
         for s, t in technique_names(5):
@@ -296,26 +476,42 @@ def test_no_technique_makes_longer_paths(rgb):
 
 
 def test_each_technique_in_an_emitting_sphere(rgb):
-    """Walls of albedo rho that emit L: rho^(k - 1) L for k segments; techniques that meet the light, too."""
+    """Walls of albedo rho that emit L: rho^(k - 1) L for k segments; techniques that meet the
+    light, too."""
     scene = inside_sphere({}, diffuse(0.5), {"type": "area", "radiance": 0.7}, size=32)
     estimates = technique_estimates(scene, pyramid(4), 48)
     assert_each(estimates, lambda st: 0.7 * 0.5 ** (st[0] + st[1] - 2), 0.08)
 
 
-@pytest.mark.parametrize("kind, rfilter", [("orthographic", "box"), ("thinlens", "gaussian"), ("perspective", "tent")])
+@pytest.mark.parametrize(
+    "kind, rfilter", [("orthographic", "box"), ("thinlens", "gaussian"), ("perspective", "tent")]
+)
 def test_light_tracing_to_each_sensor(rgb, kind, rfilter):
-    """A floor in the even part of a spot light, seen straight from above through a crop window: next-event estimation and light
-    tracing alone, by blocks."""
+    """A floor in the even part of a spot light, seen straight from above through a crop window:
+    next-event estimation and light tracing alone, by blocks."""
     window = {"crop_offset_x": 8, "crop_offset_y": 16, "crop_width": 16, "crop_height": 8}
-    view = {"type": kind, "film": film(32, rfilter, **window), "to_world": look((0, 0, 3), (0, 0, 0))}
+    view = {
+        "type": kind,
+        "film": film(32, rfilter, **window),
+        "to_world": look((0, 0, 3), (0, 0, 0)),
+    }
     if kind == "orthographic":
         view["to_world"] = view["to_world"] @ T().scale([1, 1, 1])
     else:
         view["fov"] = np.degrees(2 * np.arctan(1 / 3))
     if kind == "thinlens":
         view.update(aperture_radius=0.3, focus_distance=3.0)
-    scene = floor_from_above(1, sensor=view, light={
-        "type": "spot", "to_world": look((0.3, 0.1, 3.5), (0, -0.25, 0)), "intensity": 2.0, "cutoff_angle": 18, "beam_width": 17})
+    scene = floor_from_above(
+        1,
+        sensor=view,
+        light={
+            "type": "spot",
+            "to_world": look((0.3, 0.1, 3.5), (0, -0.25, 0)),
+            "intensity": 2.0,
+            "cutoff_angle": 18,
+            "beam_width": 17,
+        },
+    )
     x, y = np.meshgrid((np.arange(32 * 16) + 0.5) / 256 - 1, (np.arange(32 * 16) + 0.5) / 256 - 1)
     radiance = 0.5 * 2 / np.pi * point_irradiance(3.5, x - 0.3, -y - 0.1)
     picture = radiance.reshape(32, 16, 32, 16).mean(axis=(1, 3))[16:24, 8:24]
@@ -332,11 +528,22 @@ def test_pyramid_adds_up(rgb):
     session.iterate()
     image, names = session.image(), session.channels
     for letter, channel in zip("RGB", range(3)):
-        total = sum(image[:, :, i] for i, name in enumerate(names) if name.startswith("technique.") and name.endswith("." + letter))
+        total = sum(
+            image[:, :, i]
+            for i, name in enumerate(names)
+            if name.startswith("technique.") and name.endswith("." + letter)
+        )
         np.testing.assert_allclose(total, image[:, :, channel], rtol=1e-4, atol=1e-5)
-    assert image[:, :, names.index("technique.rest.G")].mean() > 0 and image[:, :, names.index("technique.s2.t2.G")].mean() > 0
+    assert (
+        image[:, :, names.index("technique.rest.G")].mean() > 0
+        and image[:, :, names.index("technique.s2.t2.G")].mean() > 0
+    )
     mi.set_variant("llvm_ad_mono")
-    assert bdpt(techniques=1, variance=True).aov_names() == ["var.Y", "technique.s0.t2.Y", "technique.rest.Y"]
+    assert bdpt(techniques=1, variance=True).aov_names() == [
+        "var.Y",
+        "technique.s0.t2.Y",
+        "technique.rest.Y",
+    ]
 
 
 # --- Images -----------------------------------------------------------------------------------------------
@@ -350,10 +557,21 @@ DEFAULT = [
 ]
 
 
-@pytest.mark.parametrize("emitter, family, sensor, variant_name, rfilter", DEFAULT, ids=["-".join(row).replace(" ", "_") for row in DEFAULT])
+@pytest.mark.parametrize(
+    "emitter, family, sensor, variant_name, rfilter",
+    DEFAULT,
+    ids=["-".join(row).replace(" ", "_") for row in DEFAULT],
+)
 def test_agrees(emitter, family, sensor, variant_name, rfilter):
     mi.set_variant(variant_name)
-    agree(bdpt(), path(rr_depth=50), tray(family, emitter, sensor, rfilter=rfilter), whole=0.02, block=0.08, most=600)
+    agree(
+        bdpt(),
+        path(rr_depth=50),
+        tray(family, emitter, sensor, rfilter=rfilter),
+        whole=0.02,
+        block=0.08,
+        most=600,
+    )
 
 
 @pytest.mark.full
@@ -364,10 +582,18 @@ def test_agrees_full(rgb, emitter, family, sensor):
     if has_delta(family) and emitter in POINT_LIKE:
         pytest.skip("path is blind there")
     oracle = ptracer if emitter == "directionalarea" else path
-    agree(bdpt(), oracle(rr_depth=50), tray(family, emitter, "perspective" if oracle is ptracer else sensor), block=0.05, most=4096)
+    agree(
+        bdpt(),
+        oracle(rr_depth=50),
+        tray(family, emitter, "perspective" if oracle is ptracer else sensor),
+        block=0.05,
+        most=4096,
+    )
 
 
-@pytest.mark.parametrize("emitter", [pytest.param("point", marks=pytest.mark.full), "directionalarea"])
+@pytest.mark.parametrize(
+    "emitter", [pytest.param("point", marks=pytest.mark.full), "directionalarea"]
+)
 def test_caustics_against_ptracer(rgb, emitter):
     """Light that reaches a floor by mirror and glass: only joining to the sensor makes it."""
     agree(bdpt(), ptracer(rr_depth=50), caustic_scene(emitter), whole=0.02, block=0.08, most=600)
@@ -377,28 +603,72 @@ def test_mirror_caustic_in_closed_form(rgb):
     """A mirror above a point light: the image light shines from its far side."""
     height, mirror = 1.0, 1.5
     scene = floor_from_above(
-        0.5, light={"type": "point", "position": [0, 0, height], "intensity": 2.0},
-        mirror={"type": "rectangle", "to_world": T().translate([0, 0, mirror]).rotate([1, 0, 0], 180).scale(10),
-                "bsdf": {"type": "conductor", "material": "none"}},
-        sensor={"type": "orthographic", "to_world": look((0, 0, 1.4), (0, 0, 0)) @ T().scale([0.5, 0.5, 1]), "film": film(16)})
-    expected = 0.5 * 2 / np.pi * block_average(
-        lambda x, y: point_irradiance(height, x, y) + point_irradiance(2 * mirror - height, x, y), 0.5, 2)
+        0.5,
+        light={"type": "point", "position": [0, 0, height], "intensity": 2.0},
+        mirror={
+            "type": "rectangle",
+            "to_world": T().translate([0, 0, mirror]).rotate([1, 0, 0], 180).scale(10),
+            "bsdf": {"type": "conductor", "material": "none"},
+        },
+        sensor={
+            "type": "orthographic",
+            "to_world": look((0, 0, 1.4), (0, 0, 0)) @ T().scale([0.5, 0.5, 1]),
+            "film": film(16),
+        },
+    )
+    expected = (
+        0.5
+        * 2
+        / np.pi
+        * block_average(
+            lambda x, y: (
+                point_irradiance(height, x, y) + point_irradiance(2 * mirror - height, x, y)
+            ),
+            0.5,
+            2,
+        )
+    )
     batches = SessionBatches(bdpt(max_depth=3, camera_paths=32), scene, 2)
     values = np.concatenate([[expected.mean()], expected])[:, None]
     batches.add(2)
-    assert_same(*collect_until(batches, Estimate.exact(np.repeat(values, 3, axis=1)), 0.01, 0.02), 0.01, 0.02, 1e-4)
+    assert_same(
+        *collect_until(batches, Estimate.exact(np.repeat(values, 3, axis=1)), 0.01, 0.02),
+        0.01,
+        0.02,
+        1e-4,
+    )
 
 
 @pytest.mark.parametrize("tilt", [-0.5, pytest.param(0.5, marks=pytest.mark.full)])
 def test_shading_normals_seen_from_the_light(rgb, tilt):
-    """A wall whose normal map tilts all its normals, lit by a narrow spot, lights a floor; Veach 1997, section 5.3. Each technique alone."""
-    normals = np.broadcast_to(np.array([0.0, tilt, np.sqrt(1 - tilt * tilt)]) * 0.5 + 0.5, (4, 4, 3))
-    scene = mi.load_dict({
-        "type": "scene", "floor": {"type": "rectangle", "to_world": T().scale(3), "bsdf": diffuse(0.6)},
-        "wall": {"type": "rectangle", "to_world": T().translate([0, 2, 1.5]).rotate([1, 0, 0], 90).scale(1.5),
-                 "bsdf": {"type": "normalmap", "normalmap": bitmap(normals), "bsdf": diffuse(0.8)}},
-        "spot": {"type": "spot", "to_world": look((0, -1.5, 3), (0, 2, 1.5)), "intensity": 20.0, "cutoff_angle": 15},
-        "sensor": {"type": "perspective", "fov": 40, "to_world": look((0, 0, 3), (0, 0, 0)), "film": film(24)}})
+    """A wall whose normal map tilts all its normals, lit by a narrow spot, lights a floor; Veach
+    1997, section 5.3. Each technique alone."""
+    normals = np.broadcast_to(
+        np.array([0.0, tilt, np.sqrt(1 - tilt * tilt)]) * 0.5 + 0.5, (4, 4, 3)
+    )
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "floor": {"type": "rectangle", "to_world": T().scale(3), "bsdf": diffuse(0.6)},
+            "wall": {
+                "type": "rectangle",
+                "to_world": T().translate([0, 2, 1.5]).rotate([1, 0, 0], 90).scale(1.5),
+                "bsdf": {"type": "normalmap", "normalmap": bitmap(normals), "bsdf": diffuse(0.8)},
+            },
+            "spot": {
+                "type": "spot",
+                "to_world": look((0, -1.5, 3), (0, 2, 1.5)),
+                "intensity": 20.0,
+                "cutoff_angle": 15,
+            },
+            "sensor": {
+                "type": "perspective",
+                "fov": 40,
+                "to_world": look((0, 0, 3), (0, 0, 0)),
+                "film": film(24),
+            },
+        }
+    )
     agree(bdpt(max_depth=3), path(max_depth=3), scene, blocks=2, whole=0.02, block=0.04)
     estimates = technique_estimates(scene, pyramid(3), 64)
     first = estimates[1, 3]
@@ -412,13 +682,31 @@ def test_shading_normals_seen_from_the_light(rgb, tilt):
 
 @pytest.mark.parametrize("rfilter, border", [("gaussian", False), ("mitchell", True)])
 def test_filters_and_crops(rgb, rfilter, border):
-    """Means of the outermost rows and columns of a crop window and of the whole agree with `path`, whatever the filter and its border."""
-    window = {"crop_offset_x": 8, "crop_offset_y": 16, "crop_width": 16, "crop_height": 8, "sample_border": border}
+    """Means of the outermost rows and columns of a crop window and of the whole agree with `path`,
+    whatever the filter and its border."""
+    window = {
+        "crop_offset_x": 8,
+        "crop_offset_y": 16,
+        "crop_width": 16,
+        "crop_height": 8,
+        "sample_border": border,
+    }
     scene = box_scene(32, rfilter, window)
-    a, b = (np.array([np.array(mi.render(scene, integrator=i, seed=seed, spp=spp)) for seed in range(16)])
-            for i, spp in ((bdpt(camera_paths=64), 256), (path(), 1024)))
+    a, b = (
+        np.array(
+            [np.array(mi.render(scene, integrator=i, seed=seed, spp=spp)) for seed in range(16)]
+        )
+        for i, spp in ((bdpt(camera_paths=64), 256), (path(), 1024))
+    )
     assert a.shape == (16, 8, 16, 3)
-    for region in (np.s_[:, :, :], np.s_[:, 0, :], np.s_[:, -1, :], np.s_[:, :, 0], np.s_[:, :, -1], np.s_[:, :4, 8:]):
+    for region in (
+        np.s_[:, :, :],
+        np.s_[:, 0, :],
+        np.s_[:, -1, :],
+        np.s_[:, :, 0],
+        np.s_[:, :, -1],
+        np.s_[:, :4, 8:],
+    ):
         means = [Estimate.of(x[region].reshape(16, -1, 3).mean(axis=1)[:, None]) for x in (a, b)]
         assert not differences(*means), region
         assert np.sqrt(means[0].error2.max()) < 0.01 * means[0].mean.max()
@@ -426,40 +714,100 @@ def test_filters_and_crops(rgb, rfilter, border):
 
 def lamp_scene():
     """A lamp in view above a floor, a glass ball, a mask, under a sky."""
-    return mi.load_dict({
-        "type": "scene", "floor": {"type": "rectangle", "to_world": T().scale(3), "bsdf": diffuse()},
-        "glass": {"type": "sphere", "center": [1.7, 1.0, 0.6], "radius": 0.5, "bsdf": {"type": "dielectric"}},
-        "mask": {"type": "rectangle", "to_world": T().translate([-1, 0.7, 0.7]).scale(0.7),
-                 "bsdf": {"type": "mask", "opacity": 0.5, "bsdf": {"type": "twosided", "bsdf": diffuse()}}},
-        "lamp": {"type": "rectangle", "to_world": look((0, -1, 2), (0, 0, 0)) @ T().scale(0.7), "bsdf": {"type": "twosided", "bsdf": diffuse()},
-                 "emitter": {"type": "area", "radiance": 2.0}},
-        "sky": {"type": "constant", "radiance": 0.5},
-        "sensor": {"type": "perspective", "fov": 45, "to_world": look((0, -2, 5), (0, 0, 0.5), (0, 1, 0)),
-                   "film": {**film(24), "pixel_format": "rgba"}}})
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "floor": {"type": "rectangle", "to_world": T().scale(3), "bsdf": diffuse()},
+            "glass": {
+                "type": "sphere",
+                "center": [1.7, 1.0, 0.6],
+                "radius": 0.5,
+                "bsdf": {"type": "dielectric"},
+            },
+            "mask": {
+                "type": "rectangle",
+                "to_world": T().translate([-1, 0.7, 0.7]).scale(0.7),
+                "bsdf": {
+                    "type": "mask",
+                    "opacity": 0.5,
+                    "bsdf": {"type": "twosided", "bsdf": diffuse()},
+                },
+            },
+            "lamp": {
+                "type": "rectangle",
+                "to_world": look((0, -1, 2), (0, 0, 0)) @ T().scale(0.7),
+                "bsdf": {"type": "twosided", "bsdf": diffuse()},
+                "emitter": {"type": "area", "radiance": 2.0},
+            },
+            "sky": {"type": "constant", "radiance": 0.5},
+            "sensor": {
+                "type": "perspective",
+                "fov": 45,
+                "to_world": look((0, -2, 5), (0, 0, 0.5), (0, 1, 0)),
+                "film": {**film(24), "pixel_format": "rgba"},
+            },
+        }
+    )
 
 
 @pytest.mark.parametrize("hide", [False, True])
 def test_hidden_emitters_and_alpha(rgb, hide):
     scene = lamp_scene()
     agree(bdpt(hide_emitters=hide), path(hide_emitters=hide, rr_depth=50), scene, block=0.04)
-    mine, truth = (np.array(mi.render(scene, integrator=i(hide_emitters=hide), spp=512))[:, :, 3] for i in (bdpt, path))
+    mine, truth = (
+        np.array(mi.render(scene, integrator=i(hide_emitters=hide), spp=512))[:, :, 3]
+        for i in (bdpt, path)
+    )
     assert np.abs(mine - truth).mean() < 0.01
 
 
-@pytest.mark.parametrize("name, max_depth", [("bdpt", 1), ("bdpt", 2), ("vcm", 1), ("pcbpt", 1), ("bdpt_ris", 1), ("bdpt_ris", 2)])
+@pytest.mark.parametrize(
+    "name, max_depth",
+    [("bdpt", 1), ("bdpt", 2), ("vcm", 1), ("pcbpt", 1), ("bdpt_ris", 1), ("bdpt_ris", 2)],
+)
 def test_alpha_at_the_last_depth(rgb, name, max_depth):
-    """What a path meets at its very last segment covers the background too, as in `path`, if it is no null surface there: four panes above a half
-    transparent floor. (Quarters of the film; standard error of a difference below 0.0035, nine of them.)"""
+    """What a path meets at its very last segment covers the background too, as in `path`, if it is
+    no null surface there: four panes above a half transparent floor. (Quarters of the film;
+    standard error of a difference below 0.0035, nine of them.)"""
     mask = {"type": "mask", "opacity": 0.5, "nested": diffuse()}
-    panes = {"opaque": diffuse(), "null": {"type": "null"}, "mask": mask, "mirror": {"type": "conductor"}}
+    panes = {
+        "opaque": diffuse(),
+        "null": {"type": "null"},
+        "mask": mask,
+        "mirror": {"type": "conductor"},
+    }
     corners = {"opaque": (-1, -1), "null": (-1, 1), "mask": (1, -1), "mirror": (1, 1)}
-    scene = mi.load_dict({
-        "type": "scene", "light": {"type": "point", "position": [0, 0, 3]}, "floor": {"type": "rectangle", "to_world": T().scale(2.5), "bsdf": mask},
-        **{kind: {"type": "rectangle", "to_world": T().translate([*corners[kind], 1]).scale(0.8), "bsdf": bsdf} for kind, bsdf in panes.items()},
-        "sensor": {"type": "orthographic", "to_world": look((0, 0, 4), (0, 0, 0), (0, 1, 0)) @ T().scale([2, 2, 1]),
-                   "film": {**film(24), "pixel_format": "rgba"}}})
-    mine, truth = (block_means(np.array(mi.render(scene, integrator=mi.load_dict({"type": kind, "max_depth": max_depth}), spp=256))[:, :, 3:], 2)
-                   for kind in (name, "path"))
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "light": {"type": "point", "position": [0, 0, 3]},
+            "floor": {"type": "rectangle", "to_world": T().scale(2.5), "bsdf": mask},
+            **{
+                kind: {
+                    "type": "rectangle",
+                    "to_world": T().translate([*corners[kind], 1]).scale(0.8),
+                    "bsdf": bsdf,
+                }
+                for kind, bsdf in panes.items()
+            },
+            "sensor": {
+                "type": "orthographic",
+                "to_world": look((0, 0, 4), (0, 0, 0), (0, 1, 0)) @ T().scale([2, 2, 1]),
+                "film": {**film(24), "pixel_format": "rgba"},
+            },
+        }
+    )
+    mine, truth = (
+        block_means(
+            np.array(
+                mi.render(
+                    scene, integrator=mi.load_dict({"type": kind, "max_depth": max_depth}), spp=256
+                )
+            )[:, :, 3:],
+            2,
+        )
+        for kind in (name, "path")
+    )
     np.testing.assert_allclose(mine, truth, atol=0.03)
 
 
@@ -468,14 +816,21 @@ def test_max_depth(rgb):
     scene = lamp_scene()
     means = []
     for max_depth in range(5):
-        mine, truth = (block_means(np.array(mi.render(scene, integrator=i(max_depth=max_depth), spp=512))[:, :, :3], 2) for i in (bdpt, path))
+        mine, truth = (
+            block_means(
+                np.array(mi.render(scene, integrator=i(max_depth=max_depth), spp=512))[:, :, :3], 2
+            )
+            for i in (bdpt, path)
+        )
         np.testing.assert_allclose(mine, truth, rtol=0.02, atol=1e-6)
         means.append(truth[0, 0])
     assert means[0] == 0 and all(b > 1.03 * a for a, b in zip(means, means[1:4]))
 
 
 def test_roulette_and_unlimited_depth_leave_the_mean(rgb):
-    scene = inside_sphere({"light": {"type": "point", "position": [0, 0, 0], "intensity": 1.0}}, diffuse(0.8))
+    scene = inside_sphere(
+        {"light": {"type": "point", "position": [0, 0, 0], "intensity": 1.0}}, diffuse(0.8)
+    )
     for rr_depth in (1, 30):
         batches = SessionBatches(bdpt(max_depth=-1, rr_depth=rr_depth), scene, 2)
         batches.add(8)
@@ -487,23 +842,36 @@ def test_roulette_and_unlimited_depth_leave_the_mean(rgb):
 
 
 def render(scene, seed=0, spp=8, **parameters):
-    return np.array(mi.render(scene, integrator=bdpt(camera_paths=1, **parameters), seed=seed, spp=spp))
+    return np.array(
+        mi.render(scene, integrator=bdpt(camera_paths=1, **parameters), seed=seed, spp=spp)
+    )
 
 
 @pytest.fixture
 def thin_lens_box(rgb):
-    return glossy_box(sensor={"type": "thinlens", "fov": 45, "aperture_radius": 0.1, "focus_distance": 5.5,
-                              "to_world": look((0, -5, 2.5), (0, 0, 0.6), (0, 0, 1)), "film": film(32)})
+    return glossy_box(
+        sensor={
+            "type": "thinlens",
+            "fov": 45,
+            "aperture_radius": 0.1,
+            "focus_distance": 5.5,
+            "to_world": look((0, -5, 2.5), (0, 0, 0.6), (0, 0, 1)),
+            "film": film(32),
+        }
+    )
 
 
 def test_seeds_and_iterations(thin_lens_box):
-    """Same seed, same image, as a whole or as iterations; other seeds and iterations are uncorrelated."""
+    """Same seed, same image, as a whole or as iterations; other seeds and iterations are
+    uncorrelated."""
     scene = thin_lens_box
     session = bdpt(camera_paths=1).session(scene, 0, 7, 0)
     images = list(pictures(session, 4))
     np.testing.assert_allclose(sum(images) / 4, render(scene, 7, 4), rtol=1e-4, atol=1e-5)
     mean = render(scene, 1000, 128).mean(axis=2)
-    images = [i.mean(axis=2) for i in images] + [render(scene, seed, 1).mean(axis=2) for seed in (8, 9)]
+    images = [i.mean(axis=2) for i in images] + [
+        render(scene, seed, 1).mean(axis=2) for seed in (8, 9)
+    ]
     noise = [(i - mean).ravel() for i in images]
     noise = [np.clip(n, *np.quantile(n, [0.02, 0.98])) for n in noise]
     table = np.corrcoef(noise) - np.eye(len(noise))
@@ -511,7 +879,8 @@ def test_seeds_and_iterations(thin_lens_box):
 
 
 def test_full_buffers_lose_nothing(thin_lens_box):
-    """Buffers that are far too small grow, and the passes run again with the same random numbers."""
+    """Buffers that are far too small grow, and the passes run again with the same random
+    numbers."""
     whole = render(thin_lens_box, 3, 2)
     session = bdpt(camera_paths=1).session(thin_lens_box, 0, 3, 0)
     session.capacity = {"light": 40, "camera": 56, "pairs": 16}
@@ -534,7 +903,8 @@ def test_parts_lose_nothing(rgb, monkeypatch):
 
 
 def test_pairs_are_thinned_without_bias(rgb, monkeypatch):
-    """What connections alone bring, with all pairs and with most of them left out, to 5 % (6 standard errors)."""
+    """What connections alone bring, with all pairs and with most of them left out, to 5 % (6
+    standard errors)."""
     scene, estimates = box_scene(24), []
     for thinning in (0, 1.0):
         monkeypatch.setattr("mis_integrators.integrators.bdpt.THINNING", thinning)
@@ -554,28 +924,64 @@ def test_variance_is_that_of_the_mean(rgb):
 # --- Parameters -----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name, value, allowed", [
-    ("beta", 0.5, "from 1"), ("beta", "power", "a number"), ("techniques", 11, "from 0"), ("techniques", True, "an integer"),
-    ("technique_weights", 1, "true or false"), ("photon_count", 5, "unknown parameter"), ("max_depth", -2, "at least 0")])
+@pytest.mark.parametrize(
+    "name, value, allowed",
+    [
+        ("beta", 0.5, "from 1"),
+        ("beta", "power", "a number"),
+        ("techniques", 11, "from 0"),
+        ("techniques", True, "an integer"),
+        ("technique_weights", 1, "true or false"),
+        ("photon_count", 5, "unknown parameter"),
+        ("max_depth", -2, "at least 0"),
+    ],
+)
 def test_bad_parameter(rgb, name, value, allowed):
     with pytest.raises(RuntimeError, match=allowed) as error:
         mi.load_dict({"type": "bdpt", name: value})
-    assert 'bdpt: ' in str(error.value) and f'"{name}"' in str(error.value)
+    assert "bdpt: " in str(error.value) and f'"{name}"' in str(error.value)
 
 
 def test_darkness_and_refusals(rgb):
-    scene = {"type": "scene", "floor": {"type": "rectangle"},
-             "sensor": {"type": "perspective", "to_world": look((0, 0, 3), (0, 0, 0)), "film": film(8)}}
+    scene = {
+        "type": "scene",
+        "floor": {"type": "rectangle"},
+        "sensor": {"type": "perspective", "to_world": look((0, 0, 3), (0, 0, 0)), "film": film(8)},
+    }
     assert (render(mi.load_dict(scene)) == 0).all()
     with pytest.raises(Exception) as error:
-        render(mi.load_dict({**scene, "fog": {"type": "sphere", "bsdf": {"type": "null"}, "interior": {"type": "homogeneous"}}}))
+        render(
+            mi.load_dict(
+                {
+                    **scene,
+                    "fog": {
+                        "type": "sphere",
+                        "bsdf": {"type": "null"},
+                        "interior": {"type": "homogeneous"},
+                    },
+                }
+            )
+        )
     assert last_words(error.value).endswith('use "volpath"') and "bdpt" in last_words(error.value)
 
 
 def test_a_sensor_that_cannot_be_joined(rgb):
     """Light tracing is left out under a `batch` sensor, and nothing is missing."""
-    views = {f"view{x}": {"type": "perspective", "fov": 40, "to_world": look((x, 0, 3), (0, 0, 0)), "film": film(8)} for x in (0, 1)}
-    scene = mi.load_dict({"type": "scene", "light": {"type": "point", "position": [0, 0, 2], "intensity": 3.0},
-                          "floor": {"type": "rectangle", "to_world": T().scale(5), "bsdf": diffuse(0.5)},
-                          "sensor": {"type": "batch", **views, "film": {**film(16), "height": 8}}})
+    views = {
+        f"view{x}": {
+            "type": "perspective",
+            "fov": 40,
+            "to_world": look((x, 0, 3), (0, 0, 0)),
+            "film": film(8),
+        }
+        for x in (0, 1)
+    }
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "light": {"type": "point", "position": [0, 0, 2], "intensity": 3.0},
+            "floor": {"type": "rectangle", "to_world": T().scale(5), "bsdf": diffuse(0.5)},
+            "sensor": {"type": "batch", **views, "film": {**film(16), "height": 8}},
+        }
+    )
     agree(bdpt(), path(), scene, blocks=2)

@@ -1,27 +1,49 @@
-"""The plugins `pcbpt` and `bdpt_ris`: one weight function whichever technique makes a path, the images, and where resampling could fail.
+"""The plugins `pcbpt` and `bdpt_ris`: one weight function whichever technique makes a path, the
+images, and where resampling could fail.
 
-Comparisons of renders as in `test_against_path`: false-alarm rate 1e-6 each, and the errors named are seen with a probability of 0.95.
+Comparisons of renders as in `test_against_path`: false-alarm rate 1e-6 each, and the errors named
+are seen with a probability of 0.95.
 """
 
 from pathlib import Path
+
+from mis_integrators.paths.camera_vertices import (
+    STEP,
+    leave,
+    not_left,
+    step_to_hit,
+    step_to_vertex,
+    sum_before,
+)
+from mis_integrators.paths.connect import join_sensor
+from mis_integrators.paths.subpaths import (
+    NO_PARENT,
+    junction_of,
+    new_vertices,
+    read_vertices,
+    vertex_layout,
+)
+from mis_integrators.paths.vertex import Junction, scattered_mean
+from mis_integrators.resampling.light_vertices import END, LightEnds
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-
-from comparing import Estimate, SessionBatches, agree, assert_same, collect_until, kernels_of, pictures
+from comparing import (
+    Estimate,
+    SessionBatches,
+    agree,
+    assert_same,
+    collect_until,
+    kernels_of,
+    pictures,
+)
 from test_against_path import MONO, RGB, SPECTRAL, caustic_scene
 from test_analytic import inside_sphere, series
 from test_bdpm import box_scene, glossy_box, last_words
 from test_bdpt import JointPaths, room
 from worlds import EMITTERS, POINT_LIKE, T, diffuse, film, has_delta, look, path, ptracer, tray
-from mis_integrators.paths.camera_vertices import STEP, leave, not_left, step_to_hit, step_to_vertex, sum_before
-from mis_integrators.paths.connect import join_sensor
-from mis_integrators.paths.vertex import Junction, scattered_mean
-from mis_integrators.resampling.light_vertices import END, LightEnds
-from mis_integrators.paths.subpaths import NO_PARENT, junction_of, new_vertices, read_vertices, vertex_layout
-
 
 SCENES = Path(__file__).parents[2] / "scenes"
 
@@ -34,11 +56,14 @@ def plugin(name, **parameters):
 
 
 class ResampledPaths(JointPaths):
-    """The same joint paths, written into buffers as the passes write them, and weighted by the passes' own code."""
+    """The same joint paths, written into buffers as the passes write them, and weighted by the
+    passes' own code."""
 
     def __init__(self, scene, length, **parameters):
         super().__init__(scene, length)
-        self.session = plugin(parameters.pop("name", "bdpt_ris"), max_depth=-1, **parameters).session(scene, 0, seed=1, spp=0)
+        self.session = plugin(
+            parameters.pop("name", "bdpt_ris"), max_depth=-1, **parameters
+        ).session(scene, 0, seed=1, spp=0)
         self.session._prepare()
         self.session._take_weights(1)
         self.lights, self.traits = self.session.lights, self.session.traits
@@ -51,8 +76,19 @@ class ResampledPaths(JointPaths):
         depth = number + 1 if side == "camera" else self.length - number
         slot = dr.arange(mi.UInt32, self.COUNT) + number * self.COUNT
         junction = Junction.at(self.traits, seen, si.bsdf(), self.valid)
-        values = {"p": si.p, "n": junction.n, "ns": junction.ns, "towards": towards, "throughput": 1, "value": junction.value, "density": junction.density,
-                  "path": slot, "depth": depth, "number": number, **dict(zip(states, state))}
+        values = {
+            "p": si.p,
+            "n": junction.n,
+            "ns": junction.ns,
+            "towards": towards,
+            "throughput": 1,
+            "value": junction.value,
+            "density": junction.density,
+            "path": slot,
+            "depth": depth,
+            "number": number,
+            **dict(zip(states, state)),
+        }
         vertex_layout(states).write(buffer["words"], values, slot, self.valid)
         dr.scatter(buffer["parent"], parent, slot, self.valid)
         if "hit" in buffer:
@@ -71,8 +107,13 @@ class ResampledPaths(JointPaths):
                 _, cosine, squared = self.segment(number - 1, number)
                 state = step_to_vertex(weights, left, density, cosine, squared)
             else:
-                of_rays = self.lens.density(si.p, si.time, self.aperture, self.valid) * dr.abs(dr.dot(si.n, to_camera))
-                state = [weights.ratio / of_rays if self.lens.connects else mi.Float(0), *[mi.Float(0)] * 5]
+                of_rays = self.lens.density(si.p, si.time, self.aperture, self.valid) * dr.abs(
+                    dr.dot(si.n, to_camera)
+                )
+                state = [
+                    weights.ratio / of_rays if self.lens.connects else mi.Float(0),
+                    *[mi.Float(0)] * 5,
+                ]
             slot = self.keep(buffer, STEP, number, "camera", state, parent)
             value, *_ = self.junction(number).between(to_camera, to_light, self.valid)
             left = leave(weights, left, si, value, p_camera, p_light, to_light, ~delta)
@@ -90,19 +131,32 @@ class ResampledPaths(JointPaths):
         source.p, source.n, source.emitter = self.light.p, self.light.n, self.light.emitter
         seen = mi.SurfaceInteraction3f(last)
         seen.wi = last.to_local(self.light.d)
-        flux = self.brought / (self.lights.start_density(last, self.light, self.valid) * self.lights.forward_density(last, self.light, self.valid))
+        flux = self.brought / (
+            self.lights.start_density(last, self.light, self.valid)
+            * self.lights.forward_density(last, self.light, self.valid)
+        )
         state = weights.lit(seen, source, dr.full(mi.Bool, True, self.COUNT), self.valid, flux)
         for number in range(self.length - 1, -1, -1):
             _, si, _, to_camera, to_light, delta = self.vertices[number]
-            slots[number] = self.keep(buffer, END, number, "light", state, dr.full(mi.UInt32, NO_PARENT, self.COUNT))
+            slots[number] = self.keep(
+                buffer, END, number, "light", state, dr.full(mi.UInt32, NO_PARENT, self.COUNT)
+            )
             if number:
                 p_camera, p_light = self.densities(number)
                 value, *_ = self.junction(number).between(to_camera, to_light, self.valid)
-                left = weights.left(state, p_light, p_camera, delta, scattered_mean(value, si.n, to_light))
+                left = weights.left(
+                    state, p_light, p_camera, delta, scattered_mean(value, si.n, to_light)
+                )
                 near, far, squared = self.segment(number, number - 1)
                 seen = mi.SurfaceInteraction3f(self.vertices[number - 1][1])
                 seen.wi = seen.to_local(self.vertices[number - 1][4])
-                state = weights.arrived(left, dr.select(delta, 0, p_light * near * far / squared), seen, squared, mi.UInt32(self.length - number + 1))
+                state = weights.arrived(
+                    left,
+                    dr.select(delta, 0, p_light * near * far / squared),
+                    seen,
+                    squared,
+                    mi.UInt32(self.length - number + 1),
+                )
                 dr.eval(state)
         return buffer, slots
 
@@ -112,8 +166,12 @@ class ResampledPaths(JointPaths):
         self.capacity = self.COUNT * self.length
         infinite = mi.has_flag(self.light.emitter.flags(), mi.EmitterFlags.Infinite)
         place = dr.select(infinite, mi.Point3f(self.light.d), self.light.p)
-        self.light, self.brought = self.lights.emitted(last, self.light.emitter, place, self.light.n, self.light.uv, self.valid)
-        self.valid &= (dr.max(self.brought) > 0) & (self.light.dist > 1e-2)      # not of a vertex on the lamp itself
+        self.light, self.brought = self.lights.emitted(
+            last, self.light.emitter, place, self.light.n, self.light.uv, self.valid
+        )
+        self.valid &= (dr.max(self.brought) > 0) & (
+            self.light.dist > 1e-2
+        )  # not of a vertex on the lamp itself
         camera, camera_slots, left, density, parent = self.camera_buffer(weights)
         light, light_slots = self.light_buffer(weights)
         delta = [np.array(v[-1]) for v in self.vertices]
@@ -121,54 +179,137 @@ class ResampledPaths(JointPaths):
         index = dr.arange(mi.UInt32, self.COUNT)
         result = {}
 
-        hit = step_to_hit(self.lights, weights, left, density, last, self.light, self.brought, dr.square(self.light.dist), self.valid)
-        nearer = sum_before(camera, hit, parent, hit["start"], hit["light_mean"], mi.Float(1), hit["across"], mi.UInt32(self.length + 1), weights,
-                            self.valid)
-        result[0] = np.array(dr.select(self.lights.can_be_met(self.light.emitter, self.valid), 1 / (1 + nearer), 0))
+        hit = step_to_hit(
+            self.lights,
+            weights,
+            left,
+            density,
+            last,
+            self.light,
+            self.brought,
+            dr.square(self.light.dist),
+            self.valid,
+        )
+        nearer = sum_before(
+            camera,
+            hit,
+            parent,
+            hit["start"],
+            hit["light_mean"],
+            mi.Float(1),
+            hit["across"],
+            mi.UInt32(self.length + 1),
+            weights,
+            self.valid,
+        )
+        result[0] = np.array(
+            dr.select(self.lights.can_be_met(self.light.emitter, self.valid), 1 / (1 + nearer), 0)
+        )
         for z in range(self.length - 1, -1, -1):
             places = dr.zeros(mi.UInt32, self.COUNT) if z == self.length - 1 else light_slots[z + 1]
-            ends = LightEnds(self.traits, self.lights, starts, self.COUNT, light, places, mi.UInt32(2 * self.COUNT), session.reach)
+            ends = LightEnds(
+                self.traits,
+                self.lights,
+                starts,
+                self.COUNT,
+                light,
+                places,
+                mi.UInt32(2 * self.COUNT),
+                session.reach,
+            )
             vertex = read_vertices(camera, camera_slots[z], self.valid, states=STEP)
-            sent = ends.send(vertex["p"], index if z == self.length - 1 else index + self.COUNT, mi.Float(0), [], self.valid)
-            value, forward, back = self.junction_at(camera, camera_slots[z]).between(vertex["towards"], sent.d, self.valid)
-            share = session._share(weights, camera, vertex, sent, value, forward, back, vertex["depth"] + sent.vertices, self.valid)
+            sent = ends.send(
+                vertex["p"],
+                index if z == self.length - 1 else index + self.COUNT,
+                mi.Float(0),
+                [],
+                self.valid,
+            )
+            value, forward, back = self.junction_at(camera, camera_slots[z]).between(
+                vertex["towards"], sent.d, self.valid
+            )
+            share = session._share(
+                weights,
+                camera,
+                vertex,
+                sent,
+                value,
+                forward,
+                back,
+                vertex["depth"] + sent.vertices,
+                self.valid,
+            )
             blocked = delta[z] if z == self.length - 1 else delta[z] | delta[z + 1]
             result[self.length - z] = np.array(share) * ~blocked
         y = read_vertices(light, light_slots[0], self.valid, states=END)
-        seen = join_sensor(self.scene, None, self.traits, self.lens, y, self.aperture, mi.Float(0), [], False, self.valid)
+        seen = join_sensor(
+            self.scene,
+            None,
+            self.traits,
+            self.lens,
+            y,
+            self.aperture,
+            mi.Float(0),
+            [],
+            False,
+            self.valid,
+        )
         self.valid &= seen.active | mi.Bool(delta[0])
-        result[self.length + 1] = np.array(weights.seen_by_sensor(seen, y)) * ~delta[0] if self.lens.connects else 0 * result[0]
+        result[self.length + 1] = (
+            np.array(weights.seen_by_sensor(seen, y)) * ~delta[0]
+            if self.lens.connects
+            else 0 * result[0]
+        )
         valid = np.array(self.valid)
         return {s: np.broadcast_to(w, self.COUNT)[valid] for s, w in result.items()}
 
     def junction_at(self, buffer, slots):
-        return junction_of(self.traits, read_vertices(buffer, slots, self.valid, states=STEP), [], self.valid)
+        return junction_of(
+            self.traits, read_vertices(buffer, slots, self.valid, states=STEP), [], self.valid
+        )
 
 
-@pytest.mark.parametrize("name, bsdf, light, sensor, length, parameters", [
-    ("bdpt_ris", "rough", "area", "thinlens", 3, {"resamples": 4}), ("bdpt_ris", "plastic", "point", "orthographic", 3, {"light_paths": 1}),
-    ("bdpt_ris", "plastic", "sphere", "perspective", 3, {"cache_neighbors": 1}), ("bdpt_ris", "bump", "constant", "perspective", 2, {}),
-    ("pcbpt", "plastic", "area", "perspective", 3, {"light_tracing": 4})])
+@pytest.mark.parametrize(
+    "name, bsdf, light, sensor, length, parameters",
+    [
+        ("bdpt_ris", "rough", "area", "thinlens", 3, {"resamples": 4}),
+        ("bdpt_ris", "plastic", "point", "orthographic", 3, {"light_paths": 1}),
+        ("bdpt_ris", "plastic", "sphere", "perspective", 3, {"cache_neighbors": 1}),
+        ("bdpt_ris", "bump", "constant", "perspective", 2, {}),
+        ("pcbpt", "plastic", "area", "perspective", 3, {"light_tracing": 4}),
+    ],
+)
 def test_weights_sum_to_one(rgb, name, bsdf, light, sensor, length, parameters):
-    """Each technique's weight for the same joint path, from its own code; some in a thousand lose by rounding at grazing angles."""
-    by_technique = ResampledPaths(room(bsdf, light, sensor), length, name=name, **parameters).weights()
+    """Each technique's weight for the same joint path, from its own code; some in a thousand lose
+    by rounding at grazing angles."""
+    by_technique = ResampledPaths(
+        room(bsdf, light, sensor), length, name=name, **parameters
+    ).weights()
     total = sum(by_technique.values())
     assert len(total) > 0.3 * JointPaths.COUNT
-    assert np.mean(np.abs(total - 1) < 1e-4) > 0.9 and np.mean(np.abs(total - 1) < 2e-3) > 0.995, np.sort(np.abs(total - 1))[-20:]
+    assert np.mean(np.abs(total - 1) < 1e-4) > 0.9 and np.mean(np.abs(total - 1) < 2e-3) > 0.995, (
+        np.sort(np.abs(total - 1))[-20:]
+    )
     smooth = {s for s, w in by_technique.items() if w.max() > 1e-3}
-    assert smooth == set(by_technique) - ({0} if light in ("point", "spot") else set())      # each of them counts somewhere
+    assert smooth == set(by_technique) - (
+        {0} if light in ("point", "spot") else set()
+    )  # each of them counts somewhere
 
 
 def test_guessed_weight_is_the_weight_where_nothing_is_guessed(rgb):
     """At the camera's first vertices on diffuse surfaces, under weights that ignore resampling."""
     from mis_integrators.mis.resampling import guessed_weight
+
     paths = ResampledPaths(room("diffuse", "area", "perspective"), 3, name="pcbpt")
     share, seen = paths.session._share, []
 
     def spy(weights, camera, z, sent, *rest):
         result = share(weights, camera, z, sent, *rest)
-        seen.append([np.array(x) for x in (z["depth"], sent.vertices, guessed_weight(z, sent), result)])
+        seen.append(
+            [np.array(x) for x in (z["depth"], sent.vertices, guessed_weight(z, sent), result)]
+        )
         return result
+
     paths.session._share = spy
     paths.weights()
     valid = np.array(paths.valid)
@@ -184,17 +325,33 @@ def test_guessed_weight_is_the_weight_where_nothing_is_guessed(rgb):
 
 def assert_value(integrator, scene, value, whole=0.01):
     batches = SessionBatches(integrator, scene, 1)
-    assert_same(*collect_until(batches, Estimate.exact(np.full((2, 3), value)), whole, whole, most=1500), whole, whole)
+    assert_same(
+        *collect_until(batches, Estimate.exact(np.full((2, 3), value)), whole, whole, most=1500),
+        whole,
+        whole,
+    )
 
 
-@pytest.mark.parametrize("name, parameters", [
-    ("bdpt_ris", {}), ("pcbpt", {}), ("bdpt_ris", {"light_paths": 1}), ("bdpt_ris", {"resamples": 4, "target": "f_y_f_yz", "light_paths": 30})],
-    ids=["aware", "unaware", "one_light_path", "four_draws"])
+@pytest.mark.parametrize(
+    "name, parameters",
+    [
+        ("bdpt_ris", {}),
+        ("pcbpt", {}),
+        ("bdpt_ris", {"light_paths": 1}),
+        ("bdpt_ris", {"resamples": 4, "target": "f_y_f_yz", "light_paths": 30}),
+    ],
+    ids=["aware", "unaware", "one_light_path", "four_draws"],
+)
 def test_point_in_sphere(rgb, name, parameters):
-    """A point light in the middle of a diffuse sphere: L = rho I / pi (1 + rho + rho^2 + ...), here four terms."""
+    """A point light in the middle of a diffuse sphere: L = rho I / pi (1 + rho + rho^2 + ...), here
+    four terms."""
     rho, intensity = 0.6, 2.0
-    scene = inside_sphere({"light": {"type": "point", "position": [0, 0, 0], "intensity": intensity}}, diffuse(rho))
-    assert_value(plugin(name, max_depth=5, **parameters), scene, series(rho * intensity / np.pi, rho, 4))
+    scene = inside_sphere(
+        {"light": {"type": "point", "position": [0, 0, 0], "intensity": intensity}}, diffuse(rho)
+    )
+    assert_value(
+        plugin(name, max_depth=5, **parameters), scene, series(rho * intensity / np.pi, rho, 4)
+    )
 
 
 @pytest.mark.parametrize("name", ["bdpt_ris", "pcbpt"])
@@ -206,23 +363,55 @@ def test_emitting_sphere(rgb, name):
 
 # plugin, emitter, family, sensor, variant, parameters
 ROWS = [
-    pytest.param("bdpt_ris", "envmap rotated", "mixed2", "thinlens", RGB, {"light_paths": 50}, marks=pytest.mark.full),
+    pytest.param(
+        "bdpt_ris",
+        "envmap rotated",
+        "mixed2",
+        "thinlens",
+        RGB,
+        {"light_paths": 50},
+        marks=pytest.mark.full,
+    ),
     ("pcbpt", "several", "smooth1", "orthographic", MONO, {}),
-    ("bdpt_ris", "textured", "smooth0", "perspective", MONO, {"resamples": 4, "target": "f_y_f_yz"}),
+    (
+        "bdpt_ris",
+        "textured",
+        "smooth0",
+        "perspective",
+        MONO,
+        {"resamples": 4, "target": "f_y_f_yz"},
+    ),
 ]
 
 
-@pytest.mark.parametrize("name, emitter, family, sensor, variant_name, parameters",
-                         ROWS, ids=["-".join(getattr(row, "values", row)[:5]).replace(" ", "_") for row in ROWS])
+@pytest.mark.parametrize(
+    "name, emitter, family, sensor, variant_name, parameters",
+    ROWS,
+    ids=["-".join(getattr(row, "values", row)[:5]).replace(" ", "_") for row in ROWS],
+)
 def test_agrees(name, emitter, family, sensor, variant_name, parameters):
     mi.set_variant(variant_name)
-    agree(plugin(name, camera_paths=16, **parameters), path(rr_depth=50), tray(family, emitter, sensor), whole=0.03, block=0.1, most=200)
+    agree(
+        plugin(name, camera_paths=16, **parameters),
+        path(rr_depth=50),
+        tray(family, emitter, sensor),
+        whole=0.03,
+        block=0.1,
+        most=200,
+    )
 
 
 @pytest.mark.full
 def test_agrees_in_spectral_variants():
     mi.set_variant(SPECTRAL)
-    agree(plugin("bdpt_ris", camera_paths=16), path(rr_depth=50), tray("mixed0", "rectangle"), whole=0.03, block=0.1, most=200)
+    agree(
+        plugin("bdpt_ris", camera_paths=16),
+        path(rr_depth=50),
+        tray("mixed0", "rectangle"),
+        whole=0.03,
+        block=0.1,
+        most=200,
+    )
 
 
 @pytest.mark.full
@@ -238,8 +427,16 @@ def test_agrees_full(rgb, emitter, family, name):
 
 @pytest.mark.parametrize("emitter", ["directionalarea"])
 def test_caustics_against_ptracer(rgb, emitter):
-    """Light that reaches a floor by mirror and glass: only joining to the sensor makes it, and the emitter has no start to be joined with."""
-    agree(plugin("bdpt_ris", max_depth=-1, camera_paths=16), ptracer(rr_depth=50), caustic_scene(emitter), whole=0.03, block=0.1, most=200)
+    """Light that reaches a floor by mirror and glass: only joining to the sensor makes it, and the
+    emitter has no start to be joined with."""
+    agree(
+        plugin("bdpt_ris", max_depth=-1, camera_paths=16),
+        ptracer(rr_depth=50),
+        caustic_scene(emitter),
+        whole=0.03,
+        block=0.1,
+        most=200,
+    )
 
 
 @pytest.mark.full
@@ -247,8 +444,12 @@ def test_caustics_against_ptracer(rgb, emitter):
 def test_bundled_scenes(rgb, scene):
     """Against `bdpt`, in rooms most of whose light sub-paths a cache point does not see."""
     scene = mi.load_file(str(SCENES / f"{scene}.xml"), resx=24, resy=24)
-    a, b = (SessionBatches(mi.load_dict({"type": name, "max_depth": 5, "camera_paths": paths}), scene, 2)
-            for name, paths in (("bdpt_ris", 4), ("bdpt", 16)))
+    a, b = (
+        SessionBatches(
+            mi.load_dict({"type": name, "max_depth": 5, "camera_paths": paths}), scene, 2
+        )
+        for name, paths in (("bdpt_ris", 4), ("bdpt", 16))
+    )
     assert_same(*collect_until(a, b, 0.03, 0.08, most=1000), 0.03, 0.08)
 
 
@@ -256,42 +457,103 @@ def test_bundled_scenes(rgb, scene):
 
 
 def test_nothing_is_visible(rgb):
-    """A lamp in a box of its own: no cache point sees any light vertex, every pmf falls back, and the image is black and finite."""
-    scene = mi.load_dict({
-        "type": "scene", "floor": {"type": "rectangle", "to_world": T().scale(2), "bsdf": diffuse(0.6)},
-        "box": {"type": "cube", "to_world": T().translate([0, 0, 1.5]).scale(0.4), "flip_normals": True, "bsdf": {"type": "twosided", "bsdf": diffuse(0.5)}},
-        "lamp": {"type": "sphere", "center": [0, 0, 1.5], "radius": 0.1, "emitter": {"type": "area"}},
-        "sensor": {"type": "perspective", "fov": 40, "to_world": look((0, -2, 3), (0, 0, 0)), "film": film(16)}})
+    """A lamp in a box of its own: no cache point sees any light vertex, every pmf falls back, and
+    the image is black and finite."""
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "floor": {"type": "rectangle", "to_world": T().scale(2), "bsdf": diffuse(0.6)},
+            "box": {
+                "type": "cube",
+                "to_world": T().translate([0, 0, 1.5]).scale(0.4),
+                "flip_normals": True,
+                "bsdf": {"type": "twosided", "bsdf": diffuse(0.5)},
+            },
+            "lamp": {
+                "type": "sphere",
+                "center": [0, 0, 1.5],
+                "radius": 0.1,
+                "emitter": {"type": "area"},
+            },
+            "sensor": {
+                "type": "perspective",
+                "fov": 40,
+                "to_world": look((0, -2, 3), (0, 0, 0)),
+                "film": film(16),
+            },
+        }
+    )
     for name in ("bdpt_ris", "pcbpt"):
         session = plugin(name).session(scene, 0, 1, 0)
         session.iterate()
         session.iterate()
-        assert np.all((session.image() >= 0) & (session.image() < 1e-4))      # rays start a little beside their surface
+        assert np.all(
+            (session.image() >= 0) & (session.image() < 1e-4)
+        )  # rays start a little beside their surface
         assert all(np.isfinite(np.array(x)).all() for x in (session.records, session.shares))
 
 
 def test_one_dominant_sub_path(rgb):
-    """Beside a lamp that lights everything, one so small, bright and rarely chosen that a light sub-path of its carries most of the light when there is one:
-    nothing is lost, though Q then rises with it."""
-    scene = mi.load_dict({
-        "type": "scene", "floor": {"type": "rectangle", "to_world": T().scale(2), "bsdf": diffuse(0.6)},
-        "wide": {"type": "point", "position": [0, 0, 40], "intensity": 2000.0},
-        "near": {"type": "point", "position": [0, 0, 1], "intensity": 10.0},
-        "sensor": {"type": "perspective", "fov": 40, "to_world": look((0, -2, 3), (0, 0, 0)), "film": film(16)}})
-    agree(plugin("bdpt_ris", light_paths=10), path(), scene, blocks=1, whole=0.2, block=0.2, most=900)
+    """Beside a lamp that lights everything, one so small, bright and rarely chosen that a light
+    sub-path of its carries most of the light when there is one: nothing is lost, though Q then
+    rises with it."""
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "floor": {"type": "rectangle", "to_world": T().scale(2), "bsdf": diffuse(0.6)},
+            "wide": {"type": "point", "position": [0, 0, 40], "intensity": 2000.0},
+            "near": {"type": "point", "position": [0, 0, 1], "intensity": 10.0},
+            "sensor": {
+                "type": "perspective",
+                "fov": 40,
+                "to_world": look((0, -2, 3), (0, 0, 0)),
+                "film": film(16),
+            },
+        }
+    )
+    agree(
+        plugin("bdpt_ris", light_paths=10), path(), scene, blocks=1, whole=0.2, block=0.2, most=900
+    )
 
 
 @pytest.mark.parametrize("parameters", [{}, {"max_depth": 0}, {"max_depth": 1}, {"max_depth": 2}])
 def test_dark_and_short(rgb, parameters):
     """A scene without light is black; depths 0, 1 and 2 show what `path` shows."""
-    floor = {"floor": {"type": "rectangle", "to_world": T().scale(2), "bsdf": diffuse(0.6)},
-             "sensor": {"type": "perspective", "fov": 40, "to_world": look((0, -2, 3), (0, 0, 0)), "film": film(16)}}
+    floor = {
+        "floor": {"type": "rectangle", "to_world": T().scale(2), "bsdf": diffuse(0.6)},
+        "sensor": {
+            "type": "perspective",
+            "fov": 40,
+            "to_world": look((0, -2, 3), (0, 0, 0)),
+            "film": film(16),
+        },
+    }
     if not parameters:
-        assert np.all(np.array(mi.render(mi.load_dict({"type": "scene", **floor}), integrator=plugin("bdpt_ris"), spp=8)) == 0)
+        assert np.all(
+            np.array(
+                mi.render(
+                    mi.load_dict({"type": "scene", **floor}), integrator=plugin("bdpt_ris"), spp=8
+                )
+            )
+            == 0
+        )
         return
-    scene = mi.load_dict({"type": "scene", **floor, "lamp": {"type": "rectangle", "to_world": look((0, 0, 1.5), (0, 0.6, 0)) @ T().scale(0.3),
-                                                             "bsdf": {"type": "twosided", "bsdf": diffuse(0.5)}, "emitter": {"type": "area"}}})
-    images = [np.array(mi.render(scene, integrator=i, spp=512)) for i in (plugin("bdpt_ris", **parameters), path(**parameters))]
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            **floor,
+            "lamp": {
+                "type": "rectangle",
+                "to_world": look((0, 0, 1.5), (0, 0.6, 0)) @ T().scale(0.3),
+                "bsdf": {"type": "twosided", "bsdf": diffuse(0.5)},
+                "emitter": {"type": "area"},
+            },
+        }
+    )
+    images = [
+        np.array(mi.render(scene, integrator=i, spp=512))
+        for i in (plugin("bdpt_ris", **parameters), path(**parameters))
+    ]
     np.testing.assert_allclose(*[x.mean(axis=(0, 1)) for x in images], rtol=0.03)
 
 
@@ -299,13 +561,18 @@ def test_dark_and_short(rgb, parameters):
 
 
 def test_slight_vertices_are_thinned_out(rgb):
-    """Each camera vertex stays with the probability whose inverse it is given, worked out apart: rough ones and the brightest of a path always, others by
-    what the nearest cache points promise. A chi-square of 200 rounds, false alarms 1e-6."""
+    """Each camera vertex stays with the probability whose inverse it is given, worked out apart:
+    rough ones and the brightest of a path always, others by what the nearest cache points promise.
+    A chi-square of 200 rounds, false alarms 1e-6."""
     from mis_integrators.paths.connect import LEAST_CHANCE, SLIGHT, list_draws
+
     session, rounds = plugin("pcbpt", max_depth=6).session(glossy_box(size=32), 0, 1, 0), 200
     session.start()
     spectral = session._spectral(1)
-    light, (_, _, _, camera, count, *_) = session._light(1, 0, spectral), session._camera(1, 0, spectral)
+    light, (_, _, _, camera, count, *_) = (
+        session._light(1, 0, spectral),
+        session._camera(1, 0, spectral),
+    )
     *_, pmfs = session._proposals(1, spectral, light)
     number = int(count[0])
     z = read_vertices(camera, dr.arange(mi.UInt32, number), True, states=STEP)
@@ -317,19 +584,36 @@ def test_slight_vertices_are_thinned_out(rgb):
     brightest = np.zeros(session.chunk)
     np.maximum.at(brightest, path, promised)
     level = SLIGHT * brightest[path]
-    chance = np.where(rough | (promised >= level), 1, np.maximum(promised / np.where(level > 0, level, 1), LEAST_CHANCE))
+    chance = np.where(
+        rough | (promised >= level),
+        1,
+        np.maximum(promised / np.where(level > 0, level, 1), LEAST_CHANCE),
+    )
     slight = chance < 1
-    assert 0.05 < slight.mean() < 0.95 and rough.any() and (chance[slight] > LEAST_CHANCE).mean() > 0.2
+    assert (
+        0.05 < slight.mean() < 0.95 and rough.any() and (chance[slight] > LEAST_CHANCE).mean() > 0.2
+    )
     stays = np.zeros(number)
     for seed in range(rounds):
-        places, factor, found = list_draws(session.grid, pmfs[2], camera, count, session.capacity["camera"], session.chunk, STEP,
-                                           session.capacity["camera"], mi.UInt32(seed))
-        places, factor = (np.array(x)[:int(found[0])] for x in (places, factor))
+        places, factor, found = list_draws(
+            session.grid,
+            pmfs[2],
+            camera,
+            count,
+            session.capacity["camera"],
+            session.chunk,
+            STEP,
+            session.capacity["camera"],
+            mi.UInt32(seed),
+        )
+        places, factor = (np.array(x)[: int(found[0])] for x in (places, factor))
         assert len(set(places)) == len(places)
         np.testing.assert_allclose(factor, 1 / chance[places], rtol=1e-4)
         stays[places] += 1
     assert np.all(stays[~slight] == rounds)
-    squares = (stays - rounds * chance)[slight] ** 2 / (rounds * chance * (1 - chance))[slight].clip(1e-3)
+    squares = (stays - rounds * chance)[slight] ** 2 / (rounds * chance * (1 - chance))[
+        slight
+    ].clip(1e-3)
     mean, error = squares.mean(), squares.std() / np.sqrt(slight.sum())
     assert abs(mean - 1) < 5 * error and error < 0.1
 
@@ -338,19 +622,23 @@ def test_slight_vertices_are_thinned_out(rgb):
 
 
 def test_same_seed_same_image(rgb):
-    """Cache points, draws and ends do not depend on the order of threads; iterations, whose light sub-paths all pixels share, are uncorrelated."""
+    """Cache points, draws and ends do not depend on the order of threads; iterations, whose light
+    sub-paths all pixels share, are uncorrelated."""
     scene = room("rough", "area")
     sessions = [plugin("bdpt_ris").session(scene, 0, seed, 0) for seed in (3, 3, 4)]
     means = [[picture.mean() for picture in pictures(session, 30)] for session in sessions]
     np.testing.assert_allclose(sessions[0].image(), sessions[1].image(), rtol=1e-4, atol=1e-6)
     same, other = np.array(means[0]), np.array(means[2])
-    assert abs(np.corrcoef(same, other)[0, 1]) < 0.75 and abs(np.corrcoef(same[1:], same[:-1])[0, 1]) < 0.75      # 1e-6 for 30 pairs
+    assert (
+        abs(np.corrcoef(same, other)[0, 1]) < 0.75
+        and abs(np.corrcoef(same[1:], same[:-1])[0, 1]) < 0.75
+    )  # 1e-6 for 30 pairs
 
 
 @pytest.mark.parametrize("light_paths", [30, 300])
 def test_iterations_in_any_order(rgb, light_paths):
-    """What the first iteration's light sub-paths tell of Q is known to all others, and not to itself, whoever renders which first: workers of a cluster, or
-    a render that goes on."""
+    """What the first iteration's light sub-paths tell of Q is known to all others, and not to
+    itself, whoever renders which first: workers of a cluster, or a render that goes on."""
     scene, images = box_scene(16), []
     for order in ((0, 1, 2), (2, 0, 1)):
         session = plugin("bdpt_ris", light_paths=light_paths).session(scene, 0, 7, 0)
@@ -362,10 +650,12 @@ def test_iterations_in_any_order(rgb, light_paths):
 
 
 def test_replays_are_what_was_recorded(monkeypatch):
-    """The pass that makes the pmfs has a size that Dr.Jit, left alone, would take for a multiple of its virtual calls' data, and get wrong
-    (`transport.recording.lanes`): 192 cache points times 520 light vertices."""
+    """The pass that makes the pmfs has a size that Dr.Jit, left alone, would take for a multiple of
+    its virtual calls' data, and get wrong (`transport.recording.lanes`): 192 cache points times 520
+    light vertices."""
     mi.set_variant(MONO)
     from mis_integrators.integrators import resampled
+
     monkeypatch.setattr(resampled, "FEWEST_CACHE_POINTS", 192)
     scene = tray("smooth1", "several", "orthographic")
     images = []
@@ -386,18 +676,29 @@ def test_replays_are_what_was_recorded(monkeypatch):
 def test_memory_is_bounded(rgb, monkeypatch):
     """Beyond the bound on pairs there are fewer cache points, and the image is the same."""
     from mis_integrators.integrators import resampled
+
     scene = room("diffuse", "area")
     monkeypatch.setattr(resampled, "MOST_PAIRS", 6000)
     session = plugin("bdpt_ris", light_paths=50).session(scene, 0, 1, 0)
     session.iterate()
     width = 50 + session.capacity["ends"]
     assert 1 <= dr.width(session.cache["depth"]) <= 6000 // width < resampled.FEWEST_CACHE_POINTS
-    agree(plugin("bdpt_ris", light_paths=50), path(), scene, blocks=1, whole=0.05, block=0.05, most=600)
+    agree(
+        plugin("bdpt_ris", light_paths=50),
+        path(),
+        scene,
+        blocks=1,
+        whole=0.05,
+        block=0.05,
+        most=600,
+    )
 
 
 def test_parts_share_their_proposals(rgb, monkeypatch):
-    """A film rendered in parts, the last one incomplete, has the mean of `path`, and draws from one set of pmfs in each iteration."""
+    """A film rendered in parts, the last one incomplete, has the mean of `path`, and draws from one
+    set of pmfs in each iteration."""
     from mis_integrators.integrators import resampled
+
     monkeypatch.setattr(resampled, "CHUNK", 470)
     scene = box_scene(24)
     session = plugin("bdpt_ris", light_tracing=1).session(scene, 0, 1, 0)
@@ -414,6 +715,7 @@ def test_parts_hold_every_path_once(rgb, monkeypatch):
     """Parts of a film, each of which sees all of it."""
     from mis_integrators.integrators import resampled
     from mis_integrators.paths.camera_pass import with_gaps
+
     monkeypatch.setattr(resampled, "CHUNK", 470)
     session = plugin("pcbpt").session(box_scene(23), 0, 1, 0)
     numbers = []
@@ -422,13 +724,18 @@ def test_parts_hold_every_path_once(rgb, monkeypatch):
         some = dr.arange(mi.UInt32, session.chunk) + with_gaps(*gaps, session.chunk, 4)
         numbers.append(np.array(some)[np.array(session.in_chunk(*gaps))])
         assert np.ptp(numbers[-1]) > 0.9 * session.path_count
-    assert np.array_equal(np.sort(np.concatenate(numbers)), np.arange(session.path_count)) and session.chunks == 5
+    assert (
+        np.array_equal(np.sort(np.concatenate(numbers)), np.arange(session.path_count))
+        and session.chunks == 5
+    )
 
 
 def test_pilot_sees_all_of_the_film(rgb, monkeypatch):
-    """Cache points of a film in parts come from all over it, as those of a film in one: heights of first vertices, two samples of the same
-    distribution (Kolmogorov and Smirnov; false alarms 1e-6)."""
+    """Cache points of a film in parts come from all over it, as those of a film in one: heights of
+    first vertices, two samples of the same distribution (Kolmogorov and Smirnov; false alarms
+    1e-6)."""
     from mis_integrators.integrators import resampled
+
     heights = []
     for chunk in (1 << 18, 500):
         monkeypatch.setattr(resampled, "CHUNK", chunk)
@@ -439,7 +746,10 @@ def test_pilot_sees_all_of_the_film(rgb, monkeypatch):
     assert session.chunks == 9
     a, b = heights
     both = np.concatenate(heights)
-    apart = np.abs(np.searchsorted(a, both, side="right") / len(a) - np.searchsorted(b, both, side="right") / len(b)).max()
+    apart = np.abs(
+        np.searchsorted(a, both, side="right") / len(a)
+        - np.searchsorted(b, both, side="right") / len(b)
+    ).max()
     assert apart < np.sqrt(-np.log(1e-6 / 2) / 2 * (1 / len(a) + 1 / len(b)))
 
 
@@ -447,41 +757,60 @@ def test_pilot_sees_all_of_the_film(rgb, monkeypatch):
 
 
 def test_best_ratio_is_the_best():
-    """Against a search along n; what no light sub-path brings, and what nothing else brings, end at the bounds."""
+    """Against a search along n; what no light sub-path brings, and what nothing else brings, end at
+    the bounds."""
     from mis_integrators.integrators.light_tracing import LEAST, MOST_CHOSEN, Noise, best_ratio
+
     n = np.geomspace(LEAST, MOST_CHOSEN, 4001)
-    for light, camera, light_cost, camera_cost in np.exp(np.random.default_rng(1).normal(0, 1, (50, 4))):
+    for light, camera, light_cost, camera_cost in np.exp(
+        np.random.default_rng(1).normal(0, 1, (50, 4))
+    ):
         best = n[np.argmin((camera + light / n) * (camera_cost + n * light_cost))]
-        assert best_ratio(Noise(light, camera), light_cost, camera_cost) == pytest.approx(best, rel=1e-3)
-    assert best_ratio(Noise(0, 1), 1, 1) == LEAST and best_ratio(Noise(1, 0), 1, 1) == MOST_CHOSEN and best_ratio(Noise(0, 0), 1, 1) == LEAST
+        assert best_ratio(Noise(light, camera), light_cost, camera_cost) == pytest.approx(
+            best, rel=1e-3
+        )
+    assert (
+        best_ratio(Noise(0, 1), 1, 1) == LEAST
+        and best_ratio(Noise(1, 0), 1, 1) == MOST_CHOSEN
+        and best_ratio(Noise(0, 0), 1, 1) == LEAST
+    )
 
 
 @pytest.mark.parametrize("camera_paths", [1, 4])
 def test_noise_is_seen_in_one_iteration(camera_paths):
-    """Camera paths and splats with the same known variances in each pixel, in an image whose brightness varies a hundredfold: each is found to 5 %
-    (five standard errors and more)."""
+    """Camera paths and splats with the same known variances in each pixel, in an image whose
+    brightness varies a hundredfold: each is found to 5 % (five standard errors and more)."""
     from mis_integrators.integrators.light_tracing import observed_noise
     from mis_integrators.pilot.radius import relative_weights
+
     rng, width, height, rate = np.random.default_rng(2), 104, 96, 0.5
     brightness = np.repeat(np.repeat(np.geomspace(0.1, 10, 13), 8)[None], height, axis=0)
     line, column = (np.repeat(x.ravel(), camera_paths) for x in np.indices((height, width)))
     there = brightness[line, column]
-    values = rng.gamma(4, there / 8)                                            # mean half the brightness, standard deviation half of that
+    values = rng.gamma(4, there / 8)  # mean half the brightness, standard deviation half of that
     light, squares = np.zeros((2, height, width))
     splats = rng.poisson(rate * camera_paths * width * height)
     y, x = rng.integers(0, height, splats), rng.integers(0, width, splats)
-    value = brightness[y, x] / 2 / rate                                         # their weights sum to `camera_paths`
+    value = brightness[y, x] / 2 / rate  # their weights sum to `camera_paths`
     np.add.at(light, (y, x), value)
-    np.add.at(squares, (y, x), value ** 2)
-    noise = observed_noise(np.stack([column, line]), values, camera_paths, light, squares, np.full((height, width), float(camera_paths)))
+    np.add.at(squares, (y, x), value**2)
+    noise = observed_noise(
+        np.stack([column, line]),
+        values,
+        camera_paths,
+        light,
+        squares,
+        np.full((height, width), float(camera_paths)),
+    )
     relative = relative_weights(brightness.ravel()) * brightness.ravel() ** 2
     assert noise.camera == pytest.approx(np.mean(relative) / 16 / camera_paths, rel=0.05)
     assert noise.light == pytest.approx(np.mean(relative) / 4 / rate / camera_paths, rel=0.05)
 
 
 def test_light_tracing_follows_the_scene(rgb):
-    """Where the noise is caustics, as many light sub-paths are traced as camera paths; where almost nothing that they meet is seen but through glass, fewer.
-    What was chosen is told, and makes the same image in another session that recalls it (and has to begin the first iteration anew)."""
+    """Where the noise is caustics, as many light sub-paths are traced as camera paths; where almost
+    nothing that they meet is seen but through glass, fewer. What was chosen is told, and makes the
+    same image in another session that recalls it (and has to begin the first iteration anew)."""
     chosen = []
     for name in ("caustics", "sds"):
         scene = mi.load_file(str(SCENES / f"{name}.xml"), resx=32, resy=24)
@@ -499,49 +828,76 @@ def test_light_tracing_follows_the_scene(rgb):
 
 
 def test_light_tracing_does_not_follow_the_parts(rgb, monkeypatch):
-    """As much for a film in parts as for one in one, but for the noise of the pilot, which sees a part."""
+    """As much for a film in parts as for one in one, but for the noise of the pilot, which sees a
+    part."""
     from mis_integrators.integrators import resampled
+
     chosen = []
     for chunk in (1 << 18, 3000):
         monkeypatch.setattr(resampled, "CHUNK", chunk)
-        sessions = [plugin("pcbpt").session(mi.load_file(str(SCENES / "door.xml"), resx=48, resy=36), 0, seed, 0) for seed in range(4)]
+        sessions = [
+            plugin("pcbpt").session(
+                mi.load_file(str(SCENES / "door.xml"), resx=48, resy=36), 0, seed, 0
+            )
+            for seed in range(4)
+        ]
         for session in sessions:
             session.start()
         chosen.append(np.log([session.light_tracing for session in sessions]))
-    assert session.chunks == 3 and abs(np.mean(chosen[0]) - np.mean(chosen[1])) < 0.3         # log(sqrt(3)) = 0.55
+    assert (
+        session.chunks == 3 and abs(np.mean(chosen[0]) - np.mean(chosen[1])) < 0.3
+    )  # log(sqrt(3)) = 0.55
 
 
 @pytest.mark.parametrize("ratio", [0.125, 8])
 def test_any_light_tracing_is_unbiased(rgb, monkeypatch, ratio):
-    """Fewer light sub-paths than camera paths, and so many that they are traced in several rounds, of a film in parts."""
+    """Fewer light sub-paths than camera paths, and so many that they are traced in several rounds,
+    of a film in parts."""
     from mis_integrators.integrators import resampled
+
     monkeypatch.setattr(resampled, "CHUNK", 1200)
     monkeypatch.setattr(resampled, "KNOWN_PATHS", 50)
     scene = box_scene(24)
     integrator = plugin("bdpt_ris", light_tracing=ratio, light_paths=50)
     session = integrator.session(scene, 0, 1, 0)
     session.start()
-    assert session.light_rounds == (8 if ratio == 8 else 1) and float(session.ratio[0]) == pytest.approx(ratio, rel=0.02)
+    assert session.light_rounds == (8 if ratio == 8 else 1) and float(
+        session.ratio[0]
+    ) == pytest.approx(ratio, rel=0.02)
     agree(integrator, path(rr_depth=50), scene, blocks=2, whole=0.02, block=0.05, most=600)
 
 
 @pytest.mark.parametrize("name", ["bdpt", "vcm", "bdpt_ris"])
 def test_kernels_know_neither_seed_nor_room(rgb, name):
-    """Another seed, with other cache points and a grid of other cells about them, and buffers of other sizes, one of which grows: no path kernel is
-    compiled anew. (Merging knows the size of its table, which goes with the light buffer's.)"""
+    """Another seed, with other cache points and a grid of other cells about them, and buffers of
+    other sizes, one of which grows: no path kernel is compiled anew. (Merging knows the size of its
+    table, which goes with the light buffer's.)"""
     scene, compiled, grids = glossy_box(size=16), [], set()
     for seed in range(3):
-        session = mi.load_dict({"type": name, "max_depth": 4, "camera_paths": 1}).session(scene, 0, seed, 0)
-        session.capacity.update(camera=2048 >> seed, light=session.capacity["light"] if name == "vcm" else (1024, 64, 2048)[seed])
+        session = mi.load_dict({"type": name, "max_depth": 4, "camera_paths": 1}).session(
+            scene, 0, seed, 0
+        )
+        session.capacity.update(
+            camera=2048 >> seed,
+            light=session.capacity["light"] if name == "vcm" else (1024, 64, 2048)[seed],
+        )
         compiled.append(kernels_of(session.iterate, 500))
         grids.add(tuple(session.grid.resolution) if name == "bdpt_ris" else seed)
     assert len(grids) > 1 and len(compiled[0]) >= 4
     assert compiled[1] <= compiled[0] and compiled[2] <= compiled[0]
 
 
-@pytest.mark.parametrize("parameters, words", [
-    ({"light_paths": 0}, ("light_paths", "from 1")), ({"resamples": 1.5}, ("resamples", "integer")), ({"cache_neighbors": 17}, ("cache_neighbors", "16")),
-    ({"target": "f"}, ("target", "f_y_rho_g_v")), ({"light_tracing": 9}, ("light_tracing", "0.125")), ({"beta": 2.0}, ("beta", "unknown", "light_paths"))])
+@pytest.mark.parametrize(
+    "parameters, words",
+    [
+        ({"light_paths": 0}, ("light_paths", "from 1")),
+        ({"resamples": 1.5}, ("resamples", "integer")),
+        ({"cache_neighbors": 17}, ("cache_neighbors", "16")),
+        ({"target": "f"}, ("target", "f_y_rho_g_v")),
+        ({"light_tracing": 9}, ("light_tracing", "0.125")),
+        ({"beta": 2.0}, ("beta", "unknown", "light_paths")),
+    ],
+)
 def test_parameters_are_checked(rgb, parameters, words):
     for name in ("pcbpt", "bdpt_ris"):
         with pytest.raises(Exception) as error:

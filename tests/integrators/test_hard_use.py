@@ -1,4 +1,5 @@
-"""Hard use: random scenes, random parameters, many renders, variants and threads in one process. Nothing aborts, hangs, grows, or lies."""
+"""Hard use: random scenes, random parameters, many renders, variants and threads in one process.
+Nothing aborts, hangs, grows, or lies."""
 
 import json
 import os
@@ -11,14 +12,21 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 import pytest
-from comparing import Estimate, PathBatches, SessionBatches, collect_until, differences, smallest_visible
+from comparing import (
+    Estimate,
+    PathBatches,
+    SessionBatches,
+    collect_until,
+    differences,
+    smallest_visible,
+)
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from random_scenes import scenes
 
 ROOT = Path(__file__).parents[2]
-# Photons must be so many that a merge disk of so small a radius holds some: else a dark region's mean hangs on a few events, of which no
-# standard error tells.
+# Photons must be so many that a merge disk of so small a radius holds some: else a dark region's
+# mean hangs on a few events, of which no standard error tells.
 MANY = {"photon_count": 1 << 16, "initial_radius": 0.04}
 PLUGINS = {
     "bdpt": {},
@@ -29,9 +37,11 @@ PLUGINS = {
     "volpath_multiview": {},
 }
 RIVAL = {"volpath_multiview": "volpath"}
-"""What a plugin is compared with, if not with `path`: passing through a mask is a segment of `max_depth` there, but not in `volpath`."""
+"""What a plugin is compared with, if not with `path`: passing through a mask is a segment of
+`max_depth` there, but not in `volpath`."""
 SLACK, BLUR = 0.002, 0.03
-"""Relative to the brightness of a region and of the image together: single precision; what merging at such a radius may take from shapes' edges."""
+"""Relative to the brightness of a region and of the image together: single precision; what merging
+at such a radius may take from shapes' edges."""
 DEPTH, MOST = 4, 480
 
 
@@ -39,10 +49,12 @@ DEPTH, MOST = 4, 480
 
 
 def compare(scene, plugin, whole):
-    """Against `path` (or `RIVAL`), over the image and its quarters, until an error of `whole` in the image would be seen, or `MOST` iterations are done.
+    """Against `path` (or `RIVAL`), over the image and its quarters, until an error of `whole` in
+    the image would be seen, or `MOST` iterations are done.
 
-    Small shapes that direct light does not reach lose more than `BLUR` at their edges. What is lost so is halved with the radius, an error is not:
-    where there is a difference, half the radius decides.
+    Small shapes that direct light does not reach lose more than `BLUR` at their edges. What is lost
+    so is halved with the radius, an error is not: where there is a difference, half the radius
+    decides.
     """
     parameters = PLUGINS[plugin]
     found, visible = found_by(scene, plugin, parameters, whole)
@@ -56,7 +68,9 @@ def compare(scene, plugin, whole):
 def at_half_the_radius(parameters):
     """The same with as many photons a disk, where their number is known."""
     finer = {**parameters, "initial_radius": parameters["initial_radius"] / 2}
-    return {**finer, "photon_count": 4 * finer["photon_count"]} if "photon_count" in finer else finer
+    return (
+        {**finer, "photon_count": 4 * finer["photon_count"]} if "photon_count" in finer else finer
+    )
 
 
 def found_by(scene, plugin, parameters, whole):
@@ -64,17 +78,27 @@ def found_by(scene, plugin, parameters, whole):
     common = {"max_depth": DEPTH, "rr_depth": 100}
     loaded = mi.load_dict(scene)
     ours = SessionBatches(mi.load_dict({"type": plugin, **parameters, **common}), loaded, blocks=2)
-    path = PathBatches(mi.load_dict({"type": RIVAL.get(plugin, "path"), **common}), loaded, blocks=2, spp=128)
+    path = PathBatches(
+        mi.load_dict({"type": RIVAL.get(plugin, "path"), **common}), loaded, blocks=2, spp=128
+    )
     estimates = collect_until(ours, path, whole, 3 * whole, start=24, most=MOST)
     brightness = estimates[1].mean[0].mean()
     lifted = [Estimate(e.mean + brightness, e.error2, e.freedom) for e in estimates]
-    return differences(*lifted, slack=BLUR if "initial_radius" in parameters else SLACK), smallest_visible(*estimates)[0]
+    return differences(
+        *lifted, slack=BLUR if "initial_radius" in parameters else SLACK
+    ), smallest_visible(*estimates)[0]
 
 
 def check_random_scenes(plugins, whole, **options):
     seen = []
 
-    @settings(deadline=None, database=None, phases=[Phase.generate], suppress_health_check=list(HealthCheck), **options)
+    @settings(
+        deadline=None,
+        database=None,
+        phases=[Phase.generate],
+        suppress_health_check=list(HealthCheck),
+        **options,
+    )
     @given(scenes(), st.sampled_from(plugins))
     def check(scene, plugin):
         seen.append(compare(scene, plugin, whole))
@@ -89,20 +113,30 @@ def test_random_scenes(rgb):
     assert len(visible) == 2 and min(visible) < 0.1
 
 
-@pytest.mark.parametrize("plugin", [plugin for plugin, parameters in PLUGINS.items() if "initial_radius" in parameters])
+@pytest.mark.parametrize(
+    "plugin", [plugin for plugin, parameters in PLUGINS.items() if "initial_radius" in parameters]
+)
 def test_half_the_radius_is_understood(rgb, plugin):
-    """What decides in `compare` is seldom needed: the plugin takes these parameters, and only the disks differ."""
-    usual, finer = (mi.load_dict({"type": plugin, **parameters}).settings() for parameters in (PLUGINS[plugin], at_half_the_radius(PLUGINS[plugin])))
+    """What decides in `compare` is seldom needed: the plugin takes these parameters, and only the
+    disks differ."""
+    usual, finer = (
+        mi.load_dict({"type": plugin, **parameters}).settings()
+        for parameters in (PLUGINS[plugin], at_half_the_radius(PLUGINS[plugin]))
+    )
     changed = {name: finer[name] / usual[name] for name in usual if finer[name] != usual[name]}
-    assert changed == {"initial_radius": 0.5, **({"photon_count": 4} if "photon_count" in PLUGINS[plugin] else {})}
+    assert changed == {
+        "initial_radius": 0.5,
+        **({"photon_count": 4} if "photon_count" in PLUGINS[plugin] else {}),
+    }
 
 
 @pytest.mark.full
 @pytest.mark.timeout(7200)
 @pytest.mark.parametrize("plugin", PLUGINS)
 def test_many_random_scenes(rgb, plugin):
-    """Others every time; hypothesis says how to draw one again. That it looks closely enough is said by a quarter of the scenes: an error of a
-    tenth is seen in about half of those drawn, so that of 25 fewer than seven are so in one run of a thousand."""
+    """Others every time; hypothesis says how to draw one again. That it looks closely enough is
+    said by a quarter of the scenes: an error of a tenth is seen in about half of those drawn, so
+    that of 25 fewer than seven are so in one run of a thousand."""
     visible = check_random_scenes([plugin], 0.02, max_examples=25, print_blob=True)
     assert np.quantile(visible, 0.25) < 0.1
 
@@ -156,10 +190,18 @@ print(json.dumps(counts))
 
 
 def random_parameters(seed, tries, renders, timeout):
-    result = subprocess.run([sys.executable, "-c", PARAMETERS, str(seed), str(tries), str(renders)], capture_output=True, text=True, cwd=ROOT,
-                            timeout=timeout, env={**os.environ, "PYTHONPATH": str(ROOT)})
+    result = subprocess.run(
+        [sys.executable, "-c", PARAMETERS, str(seed), str(tries), str(renders)],
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+        timeout=timeout,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )
     assert result.returncode == 0, result.stderr[-3000:]
-    return json.loads(result.stdout[result.stdout.rindex("{"):])             # Mitsuba's warnings end where their colour does
+    return json.loads(
+        result.stdout[result.stdout.rindex("{") :]
+    )  # Mitsuba's warnings end where their colour does
 
 
 def test_random_parameters():
@@ -181,20 +223,51 @@ def test_many_random_parameters(seed):
 
 def small_world(radiance=3.0):
     return mi.load_dict(
-        {"type": "scene", "floor": {"type": "rectangle", "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], -90)},
-         "ball": {"type": "sphere", "center": [0.25, 0.5, 0], "radius": 0.5, "bsdf": {"type": "roughplastic", "alpha": 0.25}},
-         "lamp": {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 2, 0]).rotate([1, 0, 0], 90).scale(0.5),
-                  "emitter": {"type": "area", "radiance": {"type": "rgb", "value": radiance}}},
-         "sensor": {"type": "perspective", "to_world": mi.ScalarTransform4f().look_at(origin=[0, 1, 4], target=[0, 0.5, 0], up=[0, 1, 0]),
-                    "film": {"type": "hdrfilm", "width": 16, "height": 16, "pixel_format": "rgb"}}})
+        {
+            "type": "scene",
+            "floor": {
+                "type": "rectangle",
+                "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], -90),
+            },
+            "ball": {
+                "type": "sphere",
+                "center": [0.25, 0.5, 0],
+                "radius": 0.5,
+                "bsdf": {"type": "roughplastic", "alpha": 0.25},
+            },
+            "lamp": {
+                "type": "rectangle",
+                "to_world": mi.ScalarTransform4f()
+                .translate([0, 2, 0])
+                .rotate([1, 0, 0], 90)
+                .scale(0.5),
+                "emitter": {"type": "area", "radiance": {"type": "rgb", "value": radiance}},
+            },
+            "sensor": {
+                "type": "perspective",
+                "to_world": mi.ScalarTransform4f().look_at(
+                    origin=[0, 1, 4], target=[0, 0.5, 0], up=[0, 1, 0]
+                ),
+                "film": {"type": "hdrfilm", "width": 16, "height": 16, "pixel_format": "rgb"},
+            },
+        }
+    )
 
 
 def picture(plugin, seed=0, scene=None, spp=4):
-    return np.array(mi.render(scene or small_world(), integrator=mi.load_dict({"type": plugin, "max_depth": 4}), seed=seed, spp=spp))
+    return np.array(
+        mi.render(
+            scene or small_world(),
+            integrator=mi.load_dict({"type": plugin, "max_depth": 4}),
+            seed=seed,
+            spp=spp,
+        )
+    )
 
 
 def test_variants_in_turn(rgb):
-    """Three times to and fro: the same image each time, and none of a session that was begun under another variant."""
+    """Three times to and fro: the same image each time, and none of a session that was begun under
+    another variant."""
     images = {variant: [] for variant in ("llvm_ad_rgb", "llvm_ad_mono")}
     for _ in range(3):
         for variant, pictures in images.items():
@@ -207,18 +280,24 @@ def test_variants_in_turn(rgb):
     mi.set_variant("llvm_ad_rgb")
     session = mi.load_dict({"type": "bdpm"}).session(small_world(), spp=4)
     mi.set_variant("llvm_ad_mono")
-    with pytest.raises(RuntimeError, match="begun under the variant llvm_ad_rgb, but the active one is now llvm_ad_mono"):
+    with pytest.raises(
+        RuntimeError,
+        match="begun under the variant llvm_ad_rgb, but the active one is now llvm_ad_mono",
+    ):
         session.iterate()
     mi.set_variant("llvm_ad_rgb")
     session.iterate()
 
 
 def test_threads_take_turns(rgb, monkeypatch):
-    """Two threads that render one scene at the same time get their own images, and no two iterations overlap."""
+    """Two threads that render one scene at the same time get their own images, and no two
+    iterations overlap."""
     scene = small_world()
     expected = [picture("bdpm", seed, scene) for seed in range(2)]
     inside, most = 0, 0
-    session_class = sys.modules["mis_integrators.integrators.common"].IterativeSession      # that of the active variant
+    session_class = sys.modules[
+        "mis_integrators.integrators.common"
+    ].IterativeSession  # that of the active variant
     run = session_class._run
 
     def watched(self, iteration):
@@ -269,11 +348,22 @@ print(early, resident())
 
 @pytest.mark.full
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
-@pytest.mark.parametrize("plugins", [["bdpm"], ["bdpm_opt3"], ["bdpt", "vcm"], ["volpath_multiview"], ["bdpt_ris"], ["path"]], ids=" ".join)
+@pytest.mark.parametrize(
+    "plugins",
+    [["bdpm"], ["bdpm_opt3"], ["bdpt", "vcm"], ["volpath_multiview"], ["bdpt_ris"], ["path"]],
+    ids=" ".join,
+)
 def test_hundred_renders_do_not_grow(plugins):
-    """Scenes, integrators and sessions that are forgotten are gone: 100 renders more, less than 30 MB."""
-    result = subprocess.run([sys.executable, "-c", GROWTH, "120", *plugins], capture_output=True, text=True, cwd=ROOT, timeout=580,
-                            env={**os.environ, "PYTHONPATH": str(ROOT)})
+    """Scenes, integrators and sessions that are forgotten are gone: 100 renders more, less than 30
+    MB."""
+    result = subprocess.run(
+        [sys.executable, "-c", GROWTH, "120", *plugins],
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+        timeout=580,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )
     assert result.returncode == 0, result.stderr[-2000:]
     early, late = map(float, result.stdout.split())
     assert late - early < 30, (early, late)

@@ -1,33 +1,52 @@
-"""Films without pixels, crops of huge films, numbers beyond all measure: one clear error, or the render that was asked for; no traceback."""
+"""Films without pixels, crops of huge films, numbers beyond all measure: one clear error, or the
+render that was asked for; no traceback."""
+
+from mis_integrators import _plugins
+from mis_integrators.app import cli
+from mis_integrators.core.traits import UnsupportedScene
+from mis_integrators.paths.camera_pass import film_sample_count
 
 import mitsuba as mi
 import pytest
-from mis_integrators import _plugins
-from mis_integrators.app import cli
-from mis_integrators.paths.camera_pass import film_sample_count
-from mis_integrators.core.traits import UnsupportedScene
 
-MOST_LIGHT_PATHS = 2 ** 28
+MOST_LIGHT_PATHS = 2**28
 """As parameters have it."""
-EMPTY_FILMS = [{"width": 0, "height": 0}, {"width": 8, "height": 0}, {"width": 8, "height": 8, "crop_width": 0, "crop_height": 4}]
+EMPTY_FILMS = [
+    {"width": 0, "height": 0},
+    {"width": 8, "height": 0},
+    {"width": 8, "height": 8, "crop_width": 0, "crop_height": 4},
+]
 MANY_DIGITS = ["1" + 400 * "0", "-1" + 400 * "0", "1" + 5000 * "0"]
 
 
 def scene_of(**film):
     """A ball under a bright sky, on such a film."""
-    return mi.load_dict({"type": "scene", "ball": {"type": "sphere"}, "lamp": {"type": "constant"},
-                         "sensor": {"type": "perspective", "film": {"type": "hdrfilm", "rfilter": {"type": "box"}, **film}}})
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "ball": {"type": "sphere"},
+            "lamp": {"type": "constant"},
+            "sensor": {
+                "type": "perspective",
+                "film": {"type": "hdrfilm", "rfilter": {"type": "box"}, **film},
+            },
+        }
+    )
 
 
 @pytest.fixture
 def scene_file(tmp_path, rgb):
     """Writes that scene into a file, on such a film, and returns the file."""
+
     def write(**film):
         size = "".join(f'<integer name="{name}" value="{value}"/>' for name, value in film.items())
         file = tmp_path / "scene.xml"
-        file.write_text(f'<scene version="3.0.0"><integrator type="path"/><sensor type="perspective"><film type="hdrfilm">{size}</film></sensor>'
-                        '<shape type="sphere"/><emitter type="constant"/></scene>')
+        file.write_text(
+            f'<scene version="3.0.0"><integrator type="path"/><sensor type="perspective"><film type="hdrfilm">{size}</film></sensor>'
+            '<shape type="sphere"/><emitter type="constant"/></scene>'
+        )
         return file
+
     return write
 
 
@@ -38,9 +57,13 @@ def scene_file(tmp_path, rgb):
 @pytest.mark.parametrize("plugin", _plugins.PLUGINS)
 def test_film_without_pixels_is_refused(rgb, plugin, film):
     integrator = mi.load_dict({"type": plugin})
-    sessions = [integrator.session] + ([integrator.views_session] if plugin == "volpath_multiview" else [])
+    sessions = [integrator.session] + (
+        [integrator.views_session] if plugin == "volpath_multiview" else []
+    )
     for session in sessions:
-        with pytest.raises(UnsupportedScene, match=f"^{plugin}: .*width and height must be at least 1"):
+        with pytest.raises(
+            UnsupportedScene, match=f"^{plugin}: .*width and height must be at least 1"
+        ):
             session(scene_of(**film), spp=4)
 
 
@@ -50,22 +73,37 @@ def test_command_refuses_a_film_without_pixels(scene_file, capsys, plugin, film)
     file = scene_file(**film)
     assert cli.main([str(file), "-i", plugin]) == 1
     error = capsys.readouterr().err
-    assert error.startswith(f"mis-render: {plugin}: ") and "at least 1" in error and error.count("\n") == 1
+    assert (
+        error.startswith(f"mis-render: {plugin}: ")
+        and "at least 1" in error
+        and error.count("\n") == 1
+    )
     assert not file.with_suffix(".exr").exists()
 
 
 @pytest.mark.parametrize("plugin", _plugins.PLUGINS)
 def test_crop_of_a_huge_film(rgb, plugin):
     """What counts is what is rendered: the crop window, not the film."""
-    cropped = {"width": 70000, "height": 70000, "crop_width": 8, "crop_height": 6, "crop_offset_x": 35000, "crop_offset_y": 35000}
+    cropped = {
+        "width": 70000,
+        "height": 70000,
+        "crop_width": 8,
+        "crop_height": 6,
+        "crop_offset_x": 35000,
+        "crop_offset_y": 35000,
+    }
     session = mi.load_dict({"type": plugin, "max_depth": 2}).session(scene_of(**cropped), spp=4)
     session.iterate()
     assert session.image().shape[:2] == (6, 8)
 
 
-@pytest.mark.parametrize("plugin", [plugin for plugin in _plugins.PLUGINS if plugin != "volpath_multiview"])
+@pytest.mark.parametrize(
+    "plugin", [plugin for plugin in _plugins.PLUGINS if plugin != "volpath_multiview"]
+)
 def test_more_pixels_than_can_be_numbered(rgb, plugin):
-    with pytest.raises(ValueError, match=f'^{plugin}: parameter "camera_paths" .* on 4900000000 pixels'):
+    with pytest.raises(
+        ValueError, match=f'^{plugin}: parameter "camera_paths" .* on 4900000000 pixels'
+    ):
         mi.load_dict({"type": plugin}).session(scene_of(width=70000, height=70000), spp=4)
 
 
@@ -79,36 +117,74 @@ def test_light_paths_are_bounded_by_default(rgb, plugin):
 
 @pytest.mark.parametrize("plugin", ["bdpt", "vcm", "bdpt_ris", "pcbpt"])
 def test_light_paths_of_a_part_are_bounded(rgb, plugin):
-    """Those that are traced at once, where a single pixel has more camera paths than a parameter could ask for."""
+    """Those that are traced at once, where a single pixel has more camera paths than a parameter
+    could ask for."""
     integrator = mi.load_dict({"type": plugin, "camera_paths": 2 * MOST_LIGHT_PATHS})
-    assert integrator.session(scene_of(width=1, height=1), spp=2 * MOST_LIGHT_PATHS).light_chunk <= MOST_LIGHT_PATHS
+    assert (
+        integrator.session(scene_of(width=1, height=1), spp=2 * MOST_LIGHT_PATHS).light_chunk
+        <= MOST_LIGHT_PATHS
+    )
 
 
 # --- Numbers ------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("value", [*MANY_DIGITS, "1e400", "nan", "inf", "", "0x10", "1" + 100 * "x"], ids=lambda value: value[:6])
+@pytest.mark.parametrize(
+    "value",
+    [*MANY_DIGITS, "1e400", "nan", "inf", "", "0x10", "1" + 100 * "x"],
+    ids=lambda value: value[:6],
+)
 @pytest.mark.parametrize("option", ["--spp", "--seed", "--sensor", "--workers"])
 def test_huge_integers_are_wrong_usage(scene_file, capsys, option, value):
     with pytest.raises(SystemExit) as exit:
         cli.main([str(scene_file(width=8, height=6)), f"{option}={value}"])
     said = capsys.readouterr().err.splitlines()[-1]
-    assert exit.value.code == 2 and said.startswith(f"mis-render: error: argument {option}: ") and len(said) < 400 and "is not an integer from" in said
+    assert (
+        exit.value.code == 2
+        and said.startswith(f"mis-render: error: argument {option}: ")
+        and len(said) < 400
+        and "is not an integer from" in said
+    )
 
 
-@pytest.mark.parametrize("value", [*MANY_DIGITS, "1e400", "-1e400", "nan", "inf", "0", "-0.0", "1e-400"], ids=lambda value: value[:6])
+@pytest.mark.parametrize(
+    "value",
+    [*MANY_DIGITS, "1e400", "-1e400", "nan", "inf", "0", "-0.0", "1e-400"],
+    ids=lambda value: value[:6],
+)
 @pytest.mark.parametrize("option", ["--time", "--target-error", "--checkpoint", "--preview"])
 def test_numbers_without_measure_are_wrong_usage(scene_file, capsys, option, value):
     with pytest.raises(SystemExit) as exit:
         cli.main([str(scene_file(width=8, height=6)), f"{option}={value}"])
     said = capsys.readouterr().err.splitlines()[-1]
-    assert exit.value.code == 2 and said.startswith(f"mis-render: error: argument {option}: ") and len(said) < 400 and "is not a finite number" in said
+    assert (
+        exit.value.code == 2
+        and said.startswith(f"mis-render: error: argument {option}: ")
+        and len(said) < 400
+        and "is not a finite number" in said
+    )
 
 
-@pytest.mark.parametrize("value", [*MANY_DIGITS, "9223372036854775808", "4294967296", "1e400", "nan"], ids=lambda value: value[:6])
-@pytest.mark.parametrize("plugin, parameter", [("path", "max_depth"), ("bdpt", "max_depth"), ("bdpt", "camera_paths"), ("bdpt", "beta"), ("path", "nope")])
+@pytest.mark.parametrize(
+    "value",
+    [*MANY_DIGITS, "9223372036854775808", "4294967296", "1e400", "nan"],
+    ids=lambda value: value[:6],
+)
+@pytest.mark.parametrize(
+    "plugin, parameter",
+    [
+        ("path", "max_depth"),
+        ("bdpt", "max_depth"),
+        ("bdpt", "camera_paths"),
+        ("bdpt", "beta"),
+        ("path", "nope"),
+    ],
+)
 def test_plugins_refuse_huge_parameters(scene_file, capsys, plugin, parameter, value):
-    assert cli.main([str(scene_file(width=8, height=6)), "-i", plugin, "-P", f"{parameter}={value}"]) == 1
+    assert (
+        cli.main([str(scene_file(width=8, height=6)), "-i", plugin, "-P", f"{parameter}={value}"])
+        == 1
+    )
     error = capsys.readouterr().err
     assert error.startswith("mis-render: ") and error.count("\n") == 1 and f'"{parameter}"' in error
 
@@ -117,5 +193,8 @@ def test_huge_number_that_fits_a_float(rgb):
     """Integers beyond Mitsuba's become floats, which some parameters are."""
     from mis_integrators.app import loading
 
-    assert loading.parse_value("1" + 20 * "0") == 1e20 and type(loading.parse_value("1" + 20 * "0")) is float
+    assert (
+        loading.parse_value("1" + 20 * "0") == 1e20
+        and type(loading.parse_value("1" + 20 * "0")) is float
+    )
     assert loading.parse_value(str(2**63 - 1)) == 2**63 - 1

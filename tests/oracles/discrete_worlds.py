@@ -1,16 +1,19 @@
-"""Discrete worlds: one pixel whose vertices have finitely many states, so that noise and optimal weights are known exactly.
+"""Discrete worlds: one pixel whose vertices have finitely many states, so that noise and optimal
+weights are known exactly.
 
-K strategies, N_B camera paths, n_F photons per unit of irradiance (light's flux 1). An array of level j has the shape n1 x ... x nj, the
-states of z1 ... zj. `measure[j-1]` is the projected solid angle of z_j seen from z_{j-1} [sr], `f[j-1]` the scattering at z_{j-1}
-towards z_j [1/sr], `L0[j-1]` the direct luminance of z_j (0 < j < K-1), `L` and `b` luminance and second photon sum of level K-1.
-The camera path draws its direction with p = f / mu, mu the albedo. Weights are a dictionary: `w[l, i]`, an array of level l - 1.
+K strategies, N_B camera paths, n_F photons per unit of irradiance (light's flux 1). An array of
+level j has the shape n1 x ... x nj, the states of z1 ... zj. `measure[j-1]` is the projected solid
+angle of z_j seen from z_{j-1} [sr], `f[j-1]` the scattering at z_{j-1} towards z_j [1/sr],
+`L0[j-1]` the direct luminance of z_j (0 < j < K-1), `L` and `b` luminance and second photon sum of
+level K-1. The camera path draws its direction with p = f / mu, mu the albedo. Weights are a
+dictionary: `w[l, i]`, an array of level l - 1.
 """
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from mis_integrators.weights import recursion
+
+import numpy as np
 
 
 @dataclass
@@ -41,23 +44,32 @@ class World:
         return np.where(self.L > 0, self.b / np.where(self.L > 0, self.L, 1), 0)
 
     def light(self, l):
-        """Luminance that ends the paths of family l: direct at z_{l-1}, or all of it for the last one."""
+        """Luminance that ends the paths of family l: direct at z_{l-1}, or all of it for the last
+        one."""
         return self.L if l == self.K else self.L0[l - 2]
 
 
 def load(entry):
     """The world and the known answers of one entry of optimal_weights.json."""
     arrays = {name: [np.array(a) for a in entry[name]] for name in ("measure", "f", "L0")}
-    world = World(entry["K"], entry["N_B"], entry["n_F"], **arrays, L=np.array(entry["L"]), b=np.array(entry["b"]))
+    world = World(
+        entry["K"],
+        entry["N_B"],
+        entry["n_F"],
+        **arrays,
+        L=np.array(entry["L"]),
+        b=np.array(entry["b"]),
+    )
     weights = {(int(name[1]), int(name[2])): np.array(a) for name, a in entry["weights"].items()}
     return world, weights, entry["J_optimal"], entry["J_single"]
 
 
 def random_world(seed, K, states=None, n_F=None, N_B=None, spread=1.2, zeros=0.0):
-    """`spread`: standard deviation of the logarithms of f and L; `zeros`: share of L0 and L that is zero."""
+    """`spread`: standard deviation of the logarithms of f and L; `zeros`: share of L0 and L that is
+    zero."""
     rng = np.random.default_rng(seed)
     states = states or rng.integers(2, max(2, 7 - K), size=K - 1, endpoint=True)
-    shapes = [tuple(states[:j + 1]) for j in range(K - 1)]
+    shapes = [tuple(states[: j + 1]) for j in range(K - 1)]
 
     def positive(shape, scale=1.0):
         return scale * np.exp(spread * rng.standard_normal(shape))
@@ -67,25 +79,44 @@ def random_world(seed, K, states=None, n_F=None, N_B=None, spread=1.2, zeros=0.0
 
     f = [positive(s) for s in shapes]
     measure = [rng.uniform(0.2, 1, s) for s in shapes]
-    for j in range(K - 1):     # albedos below one
-        f[j] *= (rng.uniform(0.2, 0.9, shapes[j][:-1]) / np.sum(f[j] * measure[j], axis=-1))[..., None]
+    for j in range(K - 1):  # albedos below one
+        f[j] *= (rng.uniform(0.2, 0.9, shapes[j][:-1]) / np.sum(f[j] * measure[j], axis=-1))[
+            ..., None
+        ]
     L = light(shapes[-1])
-    return World(K, int(rng.choice([1, 2, 4, 16])) if N_B is None else N_B, 10 ** rng.uniform(-1, 2) if n_F is None else n_F, measure, f,
-                 [light(s) for s in shapes[:-1]], L, L * positive(shapes[-1], 0.2))
+    return World(
+        K,
+        int(rng.choice([1, 2, 4, 16])) if N_B is None else N_B,
+        10 ** rng.uniform(-1, 2) if n_F is None else n_F,
+        measure,
+        f,
+        [light(s) for s in shapes[:-1]],
+        L,
+        L * positive(shapes[-1], 0.2),
+    )
 
 
 # ---------------------------------------------------------------- noise, and its minimum by brute force
 
-def residuals(world, weights):
-    """Terms whose sum of squares is the weight-dependent noise J, times N_B (Ershov, Kopylov and Voloboy 2021); linear in the weights.
 
-    The merging strategies' kernel costs (1/n_F) w^2 kappa_i rho_l, kappa_0 = N_B f_0, kappa_i = T_i f_i, at the last vertex T b/L; and the
-    camera path's variance, P (X - <X>)^2 with X = sum of T_i times what is gathered at z_i, averaged over light paths.
+def residuals(world, weights):
+    """Terms whose sum of squares is the weight-dependent noise J, times N_B (Ershov, Kopylov and
+    Voloboy 2021); linear in the weights.
+
+    The merging strategies' kernel costs (1/n_F) w^2 kappa_i rho_l, kappa_0 = N_B f_0, kappa_i = T_i
+    f_i, at the last vertex T b/L; and the camera path's variance, P (X - <X>)^2 with X = sum of T_i
+    times what is gathered at z_i, averaged over light paths.
     """
     K, measure, f = world.K, world.measure, world.f
-    throughput, chance, flux = [np.array(1.0)], [np.array(1.0)], [np.array(1.0)]   # per level: T, P, f_0 ... f_j dmu_1 ... dmu_{j+1}
+    throughput, chance, flux = (
+        [np.array(1.0)],
+        [np.array(1.0)],
+        [np.array(1.0)],
+    )  # per level: T, P, f_0 ... f_j dmu_1 ... dmu_{j+1}
     for j in range(K - 1):
-        throughput.append(throughput[j][..., None] * world.albedo(j)[..., None] * np.ones_like(f[j]))
+        throughput.append(
+            throughput[j][..., None] * world.albedo(j)[..., None] * np.ones_like(f[j])
+        )
         chance.append(chance[j][..., None] * world.p(j) * measure[j])
         flux.append(flux[j][..., None] * f[j] * measure[j])
 
@@ -103,7 +134,7 @@ def residuals(world, weights):
             carried = np.sum(carried * f[j] * measure[j], axis=-1)
         gathered[i] = gathered[i] + carried
     X = np.zeros(())
-    for j in range(1, K):      # what is gathered at z0 is the same for all camera paths
+    for j in range(1, K):  # what is gathered at z0 is the same for all camera paths
         X = X[..., None] + throughput[j] * gathered[j]
     mean = np.sum(chance[-1] * X)
     return np.concatenate([np.ravel(c) for c in [*costs, np.sqrt(chance[-1]) * (X - mean)]])
@@ -116,7 +147,10 @@ def noise(world, weights):
 
 def single(world, k):
     """Weights that gather everything at z_k, or at the last vertex of shorter families."""
-    return {(l, i): np.full(np.shape(world.light(l)), float(i == min(k, l - 1))) for l, i in world.families()}
+    return {
+        (l, i): np.full(np.shape(world.light(l)), float(i == min(k, l - 1)))
+        for l, i in world.families()
+    }
 
 
 def _unpack(world, x):
@@ -125,7 +159,7 @@ def _unpack(world, x):
     for l in range(2, world.K + 1):
         shape, rest = np.shape(world.light(l)), 1.0
         for i in range(1, l):
-            weights[l, i] = x[at:at + np.prod(shape)].reshape(shape)
+            weights[l, i] = x[at : at + np.prod(shape)].reshape(shape)
             at += np.prod(shape)
             rest = rest - weights[l, i]
         weights[l, 0] = rest
@@ -144,16 +178,20 @@ def perturbed(world, weights, change):
 
 
 def brute_force(world):
-    """The weights of least noise, by dense least squares over all free weights (least norm where nothing depends on a weight)."""
+    """The weights of least noise, by dense least squares over all free weights (least norm where
+    nothing depends on a weight)."""
     constant = residuals(world, _unpack(world, np.zeros(free(world))))
-    matrix = np.stack([residuals(world, _unpack(world, x)) - constant for x in np.eye(free(world))], axis=1)
-    size = np.linalg.norm(matrix, axis=0)      # columns of equal size: best conditioning
+    matrix = np.stack(
+        [residuals(world, _unpack(world, x)) - constant for x in np.eye(free(world))], axis=1
+    )
+    size = np.linalg.norm(matrix, axis=0)  # columns of equal size: best conditioning
     size[size == 0] = 1
     x, *_ = np.linalg.lstsq(matrix / size, -constant, rcond=1e-14)
     return _unpack(world, x / size)
 
 
 # ---------------------------------------------------------------- the recursion on a world
+
 
 def on_numpy(function, *arguments):
     return function(*arguments)
@@ -162,18 +200,22 @@ def on_numpy(function, *arguments):
 def on_drjit(function, *arguments):
     """The same function on flat Dr.Jit arrays of the active variant."""
     import mitsuba as mi
+
     arrays = np.broadcast_arrays(*arguments)
     return np.array(function(*[mi.Float(np.ravel(a)) for a in arrays])).reshape(arrays[0].shape)
 
 
 def recurse(world, local=False, dtype=np.float64, call=on_numpy, estimate=lambda x: x):
-    """Weights by `recursion`, its integrals as sums over the world's states, each passed through `estimate`; and e_1 ... e_{K-1}.
+    """Weights by `recursion`, its integrals as sums over the world's states, each passed through
+    `estimate`; and e_1 ... e_{K-1}.
 
     `local` leaves the integrals out; `call` applies an elementwise function.
     """
     K = world.K
-    measure, f, p, L0 = ([np.asarray(a, dtype) for a in arrays] for arrays in
-                         (world.measure, world.f, [world.p(j) for j in range(K - 1)], world.L0))
+    measure, f, p, L0 = (
+        [np.asarray(a, dtype) for a in arrays]
+        for arrays in (world.measure, world.f, [world.p(j) for j in range(K - 1)], world.L0)
+    )
     L, c, n, N_B = (np.asarray(a, dtype) for a in (world.L, world.c(), world.n_F, world.N_B))
 
     def integral(j, x):
@@ -195,15 +237,32 @@ def recurse(world, local=False, dtype=np.float64, call=on_numpy, estimate=lambda
             gamma = call(recursion.deepest_response, n, L, c, r[i])
         else:
             first, second = (average(i, onward[i] ** power * eta[i + 1]) for power in (1, 2))
-            tau[i] = np.zeros_like(r[i]) if local else call(recursion.carry, first, average(i, e[i + 1]))
-            gamma = call(recursion.inner_response, n, L0[i - 1], r[i], integral(i, onward[i] * luminance), second, first, tau[i])
+            tau[i] = (
+                np.zeros_like(r[i]) if local else call(recursion.carry, first, average(i, e[i + 1]))
+            )
+            gamma = call(
+                recursion.inner_response,
+                n,
+                L0[i - 1],
+                r[i],
+                integral(i, onward[i] * luminance),
+                second,
+                first,
+                tau[i],
+            )
             luminance = L0[i - 1] + integral(i, f[i] * luminance)
         e[i], eta[i] = call(recursion.remainder, gamma), call(recursion.response, gamma)
 
-    offset = np.asarray(0, dtype) if local else call(recursion.root_offset, average(0, f[0] * eta[1]), average(0, e[1]))
+    offset = (
+        np.asarray(0, dtype)
+        if local
+        else call(recursion.root_offset, average(0, f[0] * eta[1]), average(0, e[1]))
+    )
     drive = [None, call(recursion.bounded_drive, call(recursion.first_drive, offset, f[0]), r[1])]
     for i in range(1, K - 1):
-        raw = call(recursion.next_drive, drive[i][..., None], e[i][..., None], tau[i][..., None], onward[i])
+        raw = call(
+            recursion.next_drive, drive[i][..., None], e[i][..., None], tau[i][..., None], onward[i]
+        )
         drive.append(call(recursion.bounded_drive, raw, r[i + 1]))
 
     weights = {}
@@ -215,7 +274,13 @@ def recurse(world, local=False, dtype=np.float64, call=on_numpy, estimate=lambda
         weights[l, l - 1] = deeper = w
         for i in range(l - 2, 0, -1):
             at = (...,) + (None,) * (l - 2 - i)
-            w = call(recursion.inner_weight, drive[i][(*at, None)], e[i][(*at, None)], theta[i][at], deeper)
+            w = call(
+                recursion.inner_weight,
+                drive[i][(*at, None)],
+                e[i][(*at, None)],
+                theta[i][at],
+                deeper,
+            )
             weights[l, i], deeper = w, deeper + w
         weights[l, 0] = 1 - deeper
     return weights, e[1:]

@@ -1,22 +1,26 @@
-"""Optimal weights of two merging strategies, the closed form: for comparison, renders use `recursion`.
+"""Optimal weights of two merging strategies, the closed form: for comparison, renders use
+`recursion`.
 
-Source: Ershov and Voloboy, Calculation of MIS weights for bidirectional path tracing with photon maps in presence of direct illumination,
-Mathematica Montisnigri 48 (2020), doi 10.20948/mathmontis-2020-48-8 ("MIS-2").
+Source: Ershov and Voloboy, Calculation of MIS weights for bidirectional path tracing with photon
+maps in presence of direct illumination, Mathematica Montisnigri 48 (2020), doi
+10.20948/mathmontis-2020-48-8 ("MIS-2").
 
-Photons merge at y_M with the weight w0 or at y_{M+1} with the weight w1, functions of the direction y_M -> y_{M+1}. Direct light always
-has the weight one. Arrays of one shape, one element a direction, NumPy or Dr.Jit:
+Photons merge at y_M with the weight w0 or at y_{M+1} with the weight w1, functions of the direction
+y_M -> y_{M+1}. Direct light always has the weight one. Arrays of one shape, one element a
+direction, NumPy or Dr.Jit:
 
     f, p   BSDF value (no cosine) and camera path's density of the direction at y_M, per projected solid angle [1/sr]
     L      luminance of y_{M+1} towards y_M, indirect light included [W/(m^2 sr)]; positive
     b      integral of f^2 over the indirect radiance incident at y_{M+1} [W/(m^2 sr^2)]
     n      photons per unit of irradiance: merge area times light sub-paths over the light's flux [m^2/W]
 
-Integrals over the directions, projected solid angle, are arguments: `weights` takes the caller's quadrature.
+Integrals over the directions, projected solid angle, are arguments: `weights` takes the caller's
+quadrature.
 """
 
 from __future__ import annotations
 
-from typing import Callable
+from collections.abc import Callable
 
 from mis_integrators.weights import Array
 
@@ -51,11 +55,26 @@ def deeper_weight(W1: Array, p: Array, f: Array, alpha: Array, A2: Array, nB2: A
     return W1 + p / f * A2 / (alpha * (1 - nB2))
 
 
-def weights(f: Array, p: Array, L: Array, b: Array, n: Array, integrate: Callable[[Array], Array], camera_paths: int = 1,
-            M: int = 0) -> tuple[Array, Array]:
+def weights(
+    f: Array,
+    p: Array,
+    L: Array,
+    b: Array,
+    n: Array,
+    integrate: Callable[[Array], Array],
+    camera_paths: int = 1,
+    M: int = 0,
+) -> tuple[Array, Array]:
     """(w0, w1); `integrate`: the sum of an array with the directions' quadrature weights dmu."""
     g = shared_density(p, camera_paths, M)
     alpha = denominator(g, n, b, L)
     W1 = local_weight(g, n, alpha)
-    w1 = deeper_weight(W1, p, f, alpha, integrate(light_integrand(W1, f, L)), integrate(loss_integrand(p, L, alpha)))
+    w1 = deeper_weight(
+        W1,
+        p,
+        f,
+        alpha,
+        integrate(light_integrand(W1, f, L)),
+        integrate(loss_integrand(p, L, alpha)),
+    )
     return 1 - w1, w1

@@ -1,17 +1,23 @@
-"""Parts of the transport: the photon map against brute force, packing, and the densities that sampling claims to have."""
+"""Parts of the transport: the photon map against brute force, packing, and the densities that
+sampling claims to have."""
+
+from mis_integrators.core import packing
+from mis_integrators.core.random import mix, next_2d, streams
+from mis_integrators.lights.environment_guide import (
+    EnvironmentGuide,
+    cell_direction,
+    direction_cell,
+)
+from mis_integrators.lights.lights import Lights, _mean_power, mis_power
+from mis_integrators.photons import grid as photon_map
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from hypothesis import given, settings, strategies as st
-
 from comparing import assert_frequencies, kernels_of
-from mis_integrators.core import packing
-from mis_integrators.photons import grid as photon_map
-from mis_integrators.lights.environment_guide import EnvironmentGuide, cell_direction, direction_cell
-from mis_integrators.lights.lights import Lights, _mean_power, mis_power
-from mis_integrators.core.random import mix, next_2d, streams
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from worlds import EMITTERS, T, bitmap, diffuse, film, look, tray
 
 
@@ -24,19 +30,26 @@ def _rgb(rgb):
 
 
 def test_kernels_do_not_know_where_numpy_keeps_numbers():
-    """Arrays that begin at other addresses, modulo the alignment that vector loads want, are read by one kernel."""
+    """Arrays that begin at other addresses, modulo the alignment that vector loads want, are read
+    by one kernel."""
     numbers, kernels = np.arange(1000, dtype=np.float32), set()
     for offset in range(16):
-        array = packing.from_numpy(mi.Float, numbers[offset:offset + 400])
+        array = packing.from_numpy(mi.Float, numbers[offset : offset + 400])
         records = dr.gather(mi.Vector4f, array, dr.arange(mi.UInt32, 100)) + 1
         kernels |= kernels_of(lambda: dr.eval(records))
-        np.testing.assert_array_equal(packing.to_numpy(records).T.ravel(), numbers[offset:offset + 400] + 1)
+        np.testing.assert_array_equal(
+            packing.to_numpy(records).T.ravel(), numbers[offset : offset + 400] + 1
+        )
     assert len(kernels) == 1
 
 
 def query_counts(photons, queries, radii, cell, capacity=None, low=None, high=None):
-    """Photons that the map finds within the radius of each query: their number, and the sum of their (fake) powers."""
-    photons, queries = np.asarray(photons, np.float32).reshape(-1, 3), np.asarray(queries, np.float32).reshape(-1, 3)
+    """Photons that the map finds within the radius of each query: their number, and the sum of
+    their (fake) powers."""
+    photons, queries = (
+        np.asarray(photons, np.float32).reshape(-1, 3),
+        np.asarray(queries, np.float32).reshape(-1, 3),
+    )
     n = len(photons)
     capacity = capacity or max(n, 1)
     words = np.zeros((capacity, 4), np.uint32)
@@ -44,10 +57,19 @@ def query_counts(photons, queries, radii, cell, capacity=None, low=None, high=No
     power = np.zeros((capacity, 4), np.float32)
     power[:n, 0] = np.arange(1, n + 1)
     everything = np.concatenate([photons, queries])
-    box = mi.ScalarBoundingBox3f([float(x) for x in (everything.min(axis=0) if low is None else low)],
-                                 [float(x) for x in (everything.max(axis=0) if high is None else high)])
-    built = photon_map.build_photon_map(mi.UInt32(words.ravel()), mi.UInt32(power.view(np.uint32).ravel()), mi.UInt32([n]), box,
-                                        mi.Float(max(cell, photon_map.smallest_cell(box, capacity))), capacity, "all")
+    box = mi.ScalarBoundingBox3f(
+        [float(x) for x in (everything.min(axis=0) if low is None else low)],
+        [float(x) for x in (everything.max(axis=0) if high is None else high)],
+    )
+    built = photon_map.build_photon_map(
+        mi.UInt32(words.ravel()),
+        mi.UInt32(power.view(np.uint32).ravel()),
+        mi.UInt32([n]),
+        box,
+        mi.Float(max(cell, photon_map.smallest_cell(box, capacity))),
+        capacity,
+        "all",
+    )
 
     def visit(index, record, offset, distance_squared, hit, state):
         number, total = state
@@ -55,14 +77,25 @@ def query_counts(photons, queries, radii, cell, capacity=None, low=None, high=No
         return number + dr.select(hit, mi.UInt32(1), 0), total + dr.select(hit, flux[0], 0)
 
     m = len(queries)
-    number, total = photon_map.for_each_photon(built, mi.Point3f(queries.T.copy()), mi.Float(radii), mi.Bool(True), visit,
-                                               (dr.zeros(mi.UInt32, m), dr.zeros(mi.Float, m)))
+    number, total = photon_map.for_each_photon(
+        built,
+        mi.Point3f(queries.T.copy()),
+        mi.Float(radii),
+        mi.Bool(True),
+        visit,
+        (dr.zeros(mi.UInt32, m), dr.zeros(mi.Float, m)),
+    )
     return np.array(number), np.array(total)
 
 
 def brute_force(photons, queries, radii):
-    photons, queries = np.asarray(photons, np.float32).reshape(-1, 3), np.asarray(queries, np.float32).reshape(-1, 3)
-    near = ((queries[:, None].astype(np.float64) - photons[None]) ** 2).sum(-1) < np.asarray(radii, np.float64).reshape(-1, 1) ** 2
+    photons, queries = (
+        np.asarray(photons, np.float32).reshape(-1, 3),
+        np.asarray(queries, np.float32).reshape(-1, 3),
+    )
+    near = ((queries[:, None].astype(np.float64) - photons[None]) ** 2).sum(-1) < np.asarray(
+        radii, np.float64
+    ).reshape(-1, 1) ** 2
     return near.sum(axis=1), near @ np.arange(1.0, len(photons) + 1)
 
 
@@ -85,7 +118,9 @@ def test_map_finds_what_brute_force_finds(n, m):
 @pytest.mark.parametrize("offset", [-1000, -1, 0, 50])
 def test_map_away_from_the_origin(offset):
     rng = np.random.default_rng(1)
-    photons, queries = (np.round(rng.uniform(0, 2, (500, 3)) * 512) / 512 + offset for _ in range(2))
+    photons, queries = (
+        np.round(rng.uniform(0, 2, (500, 3)) * 512) / 512 + offset for _ in range(2)
+    )
     assert_map_is_right(photons, queries, 0.2, 0.2)
 
 
@@ -118,20 +153,31 @@ def test_radius_and_cell_need_not_match(cell, radius):
 
 
 def test_empty_map():
-    number, total = query_counts(np.zeros((0, 3)), np.zeros((5, 3)), 0.5, 0.5, capacity=16, low=(-1, -1, -1), high=(1, 1, 1))
+    number, total = query_counts(
+        np.zeros((0, 3)), np.zeros((5, 3)), 0.5, 0.5, capacity=16, low=(-1, -1, -1), high=(1, 1, 1)
+    )
     assert not number.any() and not total.any()
 
 
 def test_all_photons_in_one_cell():
     rng = np.random.default_rng(4)
     photons = rng.uniform(0.4, 0.41, (2000, 3))
-    assert_map_is_right(photons, [[0.405] * 3, [0.0] * 3, [0.45] * 3], [0.004, 0.1, 0.1], 0.1, low=(-1, -1, -1), high=(1, 1, 1))
+    assert_map_is_right(
+        photons,
+        [[0.405] * 3, [0.0] * 3, [0.45] * 3],
+        [0.004, 0.1, 0.1],
+        0.1,
+        low=(-1, -1, -1),
+        high=(1, 1, 1),
+    )
 
 
 def test_queries_outside_the_box():
     rng = np.random.default_rng(5)
     photons = rng.uniform(-1, 1, (3000, 3))
-    assert_map_is_right(photons, rng.uniform(-1.3, 1.3, (600, 3)), 0.3, 0.3, low=(-1, -1, -1), high=(1, 1, 1))
+    assert_map_is_right(
+        photons, rng.uniform(-1.3, 1.3, (600, 3)), 0.3, 0.3, low=(-1, -1, -1), high=(1, 1, 1)
+    )
 
 
 def test_collisions_in_a_tiny_table(monkeypatch):
@@ -147,16 +193,25 @@ def test_map_of_one_kind():
     n = 100
     caustic = np.arange(n) % 3 == 0
     words = np.zeros((n, 4), np.uint32)
-    words[:, 3] = np.array(packing.pack_surface(mi.Normal3f(0, 0, 1), dr.full(mi.UInt32, 2, n), mi.Bool(caustic)))
+    words[:, 3] = np.array(
+        packing.pack_surface(mi.Normal3f(0, 0, 1), dr.full(mi.UInt32, 2, n), mi.Bool(caustic))
+    )
     box = mi.ScalarBoundingBox3f([-1.0] * 3, [1.0] * 3)
     for kind, expected in (("all", n), ("caustic", caustic.sum()), ("indirect", n - caustic.sum())):
-        built = photon_map.build_photon_map(mi.UInt32(words.ravel()), dr.zeros(mi.UInt32, 4 * n), mi.UInt32([n]), box,
-                                            mi.Float(0.5), n, kind)
+        built = photon_map.build_photon_map(
+            mi.UInt32(words.ravel()),
+            dr.zeros(mi.UInt32, 4 * n),
+            mi.UInt32([n]),
+            box,
+            mi.Float(0.5),
+            n,
+            kind,
+        )
         assert int(built.start[dr.width(built.start) - 1]) == expected
 
 
 @settings(max_examples=25, deadline=None)
-@given(st.integers(0, 2 ** 32 - 1), st.integers(1, 300), st.floats(0.02, 1.5), st.floats(-20, 20))
+@given(st.integers(0, 2**32 - 1), st.integers(1, 300), st.floats(0.02, 1.5), st.floats(-20, 20))
 def test_map_finds_everything(seed, n, radius, offset):
     rng = np.random.default_rng(seed)
     photons, queries = rng.uniform(-1, 1, (2, n, 3)) * rng.uniform(0.1, 2, 3) + offset
@@ -169,8 +224,14 @@ def test_map_finds_everything(seed, n, radius, offset):
 
 # --- Packing ------------------------------------------------------------------------------------------------
 
-unit_vectors = st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda v: 0.01 < np.linalg.norm(v)).map(lambda v: v / np.linalg.norm(v))
-axes = st.sampled_from([np.roll(np.array([s, 0.0, 0.0]), k) for s in (1, -1, -0.0) for k in range(3)]).filter(np.any)
+unit_vectors = (
+    st.tuples(*[st.floats(-1, 1)] * 3)
+    .filter(lambda v: 0.01 < np.linalg.norm(v))
+    .map(lambda v: v / np.linalg.norm(v))
+)
+axes = st.sampled_from(
+    [np.roll(np.array([s, 0.0, 0.0]), k) for s in (1, -1, -0.0) for k in range(3)]
+).filter(np.any)
 
 
 def angle(a, b):
@@ -189,7 +250,9 @@ def test_direction_round_trip(v):
 @settings(max_examples=300, deadline=None)
 @given(unit_vectors | axes, st.integers(0, 2000), st.booleans())
 def test_surface_round_trip(v, depth, caustic):
-    word = packing.pack_surface(mi.Normal3f(*[float(x) for x in v]), mi.UInt32(depth), mi.Bool(caustic))
+    word = packing.pack_surface(
+        mi.Normal3f(*[float(x) for x in v]), mi.UInt32(depth), mi.Bool(caustic)
+    )
     assert angle(packing.unpack_normal(word), v) < 0.0025
     assert int(packing.unpack_depth(word)[0]) == min(depth, packing.MAX_DEPTH)
     assert bool(packing.unpack_caustic(word)[0]) == caustic
@@ -211,11 +274,18 @@ def test_streams_are_uniform_and_differ():
         assert_frequencies(np.histogram(u, 64, (0, 1))[0], np.full(64, len(u) / 64))
     for a, b in ((first, second), (first, other), (first[:-1], first[1:])):
         assert abs(np.corrcoef(a, b)[0, 1]) < 5 / np.sqrt(len(a))
-        assert_frequencies(np.histogram2d(a, b, 16, [(0, 1)] * 2)[0], np.full((16, 16), len(a) / 256))
+        assert_frequencies(
+            np.histogram2d(a, b, 16, [(0, 1)] * 2)[0], np.full((16, 16), len(a) / 256)
+        )
 
 
 def test_seeds_of_purposes_differ():
-    words = {mix(seed, iteration, purpose) for seed in range(20) for iteration in range(50) for purpose in range(3)}
+    words = {
+        mix(seed, iteration, purpose)
+        for seed in range(20)
+        for iteration in range(50)
+        for purpose in range(3)
+    }
     assert len(words) == 20 * 50 * 3
 
 
@@ -224,9 +294,15 @@ def test_seeds_of_purposes_differ():
 
 def emission(scene, count=1 << 18, seed=7):
     """Rays (origins, directions) and flux of `count` light sub-paths."""
-    guide = EnvironmentGuide(scene, scene.sensors()[0]) if any(e.flags() & mi.EmitterFlags.Infinite for e in scene.emitters()) else None
+    guide = (
+        EnvironmentGuide(scene, scene.sensors()[0])
+        if any(e.flags() & mi.EmitterFlags.Infinite for e in scene.emitters())
+        else None
+    )
     lights = Lights(scene, guide=guide)
-    ray, flux, *_ = lights.sample_emission(streams(dr.arange(mi.UInt32, count), mi.UInt32(seed)), mi.Float(0), [])
+    ray, flux, *_ = lights.sample_emission(
+        streams(dr.arange(mi.UInt32, count), mi.UInt32(seed)), mi.Float(0), []
+    )
     grey = np.array(dr.mean(flux) + dr.zeros(mi.Float, count))
     return lights, ray, grey
 
@@ -236,11 +312,17 @@ def mean_and_error(x):
 
 
 def flux_through_floor(scene, half):
-    """Estimated flux that arrives directly on the square |x|, |y| < half of the plane z = 0, and its standard error."""
+    """Estimated flux that arrives directly on the square |x|, |y| < half of the plane z = 0, and
+    its standard error."""
     _, ray, flux = emission(scene, 1 << 19)
     si = scene.ray_intersect(ray)
     p = np.array(si.p)
-    arrives = np.array(si.is_valid()) & (np.abs(p[:2]) < half).all(axis=0) & (np.abs(p[2]) < 1e-3) & (np.array(ray.d)[2] < 0)
+    arrives = (
+        np.array(si.is_valid())
+        & (np.abs(p[:2]) < half).all(axis=0)
+        & (np.abs(p[2]) < 1e-3)
+        & (np.array(ray.d)[2] < 0)
+    )
     return mean_and_error(np.where(arrives, flux, 0))
 
 
@@ -253,20 +335,33 @@ def irradiance_of_floor(scene, half, samples=1 << 18):
     si.sh_frame, si.t = mi.Frame3f(si.n), 1.0
     total, error2 = 0.0, 0.0
     for emitter in scene.emitters():
-        ds, weight = emitter.sample_direction(si, mi.Point2f(*[mi.Float(u) for u in rng.random((2, samples)).astype(np.float32)]))
+        ds, weight = emitter.sample_direction(
+            si, mi.Point2f(*[mi.Float(u) for u in rng.random((2, samples)).astype(np.float32)])
+        )
         lit = (ds.pdf > 0) & ~scene.ray_test(si.spawn_ray_to(ds.p))
-        value = np.array(dr.select(lit, dr.mean(weight) * dr.maximum(ds.d.z, 0), 0) + dr.zeros(mi.Float, samples))
+        value = np.array(
+            dr.select(lit, dr.mean(weight) * dr.maximum(ds.d.z, 0), 0) + dr.zeros(mi.Float, samples)
+        )
         mean, error = mean_and_error(value * (2 * half) ** 2)
-        total, error2 = total + mean, error2 + error ** 2
+        total, error2 = total + mean, error2 + error**2
     return total, np.sqrt(error2)
 
 
 @pytest.mark.parametrize("emitter", [e for e in EMITTERS if e != "directionalarea"])
 def test_flux_through_known_area(emitter):
-    """Light sub-paths bring the flux that Mitsuba's next-event estimation measures (5.3 standard errors: 1e-7; an error of 12 % is seen)."""
-    scene = {"type": "scene", "floor": {"type": "rectangle", "to_world": T().scale(4), "bsdf": diffuse(0.5)},
-             "sensor": {"type": "perspective", "to_world": look((0, -1.5, 6), (0, 0, 0)), "fov": 30, "film": film(32)},
-             **EMITTERS[emitter]("lambertian")}
+    """Light sub-paths bring the flux that Mitsuba's next-event estimation measures (5.3 standard
+    errors: 1e-7; an error of 12 % is seen)."""
+    scene = {
+        "type": "scene",
+        "floor": {"type": "rectangle", "to_world": T().scale(4), "bsdf": diffuse(0.5)},
+        "sensor": {
+            "type": "perspective",
+            "to_world": look((0, -1.5, 6), (0, 0, 0)),
+            "fov": 30,
+            "film": film(32),
+        },
+        **EMITTERS[emitter]("lambertian"),
+    }
     scene = mi.load_dict(scene)
     a, error_a = flux_through_floor(scene, 1.5)
     b, error_b = irradiance_of_floor(scene, 1.5)
@@ -280,7 +375,16 @@ def test_flux_through_known_area(emitter):
 def test_area_lights_emit_outwards_like_cosine(shape, rotation):
     """Power pi A L; no sub-path starts into its own (convex) shape; the cosine's mean is 2/3."""
     to_world = T().rotate(*rotation) if rotation else T()
-    scene = mi.load_dict({"type": "scene", "lamp": {"type": shape, "to_world": to_world, "emitter": {"type": "area", "radiance": 3.0}}})
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "lamp": {
+                "type": shape,
+                "to_world": to_world,
+                "emitter": {"type": "area", "radiance": 3.0},
+            },
+        }
+    )
     lights, ray, flux = emission(scene, 1 << 16)
     area = float(scene.shapes()[0].surface_area()[0])
     np.testing.assert_allclose(flux, np.pi * 3 * area, rtol=1e-4)
@@ -289,21 +393,33 @@ def test_area_lights_emit_outwards_like_cosine(shape, rotation):
     assert np.array(back.is_valid()).mean() > 0.999
     cosine = np.array(dr.dot(back.n, ray.d))
     assert cosine.mean() == pytest.approx(2 / 3, abs=5 * 0.24 / 256)
-    assert_frequencies(np.histogram(np.clip(cosine, 0, 1) ** 2, 32, (0, 1))[0], np.full(32, (1 << 16) / 32))
+    assert_frequencies(
+        np.histogram(np.clip(cosine, 0, 1) ** 2, 32, (0, 1))[0], np.full(32, (1 << 16) / 32)
+    )
 
 
 def test_point_light_directions():
-    _, ray, flux = emission(mi.load_dict({"type": "scene", "p": {"type": "point", "intensity": 2.0}}), 1 << 16)
+    _, ray, flux = emission(
+        mi.load_dict({"type": "scene", "p": {"type": "point", "intensity": 2.0}}), 1 << 16
+    )
     np.testing.assert_allclose(flux, 8 * np.pi, rtol=1e-5)
     d = np.array(ray.d)
-    assert_frequencies(np.histogram2d(d[2], np.arctan2(d[1], d[0]), 16, [(-1, 1), (-np.pi, np.pi)])[0],
-                       np.full((16, 16), (1 << 16) / 256))
+    assert_frequencies(
+        np.histogram2d(d[2], np.arctan2(d[1], d[0]), 16, [(-1, 1), (-np.pi, np.pi)])[0],
+        np.full((16, 16), (1 << 16) / 256),
+    )
 
 
 def test_power_decides_among_emitters():
-    """The choice is by power with a tenth shared evenly; the flux's mean is the sum of the powers."""
-    scene = mi.load_dict({"type": "scene", "a": {"type": "point", "intensity": 1.0, "position": [0, 0, 0]},
-                          "b": {"type": "point", "intensity": 3.0, "position": [5, 0, 0]}})
+    """The choice is by power with a tenth shared evenly; the flux's mean is the sum of the
+    powers."""
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "a": {"type": "point", "intensity": 1.0, "position": [0, 0, 0]},
+            "b": {"type": "point", "intensity": 3.0, "position": [5, 0, 0]},
+        }
+    )
     lights, ray, flux = emission(scene)
     chosen = np.array(ray.o)[0] > 2
     order = [0 if "5, 0, 0" in str(e) else 1 for e in scene.emitters()]
@@ -315,38 +431,61 @@ def test_power_decides_among_emitters():
 
 
 def test_small_spots_of_light_are_not_taken_for_darkness():
-    """A lamp of one bright texel on a rotated sphere, where Mitsuba's light rays do not meet it: its flux is the texel's all the same, and beside
-    other lamps it has its even share of the choices."""
+    """A lamp of one bright texel on a rotated sphere, where Mitsuba's light rays do not meet it:
+    its flux is the texel's all the same, and beside other lamps it has its even share of the
+    choices."""
     texels = np.zeros((256, 256, 3), np.float32)
     texels[131, 28] = 1e5
-    lamp = {"type": "sphere", "to_world": look((1, 2, 3), (0, 1, 0)), "emitter": {"type": "area", "radiance": bitmap(texels, filter_type="nearest")}}
+    lamp = {
+        "type": "sphere",
+        "to_world": look((1, 2, 3), (0, 1, 0)),
+        "emitter": {"type": "area", "radiance": bitmap(texels, filter_type="nearest")},
+    }
     scene = mi.load_dict({"type": "scene", "lamp": lamp})
     emitter = scene.emitters()[0]
     assert _mean_power(emitter) == 0, "test too weak"
     lights, ray, flux = emission(scene, 1 << 21)
     assert not lights.dark
     mean, error = mean_and_error(flux)
-    everywhere = mi.warp.square_to_uniform_sphere(next_2d(streams(dr.arange(mi.UInt32, 1 << 22), mi.UInt32(3))))
+    everywhere = mi.warp.square_to_uniform_sphere(
+        next_2d(streams(dr.arange(mi.UInt32, 1 << 22), mi.UInt32(3)))
+    )
     si = scene.ray_intersect(mi.Ray3f(mi.Point3f(1, 2, 3), everywhere))
     si.wi = mi.Vector3f(0, 0, 1)
     radiance, radiance_error = mean_and_error(np.array(dr.mean(emitter.eval(si))))
-    power, power_error = 4 * np.pi ** 2 * radiance, 4 * np.pi ** 2 * radiance_error
+    power, power_error = 4 * np.pi**2 * radiance, 4 * np.pi**2 * radiance_error
     assert abs(mean - power) < 5 * np.hypot(error, power_error)
     assert 5 * np.hypot(error, power_error) < mean, "test too weak"
-    both = Lights(mi.load_dict({"type": "scene", "lamp": lamp, "other": {"type": "point", "intensity": 3.0}}))
+    both = Lights(
+        mi.load_dict({"type": "scene", "lamp": lamp, "other": {"type": "point", "intensity": 3.0}})
+    )
     assert both.choice.pmf.min() == pytest.approx(0.05, rel=1e-3)
 
 
 def test_spectral_suns_are_chosen_by_their_light():
-    """A sun and a sky: the choice between them is the same in rgb and in spectral variants (looked at without wavelengths, the sun is dark)."""
+    """A sun and a sky: the choice between them is the same in rgb and in spectral variants (looked
+    at without wavelengths, the sun is dark)."""
     chosen = []
     for variant_name in ("llvm_ad_rgb", "llvm_ad_spectral"):
         mi.set_variant(variant_name)
-        scene = mi.load_dict({
-            "type": "scene", "floor": {"type": "rectangle", "to_world": T().scale(3), "bsdf": diffuse(0.5)},
-            "sun": {"type": "directional", "direction": [0.3, 0.2, -1], "irradiance": {"type": "rgb", "value": 5.0}},
-            "sky": {"type": "constant", "radiance": {"type": "rgb", "value": 0.2}},
-            "sensor": {"type": "perspective", "to_world": look((0, -1.5, 6), (0, 0, 0)), "fov": 30, "film": film(16)}})
+        scene = mi.load_dict(
+            {
+                "type": "scene",
+                "floor": {"type": "rectangle", "to_world": T().scale(3), "bsdf": diffuse(0.5)},
+                "sun": {
+                    "type": "directional",
+                    "direction": [0.3, 0.2, -1],
+                    "irradiance": {"type": "rgb", "value": 5.0},
+                },
+                "sky": {"type": "constant", "radiance": {"type": "rgb", "value": 0.2}},
+                "sensor": {
+                    "type": "perspective",
+                    "to_world": look((0, -1.5, 6), (0, 0, 0)),
+                    "fov": 30,
+                    "film": film(16),
+                },
+            }
+        )
         lights = Lights.seen_by(scene, scene.sensors()[0], "bdpm")
         chosen.append(lights.choice.pmf[lights.kinds.index("directional")])
     assert chosen[1] == pytest.approx(chosen[0], rel=0.1)
@@ -355,19 +494,56 @@ def test_spectral_suns_are_chosen_by_their_light():
 # --- Direct light ---------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("emitter", ["rectangle", "sphere", "disk", "cylinder", "cube", "textured", "constant", "envmap",
-                                     "envmap rotated", "sunsky", "several"])
+@pytest.mark.parametrize(
+    "emitter",
+    [
+        "rectangle",
+        "sphere",
+        "disk",
+        "cylinder",
+        "cube",
+        "textured",
+        "constant",
+        "envmap",
+        "envmap rotated",
+        "sunsky",
+        "several",
+    ],
+)
 def test_density_of_direct_light(emitter):
-    """The density that `sample_direct` states is the one that `pdf_direct` gives for the same direction, and is that of the samples (5.3 standard
-    errors: 1e-7; an error of 5 % is seen with a probability of 0.95)."""
-    scene = mi.load_dict({"type": "scene", "floor": {"type": "rectangle", "to_world": T().scale([0.01, 0.01, 1]), "bsdf": diffuse()},
-                          "sensor": {"type": "perspective", "to_world": look((0, 0, 5), (0, 0, 0)), "film": film(16)},
-                          **EMITTERS[emitter]("delta")})
-    guide = EnvironmentGuide(scene, scene.sensors()[0]) if emitter in ("constant", "envmap", "envmap rotated", "sunsky", "several") else None
+    """The density that `sample_direct` states is the one that `pdf_direct` gives for the same
+    direction, and is that of the samples (5.3 standard errors: 1e-7; an error of 5 % is seen with a
+    probability of 0.95)."""
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "floor": {
+                "type": "rectangle",
+                "to_world": T().scale([0.01, 0.01, 1]),
+                "bsdf": diffuse(),
+            },
+            "sensor": {
+                "type": "perspective",
+                "to_world": look((0, 0, 5), (0, 0, 0)),
+                "film": film(16),
+            },
+            **EMITTERS[emitter]("delta"),
+        }
+    )
+    guide = (
+        EnvironmentGuide(scene, scene.sensors()[0])
+        if emitter in ("constant", "envmap", "envmap rotated", "sunsky", "several")
+        else None
+    )
     lights = Lights(scene, guide=guide)
     n = 1 << 20
     si = dr.zeros(mi.SurfaceInteraction3f, n)
-    si.p, si.n, si.sh_frame, si.t = mi.Point3f(0.1, 0.2, 0.3), mi.Normal3f(0, 0, 1), mi.Frame3f(mi.Normal3f(0, 0, 1)), 1.0
+    si.p, si.n, si.sh_frame, si.t = (
+        mi.Point3f(0.1, 0.2, 0.3),
+        mi.Normal3f(0, 0, 1),
+        mi.Frame3f(mi.Normal3f(0, 0, 1)),
+        1.0,
+    )
     rng = streams(dr.arange(mi.UInt32, n), mi.UInt32(5))
     ds, weight, pdf = lights.sample_direct(si, rng, mi.Bool(True))
     valid = np.array((pdf > 0) & (dr.max(weight) > 0))
@@ -377,7 +553,9 @@ def test_density_of_direct_light(emitter):
     again = np.array(lights.pdf_direct(si, found, mi.Bool(True)))
     stated = np.array(pdf + dr.zeros(mi.Float, n))
     relative = np.abs(again - stated)[valid] / stated[valid]
-    assert np.quantile(relative, 0.9) < 0.02, np.quantile(relative, [0.5, 0.9, 0.98])       # grazing ones suffer from rounding
+    assert np.quantile(relative, 0.9) < 0.02, np.quantile(
+        relative, [0.5, 0.9, 0.98]
+    )  # grazing ones suffer from rounding
     # Radiance integrated with that density is radiance integrated with uniform directions.
     value, error = mean_and_error(np.array(dr.mean(weight) + dr.zeros(mi.Float, n)))
     d = mi.warp.square_to_uniform_sphere(next_2d(rng))
@@ -405,9 +583,15 @@ def test_weights_sum_to_one(a, b):
 def test_direction_cells():
     cell = dr.arange(mi.UInt32, 512)
     for u in ((0.01, 0.01), (0.5, 0.5), (0.99, 0.99)):
-        np.testing.assert_array_equal(np.array(direction_cell(cell_direction(cell, mi.Point2f(*u)))), np.arange(512))
-    d = mi.warp.square_to_uniform_sphere(next_2d(streams(dr.arange(mi.UInt32, 1 << 17), mi.UInt32(1))))
-    assert_frequencies(np.bincount(np.array(direction_cell(d)), minlength=512), np.full(512, (1 << 17) / 512))
+        np.testing.assert_array_equal(
+            np.array(direction_cell(cell_direction(cell, mi.Point2f(*u)))), np.arange(512)
+        )
+    d = mi.warp.square_to_uniform_sphere(
+        next_2d(streams(dr.arange(mi.UInt32, 1 << 17), mi.UInt32(1)))
+    )
+    assert_frequencies(
+        np.bincount(np.array(direction_cell(d)), minlength=512), np.full(512, (1 << 17) / 512)
+    )
 
 
 @pytest.mark.parametrize("emitter", ["constant", "envmap rotated", "sunsky"])
@@ -420,13 +604,16 @@ def test_environment_directions(emitter):
     rng = streams(dr.arange(mi.UInt32, n), mi.UInt32(3))
     it = dr.zeros(mi.Interaction3f, n)
     it.p = guide.center
-    towards, pdf, row, _ = guide.sample_direction(environment, mi.UInt32(0), it, next_2d(rng), rng.next_float32(), mi.Bool(True))
+    towards, pdf, row, _ = guide.sample_direction(
+        environment, mi.UInt32(0), it, next_2d(rng), rng.next_float32(), mi.Bool(True)
+    )
     inverse = np.array(dr.select(pdf > 0, dr.rcp(pdf), 0))
     cells = np.array(direction_cell(towards))
-    # The mean of 1/pdf over the samples of a cell is the cell's solid angle, where samples come at all.
+    # The mean of 1/pdf over the samples of a cell is the cell's solid angle, where samples come at
+    # all.
     per_cell = np.bincount(cells, weights=inverse, minlength=512) / n
-    square = np.bincount(cells, weights=inverse ** 2, minlength=512) / n
-    error = np.sqrt(np.maximum(square - per_cell ** 2, 0) / n)
+    square = np.bincount(cells, weights=inverse**2, minlength=512) / n
+    error = np.sqrt(np.maximum(square - per_cell**2, 0) / n)
     met = np.bincount(cells, minlength=512) > 200
     assert met.sum() > 100
     wrong = met & (np.abs(per_cell - 4 * np.pi / 512) > 5.5 * error + 0.02 * 4 * np.pi / 512)
@@ -451,57 +638,99 @@ def test_position_density(emitter):
         row = int(direction_cell(mi.Vector3f(*towards.tolist()))[0])
     direction = mi.Vector3f(*towards.tolist())
     rng = streams(dr.arange(mi.UInt32, n), mi.UInt32(4))
-    p, density = guide.sample_position(direction, mi.UInt32(row), next_2d(rng), next_2d(rng), rng.next_float32(), mi.Bool(True))
+    p, density = guide.sample_position(
+        direction, mi.UInt32(row), next_2d(rng), next_2d(rng), rng.next_float32(), mi.Bool(True)
+    )
     again = guide.position_density(direction, mi.UInt32(row), p)
     differ = np.abs(np.array(again / density + dr.zeros(mi.Float, n)) - 1) > 0.05
-    assert differ.mean() < 1e-4                                   # a point on a cell's border may fall to either side
+    assert differ.mean() < 1e-4  # a point on a cell's border may fall to either side
     frame = mi.Frame3f(direction)
     center = np.array(guide.center).ravel()
     offset = np.array(p).T - center
     s, t = (np.array(v).ravel() for v in (frame.s, frame.t))
-    side = 1.05 * max(guide.radius, float(np.linalg.norm(np.array(guide.focus_center).ravel() - center)) + 1.5 * guide.focus_radius)
+    side = 1.05 * max(
+        guide.radius,
+        float(np.linalg.norm(np.array(guide.focus_center).ravel() - center))
+        + 1.5 * guide.focus_radius,
+    )
     bins, fine = 24, 40
     observed = np.histogram2d(offset @ s, offset @ t, bins, [(-side, side)] * 2)[0]
     grid = (np.arange(bins * fine) + 0.5) / (bins * fine) * 2 * side - side
     u, v = np.meshgrid(grid, grid, indexing="ij")
     points = center[:, None] + s[:, None] * u.ravel() + t[:, None] * v.ravel()
-    values = np.array(guide.position_density(direction, mi.UInt32(row), mi.Point3f(points.astype(np.float32))))
+    values = np.array(
+        guide.position_density(direction, mi.UInt32(row), mi.Point3f(points.astype(np.float32)))
+    )
     cell = (2 * side / (bins * fine)) ** 2
     assert values.sum() * cell == pytest.approx(1, abs=0.01)
     expected = values.reshape(bins, fine, bins, fine).sum(axis=(1, 3)) * cell * n
     assert observed.sum() == n
     # The grid resolves the cells' borders to 1 in 40: counts may be off by that, besides chance.
-    assert (np.abs(observed - expected) < 5.5 * np.sqrt(expected + 1) + 0.06 * expected + 0.003 * n / bins).all()
+    assert (
+        np.abs(observed - expected)
+        < 5.5 * np.sqrt(expected + 1) + 0.06 * expected + 0.003 * n / bins
+    ).all()
 
 
 def room_with_window(sky={"type": "sunsky", "sun_direction": [0.8, 0.1, 0.5], "turbidity": 3.0}):
-    """A closed room of 6 x 4 x 3 with a window of 1 x 1 in one wall; the camera stands inside, the sky (a sun, unless told otherwise) looks in."""
+    """A closed room of 6 x 4 x 3 with a window of 1 x 1 in one wall; the camera stands inside, the
+    sky (a sun, unless told otherwise) looks in."""
     wall = {"type": "twosided", "bsdf": diffuse(0.7)}
 
     def slab(x0, x1, y0, y1, z0, z1):
-        center, half = [(x0 + x1) / 2, (y0 + y1) / 2, (z0 + z1) / 2], [(x1 - x0) / 2, (y1 - y0) / 2, (z1 - z0) / 2]
+        center, half = (
+            [(x0 + x1) / 2, (y0 + y1) / 2, (z0 + z1) / 2],
+            [(x1 - x0) / 2, (y1 - y0) / 2, (z1 - z0) / 2],
+        )
         return {"type": "cube", "to_world": T().translate(center).scale(half), "bsdf": wall}
 
     e = 0.05
-    return mi.load_dict({
-        "type": "scene", "floor": slab(0, 6, 0, 4, -e, 0), "ceiling": slab(0, 6, 0, 4, 3, 3 + e), "left": slab(-e, 0, 0, 4, 0, 3),
-        "front": slab(0, 6, -e, 0, 0, 3), "back": slab(0, 6, 4, 4 + e, 0, 3),
-        "below": slab(6, 6 + e, 0, 4, 0, 1), "above": slab(6, 6 + e, 0, 4, 2, 3), "one side": slab(6, 6 + e, 0, 1.5, 1, 2),
-        "other side": slab(6, 6 + e, 2.5, 4, 1, 2), "ground": {"type": "rectangle", "to_world": T().translate([3, 2, -0.1]).scale(30),
-                                                              "bsdf": diffuse(0.2)},
-        "sky": sky,
-        "sensor": {"type": "perspective", "fov": 70, "to_world": look((0.5, 0.5, 1.5), (5, 3, 1), (0, 0, 1)), "film": film(32)}})
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "floor": slab(0, 6, 0, 4, -e, 0),
+            "ceiling": slab(0, 6, 0, 4, 3, 3 + e),
+            "left": slab(-e, 0, 0, 4, 0, 3),
+            "front": slab(0, 6, -e, 0, 0, 3),
+            "back": slab(0, 6, 4, 4 + e, 0, 3),
+            "below": slab(6, 6 + e, 0, 4, 0, 1),
+            "above": slab(6, 6 + e, 0, 4, 2, 3),
+            "one side": slab(6, 6 + e, 0, 1.5, 1, 2),
+            "other side": slab(6, 6 + e, 2.5, 4, 1, 2),
+            "ground": {
+                "type": "rectangle",
+                "to_world": T().translate([3, 2, -0.1]).scale(30),
+                "bsdf": diffuse(0.2),
+            },
+            "sky": sky,
+            "sensor": {
+                "type": "perspective",
+                "fov": 70,
+                "to_world": look((0.5, 0.5, 1.5), (5, 3, 1), (0, 0, 1)),
+                "film": film(32),
+            },
+        }
+    )
 
 
 def inside_room(scene, ray):
     """Which light rays end in the room of `room_with_window`."""
     si = scene.ray_intersect(ray)
     p = np.array(si.p)
-    return np.array(si.is_valid()) & (p[0] > -1e-3) & (p[0] < 5.999) & (p[1] > -1e-3) & (p[1] < 4.001) & (p[2] > -1e-3) & (p[2] < 3.001)
+    return (
+        np.array(si.is_valid())
+        & (p[0] > -1e-3)
+        & (p[0] < 5.999)
+        & (p[1] > -1e-3)
+        & (p[1] < 4.001)
+        & (p[2] > -1e-3)
+        & (p[2] < 3.001)
+    )
 
 
 def test_sky_enters_by_the_window():
-    """At least 30 % of the light sub-paths of sun and sky enter a room by its one small window (1/300 of the scene's disk)."""
+    """At least 30 % of the light sub-paths of sun and sky enter a room by its one small window
+    (1/300 of the scene's disk)."""
     scene = room_with_window()
     _, ray, flux = emission(scene, 1 << 16)
     inside, sent = inside_room(scene, ray), np.array(flux) > 0
@@ -509,8 +738,9 @@ def test_sky_enters_by_the_window():
 
 
 def test_windows_are_known_from_all_directions():
-    """What an even sky sends through the window is spread over more sub-paths, counted as that many of equal flux, where the guide knows the faces by which
-    light enters than where it knows each direction by itself; and it is the same flux. (All random numbers are fixed.)"""
+    """What an even sky sends through the window is spread over more sub-paths, counted as that many
+    of equal flux, where the guide knows the faces by which light enters than where it knows each
+    direction by itself; and it is the same flux. (All random numbers are fixed.)"""
     scene = room_with_window({"type": "constant"})
     guide = EnvironmentGuide(scene, scene.sensors()[0])
     count, found = 1 << 18, []
@@ -519,33 +749,48 @@ def test_windows_are_known_from_all_directions():
             guided = np.array(guide._guided)
             guide._guided = mi.Float(np.where(guided > 0, guided + np.array(guide._entering), 0))
             guide.entrances = None
-        ray, flux, *_ = Lights(scene, guide=guide).sample_emission(streams(dr.arange(mi.UInt32, count), mi.UInt32(7)), mi.Float(0), [])
+        ray, flux, *_ = Lights(scene, guide=guide).sample_emission(
+            streams(dr.arange(mi.UInt32, count), mi.UInt32(7)), mi.Float(0), []
+        )
         entering = np.array(dr.mean(flux) + dr.zeros(mi.Float, count)) * inside_room(scene, ray)
-        found.append((entering.sum() ** 2 / np.sum(entering ** 2), *mean_and_error(entering)))
+        found.append((entering.sum() ** 2 / np.sum(entering**2), *mean_and_error(entering)))
     (even, mean, error), (uneven, other, other_error) = found
     assert even > 1.3 * uneven, (even, uneven)
     assert abs(mean - other) < 5.3 * np.hypot(error, other_error)
 
 
 def direct_light_of_floor(scene, lights, count=1 << 18):
-    """Direct light at places of the room's floor: irradiances by one sample each, their directions' densities as stated, and as `pdf_direct` has them."""
+    """Direct light at places of the room's floor: irradiances by one sample each, their directions'
+    densities as stated, and as `pdf_direct` has them."""
     rng = np.random.default_rng(1)
-    x, y = (mi.Float(v) for v in rng.uniform([[0.2], [0.2]], [[5.8], [3.8]], (2, count)).astype(np.float32))
+    x, y = (
+        mi.Float(v)
+        for v in rng.uniform([[0.2], [0.2]], [[5.8], [3.8]], (2, count)).astype(np.float32)
+    )
     ray = mi.Ray3f(mi.Point3f(x, y, 1), mi.Vector3f(0, 0, -1))
     si = scene.ray_intersect(ray)
-    ds, weight, pdf = lights.sample_direct(si, streams(dr.arange(mi.UInt32, count), mi.UInt32(2)), mi.Bool(True))
+    ds, weight, pdf = lights.sample_direct(
+        si, streams(dr.arange(mi.UInt32, count), mi.UInt32(2)), mi.Bool(True)
+    )
     lit = dr.max(weight) > 0
     found = mi.DirectionSample3f(scene, scene.ray_intersect(si.spawn_ray(ds.d), lit), si)
-    value = np.array(dr.select(lit, dr.mean(weight) * dr.maximum(ds.d.z, 0), 0) + dr.zeros(mi.Float, count))
+    value = np.array(
+        dr.select(lit, dr.mean(weight) * dr.maximum(ds.d.z, 0), 0) + dr.zeros(mi.Float, count)
+    )
     lit = np.array(lit)
     return value, np.array(pdf)[lit], np.array(lights.pdf_direct(si, found, mi.Bool(True)))[lit]
 
 
 @pytest.mark.parametrize("sky", ["constant", "sunsky"])
 def test_direct_light_is_looked_for_at_windows(sky):
-    """Next-event estimation in a room aims at the window: its mean is that of the sky's own sampler (5.3 standard errors: 1e-7; 10 % are seen) and its
-    variance a fraction of it; the density of each direction is what `pdf_direct` says. (All random numbers are fixed.)"""
-    scene = room_with_window({"type": "constant"} if sky == "constant" else {"type": "sunsky", "sun_direction": [-0.8, 0.1, 0.5], "turbidity": 3.0})
+    """Next-event estimation in a room aims at the window: its mean is that of the sky's own sampler
+    (5.3 standard errors: 1e-7; 10 % are seen) and its variance a fraction of it; the density of
+    each direction is what `pdf_direct` says. (All random numbers are fixed.)"""
+    scene = room_with_window(
+        {"type": "constant"}
+        if sky == "constant"
+        else {"type": "sunsky", "sun_direction": [-0.8, 0.1, 0.5], "turbidity": 3.0}
+    )
     guide = EnvironmentGuide(scene, scene.sensors()[0])
     assert guide.aims
     aimed, stated, again = direct_light_of_floor(scene, Lights(scene, guide=guide))

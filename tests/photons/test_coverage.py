@@ -1,4 +1,5 @@
-"""The covered share of merge disks, which corrects estimates near edges, against areas in closed form."""
+"""The covered share of merge disks, which corrects estimates near edges, against areas in closed
+form."""
 
 import drjit as dr
 import mitsuba as mi
@@ -9,7 +10,8 @@ from test_radius import FIVE_SIGMA, lost_share
 COUNT = 4096
 RADIUS = 0.1
 EDGES = [0.2, 0.4, 0.6, 0.8]
-"""Distances of edges, in radii. Between 0.5 and 0.7 probes may end before they meet one: 0.002 are allowed."""
+"""Distances of edges, in radii. Between 0.5 and 0.7 probes may end before they meet one: 0.002 are
+allowed."""
 
 
 def scene_with(**shapes):
@@ -18,12 +20,23 @@ def scene_with(**shapes):
 
 
 def share_at(scene, x, height=0.5):
-    """Covered shares of `COUNT` disks around the floor's point (x, 0, 0), seen from so high above it."""
-    from mis_integrators.photons.coverage import covered_share           # of the active variant
+    """Covered shares of `COUNT` disks around the floor's point (x, 0, 0), seen from so high above
+    it."""
+    from mis_integrators.photons.coverage import covered_share  # of the active variant
+
     ray = mi.Ray3f(mi.Point3f(dr.full(mi.Float, x, COUNT), 0, height), mi.Vector3f(0, 0, -1))
-    vertices = {"ray_o": ray.o, "ray_d": ray.d, "hit": scene.ray_intersect_preliminary(ray), "path": dr.arange(mi.UInt32, COUNT),
-                "depth": dr.ones(mi.UInt32, COUNT)}
-    return np.array(covered_share(scene, vertices, dr.opaque(mi.Float, RADIUS), dr.opaque(mi.UInt32, 7), mi.Bool(True)))
+    vertices = {
+        "ray_o": ray.o,
+        "ray_d": ray.d,
+        "hit": scene.ray_intersect_preliminary(ray),
+        "path": dr.arange(mi.UInt32, COUNT),
+        "depth": dr.ones(mi.UInt32, COUNT),
+    }
+    return np.array(
+        covered_share(
+            scene, vertices, dr.opaque(mi.Float, RADIUS), dr.opaque(mi.UInt32, 7), mi.Bool(True)
+        )
+    )
 
 
 def lacks(shares, expected):
@@ -47,7 +60,8 @@ def test_in_front_of_a_wall(rgb, u):
 
 
 def test_in_a_corner(rgb):
-    """An edge through the centre leaves one half, another at right angles a quarter: shares stop at 0.4."""
+    """An edge through the centre leaves one half, another at right angles a quarter: shares stop at
+    0.4."""
     place = mi.ScalarTransform4f().rotate([1, 0, 0], 90).translate([0, 0, 1e-4])
     shares = share_at(scene_with(wall={"type": "rectangle", "to_world": place}), 1 - 1e-4)
     assert np.all(shares == pytest.approx(0.4))
@@ -55,6 +69,10 @@ def test_in_a_corner(rgb):
 
 @pytest.mark.parametrize("gap", [0.02, 0.2, 0.6])
 def test_under_a_solid(rgb, gap):
-    """Photons reach the floor under a block that hovers, however close: probes must not start inside it."""
-    block = {"type": "cube", "to_world": mi.ScalarTransform4f().translate([0, 0, gap * RADIUS + 0.5]).scale(0.5)}
+    """Photons reach the floor under a block that hovers, however close: probes must not start
+    inside it."""
+    block = {
+        "type": "cube",
+        "to_world": mi.ScalarTransform4f().translate([0, 0, gap * RADIUS + 0.5]).scale(0.5),
+    }
     assert np.all(share_at(scene_with(block=block), 0.0, 0.5 * gap * RADIUS) == 1)

@@ -1,9 +1,9 @@
 """The pilot's arithmetic, on made-up pilots whose squared bias and noise are known exactly."""
 
+from mis_integrators.pilot import radius
+
 import numpy as np
 import pytest
-
-from mis_integrators.pilot import radius
 
 RADII = 0.1 * 2.0 ** -np.arange(6, -1, -1.0)
 PIXELS = 4096
@@ -18,8 +18,8 @@ def lost_share(u):
 
 
 def losses(radii, reach):
-    """What the correction adds, and what plain estimates lack of it: disks larger than `reach` lose no more, because what lies beyond the edge
-    brings light too."""
+    """What the correction adds, and what plain estimates lack of it: disks larger than `reach` lose
+    no more, because what lies beyond the edge brings light too."""
     distance = np.linspace(0, 0.5, PIXELS)
     return lost_share(distance / radii), lost_share(distance / np.minimum(radii, reach))
 
@@ -27,7 +27,8 @@ def losses(radii, reach):
 def pilot(iterations, seed, reach=np.inf, noise=0.05, curvature=0.0):
     """Plain and corrected samples of a plane that ends at an edge.
 
-    `noise`: relative noise of the largest disks (it falls with the area); `curvature`: bias of both at the largest radius, growing as R^2.
+    `noise`: relative noise of the largest disks (it falls with the area); `curvature`: bias of both
+    at the largest radius, growing as R^2.
     """
     rng = np.random.default_rng(seed)
     radii = RADII[:, None]
@@ -42,8 +43,8 @@ def test_constants_of_edges():
     whole, half = lost_share(u), lost_share(2 * u)
     exponent, ratio = radius.AT_EDGES
     assert exponent == 1
-    assert np.mean(whole ** 2) / np.mean((whole - half) ** 2) == pytest.approx(ratio, rel=1e-3)
-    exponent, ratio = radius.BY_CURVATURE                     # bias c R^2 against c (R^2 - R^2 / 4)
+    assert np.mean(whole**2) / np.mean((whole - half) ** 2) == pytest.approx(ratio, rel=1e-3)
+    exponent, ratio = radius.BY_CURVATURE  # bias c R^2 against c (R^2 - R^2 / 4)
     assert ratio == pytest.approx(1 / (1 - 1 / 4) ** 2) and exponent == 4
 
 
@@ -63,19 +64,23 @@ def test_share_lost_at_edges_is_found(reach, seed):
     plain, corrected = pilot(16, seed, reach)
     added, lost = losses(RADII[:, None], reach)
     squared, share, doubt = radius.light_lost_at_edges(plain, corrected, np.ones(PIXELS))
-    assert squared[3:] == pytest.approx((added ** 2).mean(axis=1)[3:], rel=1e-6)
-    truth = (lost * added).mean(axis=1) / (added ** 2).mean(axis=1)
+    assert squared[3:] == pytest.approx((added**2).mean(axis=1)[3:], rel=1e-6)
+    truth = (lost * added).mean(axis=1) / (added**2).mean(axis=1)
     assert np.all(np.abs(share - truth)[-2:] < FIVE_SIGMA * doubt[-2:] + 0.05)
     assert np.all(doubt[-2:] < 0.1)
 
 
 def test_shares_known_from_three_iterations_are_not_believed():
-    """Their standard errors are now and then far too small: how often the share that the largest disks lack is off by more than two of its standard
-    deviations. 2.3 % of the pilots, 10.7 % if the errors were taken as they are. (600 pilots: false-alarm rate below 1e-5.)"""
+    """Their standard errors are now and then far too small: how often the share that the largest
+    disks lack is off by more than two of its standard deviations. 2.3 % of the pilots, 10.7 % if
+    the errors were taken as they are. (600 pilots: false-alarm rate below 1e-5.)"""
     off = 0
     for seed in range(600):
         plain, corrected = (samples[..., ::16] for samples in pilot(3, seed, noise=0.3))
-        share, doubt = (values[-1] for values in radius.light_lost_at_edges(plain, corrected, np.ones(PIXELS // 16))[1:])
+        share, doubt = (
+            values[-1]
+            for values in radius.light_lost_at_edges(plain, corrected, np.ones(PIXELS // 16))[1:]
+        )
         off += abs(share - 1) > 2 * doubt
     assert off < 0.06 * 600
 
@@ -90,12 +95,15 @@ def test_shares_without_noise_are_as_measured():
     measured = np.array([0.9, 0.4, -0.1, 0.3])
     shares, variances = radius.shares_by_step(measured, np.full(4, 1e-12))
     assert shares[1:] == pytest.approx(measured, abs=1e-6) and np.all(variances[1:] < 1e-6)
-    assert measured[0] < shares[0] < 1 and variances[0] >= radius.SHARES_STRAY ** 2
+    assert measured[0] < shares[0] < 1 and variances[0] >= radius.SHARES_STRAY**2
 
 
 def test_hidden_shares_lie_between_one_and_the_next_larger():
-    """Where the correction takes clutter for edges at large radii, noise at small ones is no reason to believe in it fully."""
-    shares, variances = radius.shares_by_step(np.array([5.0, -7.0, 3.0, 0.2]), np.array([1e6, 1e6, 1e6, 1e-6]))
+    """Where the correction takes clutter for edges at large radii, noise at small ones is no reason
+    to believe in it fully."""
+    shares, variances = radius.shares_by_step(
+        np.array([5.0, -7.0, 3.0, 0.2]), np.array([1e6, 1e6, 1e6, 1e-6])
+    )
     assert shares[-1] == pytest.approx(0.2, abs=1e-3)
     assert np.all(np.diff(shares) < 0) and np.all(shares < 1)
     assert np.all(np.diff(variances) < 0)
@@ -110,8 +118,9 @@ def test_squared_bias_follows_from_differences(exponent):
 
 
 def test_errors_known_from_three_iterations_are_not_believed():
-    """Q's noise at small radii is now and then taken for far smaller than it is. How often the squared bias comes out four times too large at a quarter
-    of the largest radius: 1.5 % of the pilots, 7 % if those errors were believed. (1000 pilots: false-alarm rate below 1e-4.)"""
+    """Q's noise at small radii is now and then taken for far smaller than it is. How often the
+    squared bias comes out four times too large at a quarter of the largest radius: 1.5 % of the
+    pilots, 7 % if those errors were believed. (1000 pilots: false-alarm rate below 1e-4.)"""
     rng = np.random.default_rng(0)
     bias = 0.03 * (RADII / RADII[-1]) ** 2
     true_difference = bias[1:] / radius.squared_bias_over_difference(2)
@@ -120,7 +129,9 @@ def test_errors_known_from_three_iterations_are_not_believed():
     for _ in range(1000):
         difference = np.concatenate([[0.0], true_difference + noise * rng.normal(size=6)])
         error = np.concatenate([[0.0], noise * np.sqrt(rng.chisquare(2, 6) / 2)])
-        too_large += radius.expected_squared_bias(RADII, difference, error, 3, RADII)[4] > 4 * bias[4]
+        too_large += (
+            radius.expected_squared_bias(RADII, difference, error, 3, RADII)[4] > 4 * bias[4]
+        )
     assert too_large < 35
 
 
@@ -131,23 +142,32 @@ def test_a_blind_pilot_still_expects_blur():
     assert np.all(np.diff(found) > 0)
 
 
-@pytest.mark.parametrize("reach, corrects, curvature, most", [(np.inf, True, 0.08, 1.25), (np.inf, True, 0.01, 1.4), (RADII[1], False, 0.08, 1.25)])
+@pytest.mark.parametrize(
+    "reach, corrects, curvature, most",
+    [(np.inf, True, 0.08, 1.25), (np.inf, True, 0.01, 1.4), (RADII[1], False, 0.08, 1.25)],
+)
 @pytest.mark.parametrize("count", [10, 100])
 def test_choice_is_nearly_the_best(reach, corrects, curvature, most, count):
-    """The true error of the choice stays within `most` times that of the best radius and way, in the geometric mean over twelve pilots of three
-    iterations each; also where hardly any blur is left once the edges are corrected, which so few iterations do not tell as well."""
+    """The true error of the choice stays within `most` times that of the best radius and way, in
+    the geometric mean over twelve pilots of three iterations each; also where hardly any blur is
+    left once the edges are corrected, which so few iterations do not tell as well."""
     noise = 0.02
 
     def true_error(r, way):
         added, lost = losses(r, reach)
         bias = curvature * (r / RADII[-1]) ** 2 - lost + way * added
-        return np.mean(bias ** 2) + (noise * RADII[-1] / r) ** 2 / count
+        return np.mean(bias**2) + (noise * RADII[-1] / r) ** 2 / count
 
-    best = min(true_error(r, way) for r in np.geomspace(RADII[0], RADII[-1], 60) for way in (False, True))
+    best = min(
+        true_error(r, way) for r in np.geomspace(RADII[0], RADII[-1], 60) for way in (False, True)
+    )
     ratios, ways = [], []
     for seed in range(12):
         plain, corrected = pilot(3, seed, reach, noise, curvature)
-        chosen, way, *_ = radius.best_radius(radius.expect(RADII, plain, corrected, np.ones(PIXELS)), lambda r, corrected: count * np.ones_like(r))
+        chosen, way, *_ = radius.best_radius(
+            radius.expect(RADII, plain, corrected, np.ones(PIXELS)),
+            lambda r, corrected: count * np.ones_like(r),
+        )
         ratios.append(true_error(chosen, way) / best)
         ways.append(way)
     assert np.exp(np.mean(np.log(ratios))) < most
@@ -157,7 +177,10 @@ def test_choice_is_nearly_the_best(reach, corrects, curvature, most, count):
 def test_more_iterations_mean_smaller_radii():
     plain, corrected = pilot(4, 0, curvature=0.05)
     expected = radius.expect(RADII, plain, corrected, np.ones(PIXELS))
-    chosen = [radius.best_radius(expected, lambda r, way, n=n: n * np.ones_like(r))[0] for n in (1, 30, 1000)]
+    chosen = [
+        radius.best_radius(expected, lambda r, way, n=n: n * np.ones_like(r))[0]
+        for n in (1, 30, 1000)
+    ]
     assert chosen[0] > chosen[1] > chosen[2]
 
 
@@ -166,29 +189,39 @@ def test_noise_of_small_disks_is_what_large_ones_saw():
     seen = np.array([0.0, 0.0, 1.0])
     radii = np.array([1.0, 2.0, 4.0])
     assert radius.noise_of_photons(radii, seen, 0.0) == pytest.approx([16.0, 4.0, 1.0])
-    assert radius.noise_of_photons(radii, seen, 0.0, [radius.FEW_MET] * 3) == pytest.approx([0.0, 4.0, 1.0])
-    assert radius.noise_of_photons(radii, seen, 0.0, [0, radius.FEW_MET, 10 ** 6]) == pytest.approx([16.0, 4.0, 1.0])
+    assert radius.noise_of_photons(radii, seen, 0.0, [radius.FEW_MET] * 3) == pytest.approx(
+        [0.0, 4.0, 1.0]
+    )
+    assert radius.noise_of_photons(radii, seen, 0.0, [0, radius.FEW_MET, 10**6]) == pytest.approx(
+        [16.0, 4.0, 1.0]
+    )
 
 
 def test_disks_that_met_no_photons_are_not_without_noise():
-    """Caustic photons so rare that a short pilot's small disks meet none: their radii are not the best for that."""
+    """Caustic photons so rare that a short pilot's small disks meet none: their radii are not the
+    best for that."""
     rng = np.random.default_rng(6)
-    met = rng.uniform(size=(3, 1, PIXELS)) < 1e-3 * 4.0 ** np.arange(len(RADII))[:, None] / 4.0 ** (len(RADII) - 1)
+    met = rng.uniform(size=(3, 1, PIXELS)) < 1e-3 * 4.0 ** np.arange(len(RADII))[:, None] / 4.0 ** (
+        len(RADII) - 1
+    )
     samples = met * (RADII[-1] / RADII)[:, None] ** 2 * 1000.0
     assert not samples[:, 0].any() and samples[:, -1].any()
-    choice = radius.best_radius(radius.expect(RADII, samples, None, np.ones(PIXELS), alike=True), lambda *_: 100.0)
+    choice = radius.best_radius(
+        radius.expect(RADII, samples, None, np.ones(PIXELS), alike=True), lambda *_: 100.0
+    )
     assert choice.radius > RADII[-1] / 2
 
 
 def test_steadied_means_do_not_know_their_own_noise():
-    """Noise is relative to the mean that there is, not to that which the same few samples happened to have. 0.15 is seven standard deviations of
-    the ratio."""
+    """Noise is relative to the mean that there is, not to that which the same few samples happened
+    to have. 0.15 is seven standard deviations of the ratio."""
     rng, cells = np.random.default_rng(3), np.arange(PIXELS) // 16
     truth = np.exp(rng.normal(size=PIXELS // 16))[cells]
     samples = truth * rng.exponential(size=(3, PIXELS))
 
     def noise(mean):
         return np.mean(radius.relative_weights(mean) * samples.var(axis=0, ddof=1))
+
     assert noise(samples.mean(axis=0)) < 0.8 * noise(truth)
     assert noise(radius.steadied(samples, cells)) == pytest.approx(noise(truth), rel=0.15)
 
@@ -198,7 +231,10 @@ def test_steadied_means_keep_what_is_real():
     truth = np.exp(rng.normal(size=PIXELS))
     np.testing.assert_allclose(radius.steadied(np.array([truth] * 3), cells), truth)
     noisy = truth * rng.normal(1, 0.1, size=(3, PIXELS))
-    weights, plain, right = (radius.relative_weights(mean) for mean in (radius.steadied(noisy, cells), noisy.mean(axis=0), truth))
+    weights, plain, right = (
+        radius.relative_weights(mean)
+        for mean in (radius.steadied(noisy, cells), noisy.mean(axis=0), truth)
+    )
     assert np.std(weights / right) < 1.1 * np.std(plain / right) < 0.2
     assert radius.steadied(noisy, cells).sum() == pytest.approx(noisy.mean(axis=0).sum())
     np.testing.assert_array_equal(radius.steadied(noisy[:1], cells), noisy[0])
@@ -208,4 +244,6 @@ def test_ladder_needs_vertices():
     assert radius.ladder(np.zeros((3, 5)), np.zeros(5)) is None
     points = np.random.default_rng(0).uniform(size=(3, 1000))
     steps = radius.ladder(points, np.ones(1000))
-    assert steps[-1] == pytest.approx(0.08 * 0.96, rel=0.05) and np.allclose(steps[1:] / steps[:-1], 2)
+    assert steps[-1] == pytest.approx(0.08 * 0.96, rel=0.05) and np.allclose(
+        steps[1:] / steps[:-1], 2
+    )

@@ -1,14 +1,19 @@
 """Cache points: which ones a place listens to, and light vertices drawn from their pmfs."""
 
+from mis_integrators.core.random import streams
+from mis_integrators.resampling.cache_points import NORMAL_COST, CacheGrid
+from mis_integrators.resampling.proposals import (
+    BLIND_SHARE,
+    UNIFORM_SHARE,
+    Proposals,
+    cumulative_sums,
+)
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-
 from comparing import assert_frequencies
-from mis_integrators.resampling.cache_points import NORMAL_COST, CacheGrid
-from mis_integrators.resampling.proposals import BLIND_SHARE, UNIFORM_SHARE, Proposals, cumulative_sums
-from mis_integrators.core.random import streams
 
 
 def box_points(count, seed=0, stretch=(1, 1, 1)):
@@ -22,7 +27,10 @@ def box_points(count, seed=0, stretch=(1, 1, 1)):
     return p * np.array(stretch)[:, None], n
 
 
-@pytest.mark.parametrize("count, neighbors, stretch", [(300, 3, (1, 1, 1)), (77, 5, (10, 1, 0.01)), (2, 3, (1, 1, 1)), (1, 1, (0, 0, 0))])
+@pytest.mark.parametrize(
+    "count, neighbors, stretch",
+    [(300, 3, (1, 1, 1)), (77, 5, (10, 1, 0.01)), (2, 3, (1, 1, 1)), (1, 1, (0, 0, 0))],
+)
 def test_neighbours_are_the_nearest(rgb, count, neighbors, stretch):
     """Against sorting the same costs in NumPy; places outside the grid get the border's."""
     p, n = box_points(count, 1, stretch)
@@ -34,17 +42,20 @@ def test_neighbours_are_the_nearest(rgb, count, neighbors, stretch):
     cell, face = rows // 6, rows % 6
     nx, ny, nz = grid.resolution
     edge = 1 / float(grid._scale[0])
-    centre = (np.stack([cell % nx, cell // nx % ny, cell // (nx * ny)]) + 0.5) * edge + p.min(axis=1)[:, None]
+    centre = (np.stack([cell % nx, cell // nx % ny, cell // (nx * ny)]) + 0.5) * edge + p.min(
+        axis=1
+    )[:, None]
     inside = np.all((q >= p.min(axis=1)[:, None]) & (q < p.max(axis=1)[:, None]), axis=0)
     assert np.all(np.abs(centre - q)[:, inside] <= 0.5001 * edge + 1e-6)
     axis = np.eye(3)[face // 2].T * np.where(face % 2, -1, 1)
     assert np.all(np.sum(axis * m, axis=0) == 1)
-    cost = (np.sum((centre[:, :, None] - p[:, None]) ** 2, axis=0)
-            + 0.5 * NORMAL_COST * grid.spacing ** 2 * (1 - np.sum(axis[:, :, None] * n[:, None], axis=0)))
+    cost = np.sum(
+        (centre[:, :, None] - p[:, None]) ** 2, axis=0
+    ) + 0.5 * NORMAL_COST * grid.spacing**2 * (1 - np.sum(axis[:, :, None] * n[:, None], axis=0))
     found = np.array(grid.table).reshape(-1, neighbors)[rows]
     costs = np.take_along_axis(cost, found, axis=1)
     least = np.sort(cost, axis=1)[:, :neighbors]
-    assert np.allclose(costs[:, :least.shape[1]], least, rtol=1e-4, atol=1e-4 * grid.spacing ** 2)
+    assert np.allclose(costs[:, : least.shape[1]], least, rtol=1e-4, atol=1e-4 * grid.spacing**2)
 
 
 def new_proposals(grid, r, seen, count, width):
@@ -55,14 +66,18 @@ def new_proposals(grid, r, seen, count, width):
 
 @pytest.mark.parametrize("width", [24, 37])
 def test_draws_have_their_probability(rgb, width):
-    """Frequencies of drawn light vertices against the mixture of pmfs computed apart, and against `probability`; rows without light are uniform."""
+    """Frequencies of drawn light vertices against the mixture of pmfs computed apart, and against
+    `probability`; rows without light are uniform."""
     p, n = box_points(40)
     grid = CacheGrid(mi.Point3f(p), mi.Normal3f(n), 3)
     count, rng = 21, np.random.default_rng(3)
     r = rng.exponential(1, (40, width)) * (rng.random((40, width)) < 0.5)
     r[:, count:] = 0
     table = np.array(grid.table).reshape(-1, 3)
-    dark, dominated = 0, int(np.argmax(np.min(np.abs(table[:, :, None] - table[0]), axis=(1, 2)) > 0))
+    dark, dominated = (
+        0,
+        int(np.argmax(np.min(np.abs(table[:, :, None] - table[0]), axis=(1, 2)) > 0)),
+    )
     r[table[dark]] = 0
     r[table[dominated, 0], :count] = 1e-12
     r[table[dominated, 0], 4] = 1e12
@@ -74,18 +89,30 @@ def test_draws_have_their_probability(rgb, width):
     pmf = np.where(some > 0, (1 - BLIND_SHARE) * open_ + BLIND_SHARE * blind, blind)[:, :count]
     pmf = np.where(every > 0, pmf, 1 / count)
     for row in (dark, dominated, grid.rows - 1):
-        share = np.interp((some / np.maximum(every, 1e-30))[table[row]], (0, 1), UNIFORM_SHARE[::-1])
+        share = np.interp(
+            (some / np.maximum(every, 1e-30))[table[row]], (0, 1), UNIFORM_SHARE[::-1]
+        )
         expected = ((1 - share) * pmf[table[row]] + share / count).mean(axis=0)
         said = np.array(proposals.probability(mi.UInt32(row), dr.arange(mi.UInt32, count)))
         assert np.allclose(said, expected, atol=2e-7) and said.sum() == pytest.approx(1, abs=1e-6)
-        drawn = proposals.draw(mi.UInt32(row), streams(dr.arange(mi.UInt32, 200000), mi.UInt32(row)))
+        drawn = proposals.draw(
+            mi.UInt32(row), streams(dr.arange(mi.UInt32, 200000), mi.UInt32(row))
+        )
         assert_frequencies(np.bincount(np.array(drawn), minlength=count), 200000 * expected)
 
 
 def test_no_light_vertices(rgb):
     """All light sub-paths missed the scene: draws are harmless."""
     p, n = box_points(5)
-    proposals = new_proposals(CacheGrid(mi.Point3f(p), mi.Normal3f(n), 3), dr.zeros(mi.Float, 5 * 8), dr.full(mi.Bool, True, 5 * 8), 0, 8)
-    drawn = proposals.draw(dr.zeros(mi.UInt32, 100), streams(dr.arange(mi.UInt32, 100), mi.UInt32(0)))
+    proposals = new_proposals(
+        CacheGrid(mi.Point3f(p), mi.Normal3f(n), 3),
+        dr.zeros(mi.Float, 5 * 8),
+        dr.full(mi.Bool, True, 5 * 8),
+        0,
+        8,
+    )
+    drawn = proposals.draw(
+        dr.zeros(mi.UInt32, 100), streams(dr.arange(mi.UInt32, 100), mi.UInt32(0))
+    )
     assert np.all(np.array(drawn) == 0)
     assert np.all(np.isfinite(np.array(proposals.probability(dr.zeros(mi.UInt32, 100), drawn))))

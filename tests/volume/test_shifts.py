@@ -1,19 +1,21 @@
-"""Shifts between segments: against their definitions, against finite differences, and on anything at all.
+"""Shifts between segments: against their definitions, against finite differences, and on anything
+at all.
 
-With `--vectors DIR` the segments and answers of DIR/shifts.json are used; else segments generated here, the answers by bisection of the
-defining equations in double precision.
+With `--vectors DIR` the segments and answers of DIR/shifts.json are used; else segments generated
+here, the answers by bisection of the defining equations in double precision.
 """
 
 import json
 from pathlib import Path
 
+from mis_integrators.volume import shifts
+from mis_integrators.volume.shifts import SHIFTS, Sections
+
 import mitsuba as mi
 import numpy as np
 import pytest
-from hypothesis import given, settings, strategies as st
-
-from mis_integrators.volume import shifts
-from mis_integrators.volume.shifts import SHIFTS, Sections
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 STRETCHES = ("raw_depth", "majorant_optical_depth", "primary_sample")
 COPIES = tuple(name + "_copy" for name in STRETCHES)
@@ -28,7 +30,8 @@ def random_segment(rng, count, scale=1.0):
 
 
 def scale_of(name, segment, t):
-    """What the shift `name` conserves, from the definition alone: l, tau or u at t, in double precision."""
+    """What the shift `name` conserves, from the definition alone: l, tau or u at t, in double
+    precision."""
     inside = [max(0.0, min(t, b) - a) for a, b, _ in segment]
     if name.startswith("raw"):
         return t if name.endswith("copy") else sum(inside)
@@ -37,7 +40,8 @@ def scale_of(name, segment, t):
 
 
 def by_bisection(name, base, target, t):
-    """The shifted distance, from the definition: the t' at which the conserved quantity has the wanted value."""
+    """The shifted distance, from the definition: the t' at which the conserved quantity has the
+    wanted value."""
     wanted = scale_of(name, base, t)
     if not name.endswith("copy"):
         wanted *= scale_of(name, target, target.tmax[-1]) / scale_of(name, base, base.tmax[-1])
@@ -59,14 +63,26 @@ def generated():
             h = 1e-5 * (base.tmax[k] - base.tmin[k])
             moved = [by_bisection(name, base, target, t + d) for d in (0, -h, h)]
             answers[name] = {"t": moved[0], "jacobian": (moved[2] - moved[1]) / (2 * h)}
-        yield f"{seed}", base, target, t, answers, 1e-6       # bisection and finite differences
+        yield f"{seed}", base, target, t, answers, 1e-6  # bisection and finite differences
 
 
 def stored(file):
-    entries = json.loads(file.read_text()) if file.exists() else []       # other kinds of vectors are no business of these tests
+    entries = (
+        json.loads(file.read_text()) if file.exists() else []
+    )  # other kinds of vectors are no business of these tests
     for number, entry in enumerate(entries):
-        base, target = (Sections(entry[s]["tmin"], entry[s]["tmax"], entry[s]["majorant"]) for s in ("base", "target"))
-        yield f"{number}", base, target, entry["t"], {name: entry[name] for name in SHIFTS if name in entry}, 1e-10
+        base, target = (
+            Sections(entry[s]["tmin"], entry[s]["tmax"], entry[s]["majorant"])
+            for s in ("base", "target")
+        )
+        yield (
+            f"{number}",
+            base,
+            target,
+            entry["t"],
+            {name: entry[name] for name in SHIFTS if name in entry},
+            1e-10,
+        )
 
 
 def pytest_generate_tests(metafunc):
@@ -77,7 +93,12 @@ def pytest_generate_tests(metafunc):
 
 
 def on_arrays(segment, make):
-    return Sections(*([make(np.float64(x)) for x in values] for values in (segment.tmin, segment.tmax, segment.majorant)))
+    return Sections(
+        *(
+            [make(np.float64(x)) for x in values]
+            for values in (segment.tmin, segment.tmax, segment.majorant)
+        )
+    )
 
 
 # --- Known answers ------------------------------------------------------------------------------------
@@ -98,9 +119,16 @@ def test_stretches_in_single_precision(case, precision, rgb):
     make = (lambda x: mi.Float(float(x))) if precision == "drjit" else np.float32
     for name, answer in answers.items():
         shifted = SHIFTS[name](on_arrays(base, make), on_arrays(target, make), make(t))
-        # The primary sample's end turns rounding of tau into errors of exp(tau' - tau): at most e^10 roundings here.
-        assert np.allclose(np.array(shifted.t), answer["t"], rtol=2e-3 if name == "primary_sample" else 2e-5)
-        assert np.allclose(np.array(shifted.jacobian), answer["jacobian"], rtol=2e-2 if name == "primary_sample" else 1e-4)
+        # The primary sample's end turns rounding of tau into errors of exp(tau' - tau): at most
+        # e^10 roundings here.
+        assert np.allclose(
+            np.array(shifted.t), answer["t"], rtol=2e-3 if name == "primary_sample" else 2e-5
+        )
+        assert np.allclose(
+            np.array(shifted.jacobian),
+            answer["jacobian"],
+            rtol=2e-2 if name == "primary_sample" else 1e-4,
+        )
 
 
 @pytest.mark.parametrize("name", COPIES)
@@ -117,9 +145,16 @@ def test_copies(name, seed):
         else:
             assert valid == (scale_of(name, base, at) <= scale_of(name, target, end))
         if valid:
-            assert scale_of(name, target, t_new) == pytest.approx(scale_of(name, base, at), rel=1e-9)
-            rates = [next(mu for a, b, mu in segment if a <= x <= b) for segment, x in ((base, at), (target, t_new))]
-            assert jacobian == pytest.approx(1 if name == "raw_depth_copy" else rates[0] / rates[1], rel=1e-9)
+            assert scale_of(name, target, t_new) == pytest.approx(
+                scale_of(name, base, at), rel=1e-9
+            )
+            rates = [
+                next(mu for a, b, mu in segment if a <= x <= b)
+                for segment, x in ((base, at), (target, t_new))
+            ]
+            assert jacobian == pytest.approx(
+                1 if name == "raw_depth_copy" else rates[0] / rates[1], rel=1e-9
+            )
 
 
 # --- What every shift obeys -------------------------------------------------------------------------------
@@ -127,7 +162,13 @@ def test_copies(name, seed):
 
 def interior_points(segment, count, margin=0.02):
     """Points away from the sections' borders."""
-    return np.concatenate([a + np.linspace(margin, 1 - margin, count) * (b - a) for a, b, _ in segment if b - a > 1e-3])
+    return np.concatenate(
+        [
+            a + np.linspace(margin, 1 - margin, count) * (b - a)
+            for a, b, _ in segment
+            if b - a > 1e-3
+        ]
+    )
 
 
 def section_of(segment, t):
@@ -152,7 +193,7 @@ def test_round_trip_chain_rule_and_jacobian(name, seed):
     assert np.allclose(back.t[kept], t[kept], rtol=1e-9)
     assert np.allclose((ab.jacobian * back.jacobian)[kept], 1, rtol=1e-8)
     both = kept & ac.valid
-    assert np.all(abc.valid[both])                                      # so a path has one set of views that can make it
+    assert np.all(abc.valid[both])  # so a path has one set of views that can make it
     assert np.allclose(abc.t[both], ac.t[both], rtol=1e-9)
     assert np.allclose((ab.jacobian * abc.jacobian)[both], ac.jacobian[both], rtol=1e-8)
 
@@ -164,7 +205,9 @@ def test_round_trip_chain_rule_and_jacobian(name, seed):
     assert smooth.sum() >= same.sum() / 2
     assert np.allclose(slope[smooth], ab.jacobian[smooth], rtol=1e-4, atol=1e-7)
     # In optical depth, where the sampling density is one.
-    tau = (shifts.optical_depth(b, high.t) - shifts.optical_depth(b, low.t)) / (shifts.optical_depth(a, t + h) - shifts.optical_depth(a, t - h))
+    tau = (shifts.optical_depth(b, high.t) - shifts.optical_depth(b, low.t)) / (
+        shifts.optical_depth(a, t + h) - shifts.optical_depth(a, t - h)
+    )
     assert np.allclose(tau[smooth], np.exp(ab.log_rate)[smooth], rtol=1e-4, atol=1e-7)
 
 
@@ -173,7 +216,9 @@ def test_ends_stay_ends(name):
     rng = np.random.default_rng(3)
     a, b = random_segment(rng, 3), random_segment(rng, 2)
     start, end = (SHIFTS[name](a, b, np.float64(t)) for t in (a.tmin[0] + 1e-12, a.tmax[-1]))
-    assert start.t == pytest.approx(b.tmin[0], abs=1e-9) and end.t == pytest.approx(b.tmax[-1], abs=1e-6)
+    assert start.t == pytest.approx(b.tmin[0], abs=1e-9) and end.t == pytest.approx(
+        b.tmax[-1], abs=1e-6
+    )
 
 
 @pytest.mark.parametrize("name", SHIFTS)
@@ -182,35 +227,53 @@ def test_empty_segments(name):
     some, none = Sections([1.0], [2.0], [3.0]), Sections([1.0], [2.0], [0.0])
     for target in (none, Sections([1.5], [1.5], [2.0])):
         shifted = SHIFTS[name](some, target, np.array([1.2, 1.9]))
-        assert not shifted.valid.any() and np.isfinite(shifted.t).all() and np.isfinite(shifted.jacobian).all()
+        assert (
+            not shifted.valid.any()
+            and np.isfinite(shifted.t).all()
+            and np.isfinite(shifted.jacobian).all()
+        )
     assert not SHIFTS[name](none, some, np.array([1.5])).valid.any()
 
 
 @pytest.mark.parametrize("name", SHIFTS)
 @pytest.mark.parametrize("precision", [np.float32, np.float64, "drjit"])
 def test_thick_media(name, precision, rgb):
-    """Optical depths up to 1e4, on either side or on both: finite, in order, inside, and with the ends where they belong."""
+    """Optical depths up to 1e4, on either side or on both: finite, in order, inside, and with the
+    ends where they belong."""
     make = (lambda x: mi.Float(x)) if precision == "drjit" else (lambda x: np.asarray(x, precision))
     share = np.linspace(0, 1, 201)
     for base_depth in (1e-6, 1e-2, 1, 30, 90, 1e3, 1e4):
         for target_depth in (1e-6, 1e-2, 1, 30, 90, 1e3, 1e4):
-            base = Sections([make(0.0), make(2.0)], [make(1.0), make(3.0)], [make(base_depth * 0.25), make(base_depth * 0.75)])
+            base = Sections(
+                [make(0.0), make(2.0)],
+                [make(1.0), make(3.0)],
+                [make(base_depth * 0.25), make(base_depth * 0.75)],
+            )
             target = Sections([make(1.0)], [make(5.0)], [make(target_depth / 4)])
             t = np.concatenate([share[1:], 2 + share])
             shifted = SHIFTS[name](base, target, make(t))
-            values = [np.array(x) for x in (shifted.t, shifted.tau, shifted.log_rate, shifted.jacobian)]
+            values = [
+                np.array(x) for x in (shifted.t, shifted.tau, shifted.log_rate, shifted.jacobian)
+            ]
             assert all(np.isfinite(v[np.array(shifted.valid)]).all() for v in values)
             if name in STRETCHES:
                 assert np.array(shifted.valid).all()
-                assert np.all(np.diff(values[0]) >= -1e-5) and values[0].min() >= 1 and values[0].max() <= 5
+                assert (
+                    np.all(np.diff(values[0]) >= -1e-5)
+                    and values[0].min() >= 1
+                    and values[0].max() <= 5
+                )
                 assert values[0][-1] == pytest.approx(5, abs=1e-5)
                 assert np.all(values[3] >= 0)
-                assert values[0][0] < 4.999 or base_depth > 100       # all of the base's first hundredth goes to the end only if it is opaque
+                assert (
+                    values[0][0] < 4.999 or base_depth > 100
+                )  # all of the base's first hundredth goes to the end only if it is opaque
 
 
 def test_primary_sample_deep_inside():
-    """Where the printed form C / (C - (C - 1) exp(tau)) is 0 times infinity: equal depths are the identity, and beyond the visible depth of the
-    thinner segment the far end is stretched by exp(tau) as it should."""
+    """Where the printed form C / (C - (C - 1) exp(tau)) is 0 times infinity: equal depths are the
+    identity, and beyond the visible depth of the thinner segment the far end is stretched by
+    exp(tau) as it should."""
     for depth in (80.0, 500.0, 1e4):
         segment = Sections([np.float32(0)], [np.float32(1)], [np.float32(depth)])
         t = np.linspace(0.01, 0.99, 50, dtype=np.float32)
@@ -218,18 +281,35 @@ def test_primary_sample_deep_inside():
         assert np.allclose(same.t, t, atol=1e-6) and np.allclose(same.jacobian, 1, rtol=1e-3)
     thin, thick = Sections([0.0], [1.0], [2.0]), Sections([0.0], [1.0], [200.0])
     t = np.array([0.3, 0.999])
-    expected = [-np.log1p(-(-np.expm1(-2 * x)) / (-np.expm1(-2.0))) / 200 for x in t]       # u'max = 1 in double precision
+    expected = [
+        -np.log1p(-(-np.expm1(-2 * x)) / (-np.expm1(-2.0))) / 200 for x in t
+    ]  # u'max = 1 in double precision
     assert np.allclose(shifts.primary_sample(thin, thick, t).t, expected, rtol=1e-9)
 
 
-segments = st.lists(st.tuples(st.one_of(st.just(0.0), st.floats(1e-3, 10)), st.one_of(st.just(0.0), st.floats(1e-3, 10)),
-                              st.one_of(st.just(0.0), st.floats(1e-4, 1e4))), min_size=1, max_size=5)
+segments = st.lists(
+    st.tuples(
+        st.one_of(st.just(0.0), st.floats(1e-3, 10)),
+        st.one_of(st.just(0.0), st.floats(1e-3, 10)),
+        st.one_of(st.just(0.0), st.floats(1e-4, 1e4)),
+    ),
+    min_size=1,
+    max_size=5,
+)
 
 
-@given(segments, segments, st.floats(0, 1), st.sampled_from(list(SHIFTS)), st.sampled_from([np.float32, np.float64]))
+@given(
+    segments,
+    segments,
+    st.floats(0, 1),
+    st.sampled_from(list(SHIFTS)),
+    st.sampled_from([np.float32, np.float64]),
+)
 @settings(max_examples=400, deadline=None)
 def test_anything(base, target, share, name, precision):
-    """Empty sections, pockets, single points: numbers are finite, valid results lie in a medium, and stretches lose nothing that is in one."""
+    """Empty sections, pockets, single points: numbers are finite, valid results lie in a medium,
+    and stretches lose nothing that is in one."""
+
     def segment(pieces):
         cuts = np.cumsum([x for gap, size, _ in pieces for x in (gap, size)]).astype(precision)
         return Sections(list(cuts[0::2]), list(cuts[1::2]), [precision(mu) for _, _, mu in pieces])
@@ -248,6 +328,10 @@ def test_anything(base, target, share, name, precision):
 @given(st.floats(0, 1e4))
 def test_elementary_functions(x):
     mi.set_variant("llvm_ad_rgb")
-    assert float(shifts.one_minus_exp(mi.Float(x))[0]) == pytest.approx(-np.expm1(-x), rel=2e-6, abs=1e-37)
+    assert float(shifts.one_minus_exp(mi.Float(x))[0]) == pytest.approx(
+        -np.expm1(-x), rel=2e-6, abs=1e-37
+    )
     u = min(x / 2e4, 0.5)
-    assert float(shifts.minus_log_one_minus(mi.Float(u))[0]) == pytest.approx(-np.log1p(-u), rel=2e-6, abs=1e-37)
+    assert float(shifts.minus_log_one_minus(mi.Float(u))[0]) == pytest.approx(
+        -np.log1p(-u), rel=2e-6, abs=1e-37
+    )

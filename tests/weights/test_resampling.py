@@ -1,34 +1,51 @@
 """Resampled light sub-paths on discrete worlds whose every outcome can be counted.
 
-With `--vectors DIR` the worlds and answers of DIR/resampling.json are used; else worlds generated here, their answers by enumeration.
+With `--vectors DIR` the worlds and answers of DIR/resampling.json are used; else worlds generated
+here, their answers by enumeration.
 """
 
 import itertools
 import json
 from pathlib import Path
 
+from mis_integrators.weights import resampling
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from hypothesis import given, settings, strategies as st
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from mis_integrators.weights import resampling
-
-GENERATED = [(seed, M, N, states) for seed, (M, N, states) in enumerate(
-    (M, N, states) for M in (1, 2, 3) for N in (1, 3) for states in ((2,), (3, 2), (2, 2, 2)) if M * sum(states) <= 12)]
+GENERATED = [
+    (seed, M, N, states)
+    for seed, (M, N, states) in enumerate(
+        (M, N, states)
+        for M in (1, 2, 3)
+        for N in (1, 3)
+        for states in ((2,), (3, 2), (2, 2, 2))
+        if M * sum(states) <= 12
+    )
+]
 
 
 def random_world(seed, M, N, states):
-    """A discrete world as in the vectors: densities p, contributions g and targets q* for each length and state."""
+    """A discrete world as in the vectors: densities p, contributions g and targets q* for each
+    length and state."""
     rng = np.random.default_rng(seed)
     p = [rng.dirichlet(np.ones(n)) + 1e-3 for n in states]
-    return {"M": M, "N": N, "p": [x / x.sum() for x in p], "g": [rng.uniform(0, 2, n) for n in states],
-            "q_star": [rng.uniform(0.1, 2, n) for n in states]}
+    return {
+        "M": M,
+        "N": N,
+        "p": [x / x.sum() for x in p],
+        "g": [rng.uniform(0, 2, n) for n in states],
+        "q_star": [rng.uniform(0.1, 2, n) for n in states],
+    }
 
 
 def enumerate_world(world, uniform=0.0, cached=None):
-    """Mean and variance of the resampling estimate over every outcome; `cached`: targets that the pmf is made of instead of the world's."""
+    """Mean and variance of the resampling estimate over every outcome; `cached`: targets that the
+    pmf is made of instead of the world's."""
     M, N, p, g = world["M"], world["N"], world["p"], world["g"]
     r = [resampling.proposal_weight(np.asarray(q), x) for q, x in zip(cached or world["q_star"], p)]
     mean = square = 0.0
@@ -38,11 +55,13 @@ def enumerate_world(world, uniform=0.0, cached=None):
         ratios = np.array([r[s][i] for s, i in place])
         pmf = resampling.pmf(ratios, ratios.sum(), len(place), uniform)
         assert pmf.sum() == pytest.approx(1, abs=1e-12)
-        said = resampling.estimate(np.array([g[s][i] for s, i in place]), np.array([p[s][i] for s, i in place]), pmf, M)
-        first, second = np.sum(pmf * said), np.sum(pmf * said ** 2)
+        said = resampling.estimate(
+            np.array([g[s][i] for s, i in place]), np.array([p[s][i] for s, i in place]), pmf, M
+        )
+        first, second = np.sum(pmf * said), np.sum(pmf * said**2)
         mean += probability * first
-        square += probability * ((second - first ** 2) / N + first ** 2)
-    return mean, square - mean ** 2
+        square += probability * ((second - first**2) / N + first**2)
+    return mean, square - mean**2
 
 
 def countable(world):
@@ -54,13 +73,27 @@ def pytest_generate_tests(metafunc):
     if "world" in metafunc.fixturenames:
         directory = metafunc.config.getoption("vectors")
         if directory is None:
-            worlds, names = [random_world(*case) for case in GENERATED], [f"M{M}-N{N}-{states}" for _, M, N, states in GENERATED]
+            worlds, names = (
+                [random_world(*case) for case in GENERATED],
+                [f"M{M}-N{N}-{states}" for _, M, N, states in GENERATED],
+            )
         else:
             file = Path(directory) / "resampling.json"
-            worlds = json.loads(file.read_text()) if file.exists() else []     # other kinds of vectors are no business of these tests
+            worlds = (
+                json.loads(file.read_text()) if file.exists() else []
+            )  # other kinds of vectors are no business of these tests
             names = [str(i) for i in range(len(worlds))]
-        metafunc.parametrize("world", [{key: [np.array(x) for x in value] if isinstance(value, list) else value
-                                        for key, value in world.items()} for world in worlds], ids=names)
+        metafunc.parametrize(
+            "world",
+            [
+                {
+                    key: [np.array(x) for x in value] if isinstance(value, list) else value
+                    for key, value in world.items()
+                }
+                for world in worlds
+            ],
+            ids=names,
+        )
 
 
 def variance(world, dtype=np.float64):
@@ -69,10 +102,13 @@ def variance(world, dtype=np.float64):
 
 
 def moment(world, g=None):
-    return resampling.second_moment(g or world["g"], world["p"], world["q_star"], world["M"], world["N"], np.sum)
+    return resampling.second_moment(
+        g or world["g"], world["p"], world["q_star"], world["M"], world["N"], np.sum
+    )
 
 
 # ---------------------------------------------------------------- exact worlds
+
 
 def test_variance_is_exact(world):
     total = sum(g.sum() for g in world["g"])
@@ -84,25 +120,30 @@ def test_variance_is_exact(world):
 
 
 def test_densities_are_those_of_the_variance(world):
-    """The variance is the integral of g^2/p_t less squares of integrals: that is where p_t comes from."""
+    """The variance is the integral of g^2/p_t less squares of integrals: that is where p_t comes
+    from."""
     totals, M, N = np.array([g.sum() for g in world["g"]]), world["M"], world["N"]
-    squares = np.sum(totals ** 2) / M * (1 - 1 / N) + totals.sum() ** 2 / N
+    squares = np.sum(totals**2) / M * (1 - 1 / N) + totals.sum() ** 2 / N
     assert moment(world) - squares == pytest.approx(variance(world), rel=1e-9)
 
 
 def test_any_pmf_is_unbiased(world):
-    """A pmf of another target, with zeros where there is light: the uniform share keeps the mean."""
+    """A pmf of another target, with zeros where there is light: the uniform share keeps the
+    mean."""
     if not countable(world):
         return
     rng = np.random.default_rng(1)
     cached = [q * rng.choice([0, 0.1, 3], len(q)) for q in world["q_star"]]
     expected = sum(g.sum() for g in world["g"])
     assert enumerate_world(world, 0.1, cached)[0] == pytest.approx(expected, rel=1e-9)
-    assert enumerate_world(world, 0.1, [0 * q for q in cached])[0] == pytest.approx(expected, rel=1e-9)
+    assert enumerate_world(world, 0.1, [0 * q for q in cached])[0] == pytest.approx(
+        expected, rel=1e-9
+    )
 
 
 def test_weights_are_the_best(world):
-    """Resampled techniques and an ordinary one share the light f: no other weights have a lower sum of second moments."""
+    """Resampled techniques and an ordinary one share the light f: no other weights have a lower sum
+    of second moments."""
     rng = np.random.default_rng(2)
     M, N, p, q_star = world["M"], world["N"], world["p"], world["q_star"]
     f, other, count = world["g"], [rng.uniform(0.05, 1, len(x)) for x in p], 7
@@ -112,7 +153,9 @@ def test_weights_are_the_best(world):
     assert all(np.allclose(a + b, 1, atol=1e-14) for a, b in weights)
 
     def noise(resampled):
-        ordinary = sum(np.sum(((1 - w) * x) ** 2 / d) for w, x, d in zip(resampled, f, other)) / count
+        ordinary = (
+            sum(np.sum(((1 - w) * x) ** 2 / d) for w, x, d in zip(resampled, f, other)) / count
+        )
         return moment(world, [w * x for w, x in zip(resampled, f)]) + ordinary
 
     least = noise([a for a, _ in weights])
@@ -122,7 +165,9 @@ def test_weights_are_the_best(world):
 
 
 def test_single_precision(world):
-    assert variance(world, np.float32) == pytest.approx(variance(world), rel=2e-4)     # differences of sums of some tens of terms
+    assert variance(world, np.float32) == pytest.approx(
+        variance(world), rel=2e-4
+    )  # differences of sums of some tens of terms
 
 
 def test_drjit_arrays(world, rgb):
@@ -139,9 +184,11 @@ def test_drjit_arrays(world, rgb):
 
 # ---------------------------------------------------------------- limits
 
+
 @pytest.mark.parametrize("S", [1, 2, 5])
 def test_one_sub_path_with_uniform_pmf(S):
-    """M = 1 with a pmf uniform over the S lengths: p_t = p/S, bidirectional path tracing with one light vertex picked at random."""
+    """M = 1 with a pmf uniform over the S lengths: p_t = p/S, bidirectional path tracing with one
+    light vertex picked at random."""
     p = np.array([1e-6, 0.3, 2e4])
     ratio = resampling.density_ratio(resampling.pmf(np.ones(3), S, S), 1)
     assert np.allclose(p * resampling.gain(ratio, 1 / S, 1), p / S, rtol=1e-14, atol=0)
@@ -153,7 +200,11 @@ def test_nothing_visible(uniform):
     """Q = 0: the uniform pmf, and weights of finite densities."""
     pmf = resampling.pmf(np.zeros(6), 0.0, 6, uniform)
     assert np.allclose(pmf, 1 / 6, rtol=1e-14)
-    assert np.allclose(resampling.gain(resampling.density_ratio(pmf, 3), 0.5, 3), 1 / (1 / 3 + (1 - 0.5 / 3) / 0.5), rtol=1e-14)
+    assert np.allclose(
+        resampling.gain(resampling.density_ratio(pmf, 3), 0.5, 3),
+        1 / (1 / 3 + (1 - 0.5 / 3) / 0.5),
+        rtol=1e-14,
+    )
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
@@ -164,27 +215,39 @@ def test_length_share_above_one(dtype):
             value = resampling.gain(np.array([1.0], dtype), np.array([share], dtype), M)
             assert np.all((value > 0) & (value <= M))
     assert np.all(resampling.bracket(np.array([1 + 1e-6, 2, 1e9], dtype), 1) == 0)
-    assert resampling.gain(np.array([0.3], dtype), np.array([1.2], dtype), 1)[0] == 1     # the only proposal is always drawn
+    assert (
+        resampling.gain(np.array([0.3], dtype), np.array([1.2], dtype), 1)[0] == 1
+    )  # the only proposal is always drawn
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_one_dominant_sub_path(dtype):
-    """One sub-path holds nearly all of the target: it is drawn always and has the density M p; the others keep the uniform share."""
+    """One sub-path holds nearly all of the target: it is drawn always and has the density M p; the
+    others keep the uniform share."""
     r = np.array([1e9, 1, 0, 0], dtype)
     pmf = resampling.pmf(r, r.sum(), 4, 0.04)
     assert pmf.sum() == pytest.approx(1, abs=1e-6) and np.all(pmf >= 0.0099)
-    gains = resampling.gain(resampling.density_ratio(pmf, 4), np.array([0.97, 0.01, 0.01, 0.01], dtype), 4)
+    gains = resampling.gain(
+        resampling.density_ratio(pmf, 4), np.array([0.97, 0.01, 0.01, 0.01], dtype), 4
+    )
     assert np.all(np.isfinite(gains)) and gains[0] > 2 and np.all(gains[1:] < 0.05)
-    assert resampling.gain(np.array([np.inf], dtype), np.array([1.0], dtype), 4)[0] == pytest.approx(4)
+    assert resampling.gain(np.array([np.inf], dtype), np.array([1.0], dtype), 4)[
+        0
+    ] == pytest.approx(4)
 
 
-@given(ratio=st.one_of(st.just(0.0), st.just(np.inf), st.floats(0, 1e30)), share=st.floats(0, 1e6), M=st.integers(1, 10000),
-       N=st.integers(1, 64), dtype=st.sampled_from([np.float32, np.float64]))
+@given(
+    ratio=st.one_of(st.just(0.0), st.just(np.inf), st.floats(0, 1e30)),
+    share=st.floats(0, 1e6),
+    M=st.integers(1, 10000),
+    N=st.integers(1, 64),
+    dtype=st.sampled_from([np.float32, np.float64]),
+)
 @settings(max_examples=300, deadline=None)
 def test_any_gain_is_a_number(ratio, share, M, N, dtype):
     value = resampling.gain(np.array([ratio], dtype), np.array([share], dtype), M, N)
     assert np.all(np.isfinite(value) & (value >= 0) & (value <= M * (1 + 1e-6))), value
-    assert ratio > 0 or value[0] == 0             # what is never drawn has no share
+    assert ratio > 0 or value[0] == 0  # what is never drawn has no share
 
 
 def test_paths_without_techniques():
