@@ -51,7 +51,7 @@ class Together:
     @property
     def samples(self):
         """Camera paths a pixel so far."""
-        return self.session.iterations * self.session.samples_per_iteration
+        return self.session.iterations * self.session.camera_paths
 
 
 class Apart:

@@ -147,7 +147,7 @@ def measure(
     contenders.append(Contender("path", path_maker.make(seed=0)))
     take_turns(contenders, seconds, tell)
     iteration, with_probes, path_pass = (1000 * median(c.seconds) for c in contenders)
-    path_sample = path_pass / contenders[2].session.samples_per_iteration
+    path_sample = path_pass / contenders[2].session.camera_paths
     return {
         "scene": opened.name,
         "size": f"{size}x{size}",
@@ -207,7 +207,7 @@ def radius_for(session, photons_a_gather: float) -> tuple[float, int, int, float
         first,
         stride,
         session.chunk,
-        session.samples_per_iteration,
+        session.camera_paths,
         session.vertex_capacity,
         spectral,
     )

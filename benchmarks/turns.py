@@ -95,7 +95,7 @@ class Contender:
     def take_snapshot(self) -> None:
         """Keep the picture as it is now; the time that it takes does not count."""
         session = self.session
-        samples = session.iterations * session.samples_per_iteration
+        samples = session.iterations * session.camera_paths
         self.snapshots.append(
             Snapshot(self.rendering, session.iterations, samples, colours(session))
         )
@@ -104,7 +104,7 @@ class Contender:
         """Whether one more iteration brings the time used closer to ``seconds``, or is needed for
         ``spp`` samples per pixel."""
         if spp:
-            return self.session.iterations * self.session.samples_per_iteration < spp
+            return self.session.iterations * self.session.camera_paths < spp
         if not self.seconds:
             return True
         next_one = (

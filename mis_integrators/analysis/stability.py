@@ -74,7 +74,7 @@ def breaks(points: Sequence[Point]) -> list[bool]:
 
 
 @dataclass(frozen=True)
-class Choice:
+class ParameterChoice:
     """What to use over a range of a parameter, and what to avoid there."""
 
     low: float
@@ -90,7 +90,7 @@ CLOSE = 1.25
 """Ratio of errors up to which methods count as about as good."""
 
 
-def choose(sweeps: dict[str, Sequence[Point]]) -> list[Choice]:
+def choose(sweeps: dict[str, Sequence[Point]]) -> list[ParameterChoice]:
     """Ranges of neighbouring values with the same best method: least error among those whose mean
     is not off, but a range goes on while its method's error stays within `CLOSE` times the least.
     `sweeps`: the points of each method, all at the same values."""
@@ -121,7 +121,7 @@ def choose(sweeps: dict[str, Sequence[Point]]) -> list[Choice]:
                 )
             )
             choices.append(
-                Choice(
+                ParameterChoice(
                     values[start],
                     values[index - 1],
                     best[start],

@@ -221,7 +221,7 @@ def _metadata(
         "integrator": loaded.plugin,
         **loaded.parameters,
         **session.settings,
-        "spp": session.iterations * session.samples_per_iteration,
+        "spp": session.iterations * session.camera_paths,
         "iterations": session.iterations,
         "seed": options.seed,
         "variant": options.variant,
@@ -249,15 +249,15 @@ def _render(
     planned = None if options.time else session.iterations_planned
     with (
         Progress(
-            lambda: pixels * session.samples_per_iteration, planned, options.time, options.quiet
+            lambda: pixels * session.camera_paths, planned, options.time, options.quiet
         ) as progress,
         dr.scoped_set_flag(dr.JitFlag.KernelHistory),
     ):
         asked = options.spp or sensor.sampler().sample_count()
-        if planned and planned * session.samples_per_iteration > asked:
+        if planned and planned * session.camera_paths > asked:
             progress.say(
-                f"{asked} samples per pixel rounded up to {planned * session.samples_per_iteration}: "
-                f"{planned} iterations of {session.samples_per_iteration}"
+                f"{asked} samples per pixel rounded up to {planned * session.camera_paths}: "
+                f"{planned} iterations of {session.camera_paths}"
             )
         path = checkpoint.beside(options.output)
         keep = Chore(

@@ -70,11 +70,11 @@ def attribute(options: argparse.Namespace, session: Session, learned: dict[str, 
     if "camera_paths" in session.settings:
         given["parameters"] = [
             *(pair for pair in given["parameters"] if pair[0] != "camera_paths"),
-            ("camera_paths", str(session.samples_per_iteration)),
+            ("camera_paths", str(session.camera_paths)),
         ]
     return json.dumps(
         {
-            "options": {**given, "spp": session.iterations * session.samples_per_iteration},
+            "options": {**given, "spp": session.iterations * session.camera_paths},
             "learned": learned,
             "versions": versions(),
         }

@@ -10,18 +10,18 @@ import threading
 from collections.abc import Callable
 from typing import Any, TypeVar
 
-TURN = threading.RLock()
+RENDER_LOCK = threading.RLock()
 """Whoever renders or develops holds it."""
 
 Method = TypeVar("Method", bound=Callable[..., Any])
 
 
-def by_turns(method: Method) -> Method:
+def under_render_lock(method: Method) -> Method:
     """The function, run by one thread at a time among all those that are so decorated."""
 
     @functools.wraps(method)
     def alone(*arguments: Any, **options: Any) -> Any:
-        with TURN:
+        with RENDER_LOCK:
             return method(*arguments, **options)
 
     return alone  # type: ignore[return-value]

@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .render_lock import by_turns
+from .render_lock import under_render_lock
 from .sums import Sums
 from .untrusted import Fields
 
@@ -43,7 +43,7 @@ class Session(Protocol):
     def iterations(self) -> int:
         """Iterations done."""
 
-    samples_per_iteration: int
+    camera_paths: int
     """Camera paths per pixel of one iteration."""
 
     channels: list[str]
@@ -159,10 +159,8 @@ class MitsubaSession:
         # The sampler has the last word: some of them only know squares or powers of two.
         sampler = self._sensor.sampler().clone()
         sampler.set_sample_count(samples)
-        self.samples_per_iteration = int(sampler.sample_count())
-        self.iterations_planned = (
-            math.ceil(self._spp / self.samples_per_iteration) if self._spp else None
-        )
+        self.camera_paths = int(sampler.sample_count())
+        self.iterations_planned = math.ceil(self._spp / self.camera_paths) if self._spp else None
 
     @property
     def iterations(self) -> int:
@@ -170,7 +168,7 @@ class MitsubaSession:
 
     @property
     def learned(self) -> dict[str, Any]:
-        return {"samples_per_iteration": self.samples_per_iteration}
+        return {"samples_per_iteration": self.camera_paths}
 
     def recall(self, learned: dict[str, Any]) -> None:
         fields = Fields(learned, "learned")
@@ -180,13 +178,13 @@ class MitsubaSession:
     def start(self) -> None:
         pass
 
-    @by_turns
+    @under_render_lock
     def iterate(self, iteration: int | None = None) -> None:
         iteration = self.sums.done.first_missing if iteration is None else iteration
         seed = int(np.random.SeedSequence((self._seed, iteration)).generate_state(1)[0])
         with dr.suspend_grad():
             self._integrator.render(
-                self._scene, self._sensor, seed=seed, spp=self.samples_per_iteration, develop=False
+                self._scene, self._sensor, seed=seed, spp=self.camera_paths, develop=False
             )
         # The film has all channels; the tensor that render() could return lacks some under `aov`.
         image = np.array(self._sensor.film().bitmap(), np.float64).reshape(self._shape)

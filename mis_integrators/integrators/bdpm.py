@@ -138,7 +138,7 @@ class BDPMSession(IterativeSession):
             Lights.seen_by(scene, sensor, integrator.plugin),
         )
         self.split_paths(CAMERA_CHUNK)
-        self.light_paths = integrator.photon_count or min(
+        self.light_path_count = integrator.photon_count or min(
             film_sample_count(sensor), MOST_LIGHT_PATHS
         )
         depth = integrator.max_depth
@@ -151,7 +151,7 @@ class BDPMSession(IterativeSession):
         self.one_vertex = not self.traits.has_mixed and (
             integrator.bdd == 0 or not self.has_caustics
         )
-        self.photon_capacity = rounded_up(3 * self.light_paths)
+        self.photon_capacity = rounded_up(3 * self.light_path_count)
         self.vertex_capacity = self._vertex_room(self.chunk)
         self.radii = (
             dict.fromkeys(self.kinds(), integrator.initial_radius)
@@ -179,7 +179,7 @@ class BDPMSession(IterativeSession):
     def settings(self):
         radii = {f"radius.{kind}": radius for kind, radius in (self.radii or {}).items()}
         corrected = {f"edge_correction.{kind}": flag for kind, flag in self.corrected.items()}
-        return {**super().settings, "photon_count": self.light_paths, **radii, **corrected}
+        return {**super().settings, "photon_count": self.light_path_count, **radii, **corrected}
 
     @property
     def last_vertex(self):
@@ -230,7 +230,7 @@ class BDPMSession(IterativeSession):
             self.lights,
             self.traits,
             seed,
-            self.light_paths,
+            self.light_path_count,
             self.photon_capacity,
             spectral["wavelengths"],
             sensor.shutter_open(),
@@ -240,10 +240,10 @@ class BDPMSession(IterativeSession):
         )
 
     def _trace_camera(
-        self, scene, sensor, seed, first, stride, paths, together, capacity, spectral
+        self, scene, sensor, seed, first, stride, paths, camera_paths, capacity, spectral
     ):
         """Traces `paths` camera paths, those with numbers `first`, `first + stride`, ..., of which
-        each pixel has so many `together`."""
+        each pixel has so many `camera_paths`."""
         integrator = self.integrator
         return trace_camera_paths(
             scene,
@@ -255,7 +255,7 @@ class BDPMSession(IterativeSession):
             first,
             stride,
             paths,
-            together,
+            camera_paths,
             spectral["sample"],
             integrator.bdd,
             integrator.max_depth,
@@ -275,7 +275,7 @@ class BDPMSession(IterativeSession):
             vertices,
             radii,
             spectral["wavelengths"],
-            self.light_paths,
+            self.light_path_count,
             self.integrator.max_depth,
             only_last=kind == "indirect",
             grey=grey,
@@ -309,9 +309,14 @@ class BDPMSession(IterativeSession):
         return total
 
     def _map(self, photons, kind, radius):
-        notes = photons[3] if kind == "indirect" and len(photons) > 3 else None
+        mis_words = photons[3] if kind == "indirect" and len(photons) > 3 else None
         return build_photon_map(
-            *photons[:3], self.traits.bounds, self._cell(radius), self.photon_capacity, kind, notes
+            *photons[:3],
+            self.traits.bounds,
+            self._cell(radius),
+            self.photon_capacity,
+            kind,
+            mis_words,
         )
 
     def _cell(self, radius):
@@ -328,7 +333,7 @@ class BDPMSession(IterativeSession):
             first,
             1,
             self.chunk,
-            self.samples_per_iteration,
+            self.camera_paths,
             self.vertex_capacity,
             spectral,
         )
@@ -387,7 +392,7 @@ class BDPMSession(IterativeSession):
         return {
             "radii": {kind: float(radius) for kind, radius in self.radii.items()},
             "corrected": {kind: bool(flag) for kind, flag in self.corrected.items()},
-            "camera_paths": self.samples_per_iteration,
+            "camera_paths": self.camera_paths,
         }
 
     def recall(self, learned):

@@ -61,7 +61,7 @@ class BDPMAuto(IterativeIntegrator):
         if has_media(scene):
             volumetric = mi.load_dict({"type": "volpath_multiview", **handed_on(self)})
             return volumetric.session(
-                scene, sensor, seed, (iterations or 0) * self.fewest_camera_paths
+                scene, sensor, seed, (iterations or 0) * self.initial_camera_paths
             )
         return AutoSession(self, scene, sensor, seed, iterations)
 
@@ -116,7 +116,7 @@ class AutoSession(IterativeSession):
             )
 
     def _take(self, decision):
-        self.decision, self.samples_per_iteration = decision, decision.session.samples_per_iteration
+        self.decision, self.camera_paths = decision, decision.session.camera_paths
 
     @property
     def learned(self):

@@ -73,22 +73,22 @@ class BDPMBalance(WeightedBDPM):
 class BDPMBalanceSession(WeightedSession):
     """Iterations of `bdpm_balance`."""
 
-    def weights(self, merging):
+    def weights(self, merge_settings):
         integrator = self.integrator
         beta = int(integrator.beta) if integrator.beta == int(integrator.beta) else integrator.beta
         return HeuristicWeights(
             self.lights,
-            merging["disk_paths"],
-            merging["caustic_share"],
+            merge_settings["disk_paths"],
+            merge_settings["caustic_share"],
             integrator.strategies,
             beta,
         )
 
-    def merging(self, radii):
+    def merge_settings(self, radii):
         radius = radii.get("indirect", radii.get("caustic"))
         both = {"caustic", "indirect"} <= radii.keys()
         return {
-            "disk_paths": dr.pi * dr.square(radius) * self.light_paths,
+            "disk_paths": dr.pi * dr.square(radius) * self.light_path_count,
             "caustic_share": dr.square(radius / radii["caustic"]) if both else mi.Float(1),
         }
 

@@ -8,7 +8,7 @@ import math
 import drjit as dr
 import mitsuba as mi
 
-from ..mis.neighbour_radiance import Surroundings
+from ..mis.neighbour_radiance import NeighbourRadiance
 from ..mis.optimal import OptimalWeights
 from ..paths.light_pass import trace_light_paths
 from ..photons.irradiance_cache import IrradianceCache
@@ -135,12 +135,12 @@ class BDPMOptSession(WeightedSession):
         area = (
             USUAL_PHOTONS
             * self.cache.typical_flux
-            / (self.light_paths * max(self.cache.mean, 1e-30))
+            / (self.light_path_count * max(self.cache.mean, 1e-30))
         )
         return dr.opaque(mi.Float, math.sqrt(area / math.pi))
 
     def __init__(self, integrator, scene, sensor, seed, iterations):
-        self.cache = self.surroundings = None
+        self.cache = self.neighbour_radiance = None
         super().__init__(integrator, scene, sensor, seed, iterations)
         self.mix_diffuse = bool(integrator.mix_diffuse)
         self.undecided = integrator.mix_diffuse is None and self.radii is not None
@@ -153,7 +153,7 @@ class BDPMOptSession(WeightedSession):
         if self.undecided and self.integrator.strategies > 1:
             self._learn()
             photons = (
-                self.light_paths
+                self.light_path_count
                 * math.pi
                 * max(self.radii.values()) ** 2
                 * self.cache.mean
@@ -169,7 +169,7 @@ class BDPMOptSession(WeightedSession):
 
     def prepare(self, spectral):
         if self.integrator.weights == "full":
-            self.surroundings = Surroundings(
+            self.neighbour_radiance = NeighbourRadiance(
                 self.scene,
                 self.weights({"n": mi.Spectrum(0), "caustic_cost": mi.Float(0)}),
                 spectral["wavelengths"],
@@ -209,29 +209,31 @@ class BDPMOptSession(WeightedSession):
         super()._freeze()
         if self._weighted:
             self._tables += self.cache.tables() + (
-                [self.surroundings.table, self.surroundings.albedo] if self.surroundings else []
+                [self.neighbour_radiance.table, self.neighbour_radiance.albedo]
+                if self.neighbour_radiance
+                else []
             )
 
-    def weights(self, merging):
+    def weights(self, merge_settings):
         integrator = self.integrator
         return OptimalWeights(
             self.lights,
             self.traits,
             self.cache,
-            self.surroundings,
-            merging["n"],
-            merging["caustic_cost"],
+            self.neighbour_radiance,
+            merge_settings["n"],
+            merge_settings["caustic_cost"],
             integrator.strategies,
             integrator.first_vertex,
-            self.samples_per_iteration,
+            self.camera_paths,
             integrator.weights == "full",
             self.mix_diffuse,
         )
 
-    def merging(self, radii):
+    def merge_settings(self, radii):
         cache = self.cache
         inverse = [
-            dr.opaque(mi.Float, self.light_paths / flux if flux > 0 else 0.0)
+            dr.opaque(mi.Float, self.light_path_count / flux if flux > 0 else 0.0)
             for flux in cache.photon_flux
         ]  # no kernel's literals
         radius = radii.get("indirect", radii.get("caustic"))

@@ -153,7 +153,7 @@ class BDPTSession(IterativeSession):
         self.lights = Lights.seen_by(scene, sensor, integrator.plugin)
         self.split_paths(CHUNK)
         self.light_chunk = self.light_count()
-        self.light_paths = self.chunks * self.light_chunk
+        self.light_path_count = self.chunks * self.light_chunk
         width, height = sensor.film().crop_size()
         self.pixel_paths = width * height * integrator.camera_paths
         self.capacity = {
@@ -184,7 +184,7 @@ class BDPTSession(IterativeSession):
         """The weights of an iteration."""
         integrator = self.integrator
         beta = int(integrator.beta) if integrator.beta == int(integrator.beta) else integrator.beta
-        return ConnectionWeights(self.lights, beta, self.light_paths / self.pixel_paths)
+        return ConnectionWeights(self.lights, beta, self.light_path_count / self.pixel_paths)
 
     # ------------------------------------------------------------------ passes
 
@@ -272,7 +272,7 @@ class BDPTSession(IterativeSession):
         dr.scatter_reduce(dr.ReduceOp.Add, total, pair.value * share, z["path"], seen)
         if entries:
             ledger = self._ledger(dict(entries))
-            ledger.joined(z["path"], z["depth"], y["depth"], pair.value, share, seen)
+            ledger.connected(z["path"], z["depth"], y["depth"], pair.value, share, seen)
         return total, entries
 
     def _join_sensor(self, scene, sensor, tables, light, seed, spectral):
@@ -295,7 +295,7 @@ class BDPTSession(IterativeSession):
             self.integrator.hide_emitters,
             active,
         )
-        value = joined.value * (self.pixel_paths / self.light_paths)
+        value = joined.value * (self.pixel_paths / self.light_path_count)
         share = self.weights(spectral).seen_by_sensor(joined, y)
         channels = list(colour_channels(value * share, spectral["matrix"]))
         if self.integrator.techniques:

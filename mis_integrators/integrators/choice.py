@@ -18,7 +18,7 @@ import numpy as np
 from ..core.recording import lanes
 from ..core.spectra import channel_mean
 from ..paths.path_length_statistics import mean_segments
-from ..pilot.radius import relative_weights, usual_mean
+from ..pilot.radius import relative_weights, trimmed_mean
 from ..pilot.run import FEWEST_ITERATIONS, PILOT_INDEX, UNPLANNED_ITERATIONS, pilot_pixels
 from . import costs
 from .unidirectional import PathSession
@@ -31,7 +31,7 @@ PHOTON_MAPPERS = FIRST, OPT2, LATER, OPT3 = (
 )
 """The first is tried in any case."""
 CANDIDATES = ("path", {}), *PHOTON_MAPPERS
-PILOT_SHARE = 0.05
+TRIAL_TIME_SHARE = 0.05
 """Share of the planned time that the pilot may have; `path` and the first photon mapper are tried
 however long that takes."""
 KEEPS_UP = 4
@@ -168,11 +168,11 @@ def choose(integrator, scene, sensor, seed, iterations, seconds):
                 LIKE_THE_FIRST * first_seconds,
             )
         likely = weighting and plugin.startswith("bdpm_opt")
-        if gone + takes > PILOT_SHARE * whole and not (
+        if gone + takes > TRIAL_TIME_SHARE * whole and not (
             likely and takes < WORTH_SHARE * (whole - gone)
         ):
             reasons.append(
-                f"not {name}: trying it would take more than {WORTH_SHARE if likely else PILOT_SHARE:.0%} of the time"
+                f"not {name}: trying it would take more than {WORTH_SHARE if likely else TRIAL_TIME_SHARE:.0%} of the time"
             )
             continue
         weighting &= not likely
@@ -267,29 +267,29 @@ def _try_path(path, segments, stride, pixels, mean):
     passes = (
         PATH_TRIALS if mi.is_spectral else 1
     )  # wavelengths are shared by all that is traced at once
-    together = PATH_TRIALS // passes
-    trial = lanes(together * pixels) // pixels
+    at_once = PATH_TRIALS // passes
+    trial = lanes(at_once * pixels) // pixels
     values = []
-    stride *= path.samples_per_iteration
+    stride *= path.camera_paths
     first = trial * (-pixels * stride % 2**32)  # back to the first pixel
     for number in range(PILOT_INDEX, PILOT_INDEX + passes):
         radiance, *_ = path.trace(
-            number, 0, first, stride, together * pixels, path._spectral(number), trial
+            number, 0, first, stride, at_once * pixels, path._spectral(number), trial
         )
         values += list(
-            np.broadcast_to(np.array(channel_mean(radiance)), together * pixels).reshape(
-                together, pixels
+            np.broadcast_to(np.array(channel_mean(radiance)), at_once * pixels).reshape(
+                at_once, pixels
             )
         )
     path.sampler.seed(0, 1)
-    variance = usual_mean(relative_weights(mean) * np.var(values, axis=0, ddof=1))
+    variance = trimmed_mean(relative_weights(mean) * np.var(values, axis=0, ddof=1))
     return Trial(
         "path",
         {},
         path,
         0.0,
-        variance / path.samples_per_iteration,
-        costs.cost("path", costs.events(path, segments, None, 0.0)) * path.samples_per_iteration,
+        variance / path.camera_paths,
+        costs.cost("path", costs.events(path, segments, None, 0.0)) * path.camera_paths,
     )
 
 

@@ -13,7 +13,7 @@ from ..core.film import Accumulator, shared_wavelengths, variance_channels
 from ..core.packing import rounded_up
 from ..core.random import mix
 from ..core.recording import settle
-from ..core.render_lock import TURN, by_turns
+from ..core.render_lock import RENDER_LOCK, under_render_lock
 from ..core.traits import UnsupportedScene, check_film, check_scene, check_variant, unfinite_data
 from ..core.untrusted import Fields
 from ..paths.camera_pass import film_sample_count, with_gaps
@@ -68,7 +68,7 @@ class IterativeIntegrator(mi.AdjointIntegrator):
         return f"{type(self).__name__}[\n{lines}\n]"
 
     @property
-    def fewest_camera_paths(self):
+    def initial_camera_paths(self):
         """The parameter `camera_paths`; where it is automatic, one: until more turn out to be worth
         while."""
         return self.camera_paths or 1
@@ -91,14 +91,17 @@ class IterativeIntegrator(mi.AdjointIntegrator):
         self.check(scene, sensor)
         self.check_path_number([sensor])
         return self.new_session(
-            scene, sensor, scalar_seed(seed), self.planned_iterations(spp, self.fewest_camera_paths)
+            scene,
+            sensor,
+            scalar_seed(seed),
+            self.planned_iterations(spp, self.initial_camera_paths),
         )
 
     def check_path_number(self, sensors):
         """Raises `ValueError` where an iteration would have more camera paths than can be
         numbered."""
         pixels = sum(film_sample_count(sensor) for sensor in sensors)
-        if self.fewest_camera_paths * pixels > MOST_PATHS:
+        if self.initial_camera_paths * pixels > MOST_PATHS:
             raise ValueError(
                 f'{self.plugin}: parameter "camera_paths" = {self.camera_paths} makes more than {MOST_PATHS} paths an iteration on '
                 f"{pixels} pixels; ask for more samples per pixel (spp), and so more iterations, instead, or crop the film"
@@ -119,7 +122,7 @@ class IterativeIntegrator(mi.AdjointIntegrator):
 
     def say_rounded(self, session, spp):
         """Warns where a session of `spp` samples per pixel makes more of them."""
-        iterations, camera_paths = session.iterations_planned, session.samples_per_iteration
+        iterations, camera_paths = session.iterations_planned, session.camera_paths
         if iterations * camera_paths != spp:
             mi.Log(
                 mi.LogLevel.Warn,
@@ -157,7 +160,7 @@ class IterativeIntegrator(mi.AdjointIntegrator):
             self.say_rounded(session, spp)
             for _ in range(session.iterations_planned):
                 session.iterate()
-            with TURN:
+            with RENDER_LOCK:
                 self.say_unfinite(session)
                 session.fill_film()
                 if not develop:
@@ -185,7 +188,7 @@ class IterativeSession:
     def __init__(self, integrator, scene, sensor, seed, iterations):
         self.integrator, self.scene, self.sensor, self.seed = integrator, scene, sensor, seed
         self.iterations_planned = iterations
-        self.samples_per_iteration = integrator.fewest_camera_paths
+        self.camera_paths = integrator.initial_camera_paths
         self.accumulator = Accumulator(sensor.film(), integrator.variance)
         self.variant = mi.variant()
         settle(scene)
@@ -247,9 +250,9 @@ class IterativeSession:
         before are planned."""
         if self.iterations_planned:
             self.iterations_planned = math.ceil(
-                self.iterations_planned * self.samples_per_iteration / camera_paths
+                self.iterations_planned * self.camera_paths / camera_paths
             )
-        self.samples_per_iteration = camera_paths
+        self.camera_paths = camera_paths
 
     @property
     def settings(self):
@@ -257,11 +260,11 @@ class IterativeSession:
         return {
             "integrator": self.integrator.plugin,
             **self.integrator.settings(),
-            "camera_paths": self.samples_per_iteration,
+            "camera_paths": self.camera_paths,
             "seed": self.seed,
         }
 
-    @by_turns
+    @under_render_lock
     def iterate(self, iteration=None):
         """Runs one iteration to its end: that of the given number, or the first that is missing."""
         if mi.variant() != self.variant:
@@ -289,12 +292,9 @@ class IterativeSession:
         """Splits the `path_count` camera paths of an iteration into `chunks` parts of `chunk`
         paths, all those of a pixel in the same part and about `largest` at most: that bounds
         memory."""
-        self.path_count = film_sample_count(self.sensor) * self.samples_per_iteration
+        self.path_count = film_sample_count(self.sensor) * self.camera_paths
         self.chunks = -(-self.path_count // largest)
-        self.chunk = (
-            -(-self.path_count // (self.chunks * self.samples_per_iteration))
-            * self.samples_per_iteration
-        )
+        self.chunk = -(-self.path_count // (self.chunks * self.camera_paths)) * self.camera_paths
 
     def sum_of_chunks(self, render):
         """What `render(chunk, first)` returns, a tuple of tensors or `None`s, summed over all
@@ -312,15 +312,14 @@ class IterativeSession:
     def all_over_the_film(self, chunk=0):
         """Numbers `first` and `skip` of a part's camera paths that see all of the film, as of
         `trace_camera_vertices`: for pilots, or for all parts."""
-        paths = self.samples_per_iteration
+        paths = self.camera_paths
         return dr.opaque(mi.UInt32, chunk * paths), dr.opaque(mi.UInt32, paths * (self.chunks - 1))
 
     def in_chunk(self, first, skip=0):
         """Which of `chunk` paths from number `first` on there are, with gaps of `skip` after each
         pixel's: the last part may have fewer."""
         return (
-            dr.arange(mi.UInt32, self.chunk)
-            + with_gaps(first, skip, self.chunk, self.samples_per_iteration)
+            dr.arange(mi.UInt32, self.chunk) + with_gaps(first, skip, self.chunk, self.camera_paths)
             < self.path_count
         )
 
@@ -360,7 +359,7 @@ class IterativeSession:
         film.prepare(self.integrator.aov_names())
         return film
 
-    @by_turns
+    @under_render_lock
     def image(self):
         """The image so far: float32, (height, width, channels)."""
         if self.integrator.variance and self.iterations < 2:
@@ -371,7 +370,7 @@ class IterativeSession:
         return np.array(self.sensor.film().develop(), dtype=np.float32)
 
     @property
-    @by_turns
+    @under_render_lock
     def channels(self):
         """Channel names of `image()`."""
         return [field.name for field in self._emptied(self.sensor.film()).bitmap().struct_()]

@@ -23,11 +23,9 @@ def events(session, segments, last_vertex, gathered):
     (`None`: all); `gathered`: photons within a vertex's merge disks.
     """
     camera = float(sum(segments if last_vertex is None else segments[: last_vertex + 1]))
-    paths = getattr(session, "light_paths", 0)
+    paths = getattr(session, "light_path_count", 0)
     light = (
-        (paths + getattr(session, "photons_found", 0))
-        * session.samples_per_iteration
-        / session.path_count
+        (paths + getattr(session, "photons_found", 0)) * session.camera_paths / session.path_count
     )
     return camera, light, gathered, 1.0
 

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..pilot.radius import relative_weights, usual_mean
+from ..pilot.radius import relative_weights, trimmed_mean
 from . import costs
 
-LEAST, MOST = 1 / 8, 8.0
+LEAST_LIGHT_TRACING, MOST_LIGHT_TRACING = 1 / 8, 8.0
 """Bounds of the ratio."""
 MOST_CHOSEN = 1.0
 """The most that a pilot chooses. More light sub-paths take time from the rare paths that it does
@@ -25,7 +25,7 @@ would outweigh all others."""
 
 
 @dataclass
-class Noise:
+class LightTracingNoise:
     """Relative variances of a pixel, in an iteration with one light sub-path for each camera
     path."""
 
@@ -37,10 +37,10 @@ class Noise:
 
 def best_ratio(noise, light_cost, camera_cost):
     """Light sub-paths for each camera path: n that makes (camera + light / n) (camera_cost + n
-    light_cost) least, n^2 = light camera_cost / (camera light_cost), from `LEAST` to `MOST_CHOSEN`.
+    light_cost) least, n^2 = light camera_cost / (camera light_cost), from `LEAST_LIGHT_TRACING` to `MOST_CHOSEN`.
     `light_cost`, `camera_cost`: of a light sub-path and of a camera path, in the same unit."""
     square = noise.light * camera_cost / max(noise.camera * light_cost, 1e-30)
-    return float(np.clip(np.sqrt(square), LEAST, MOST_CHOSEN))
+    return float(np.clip(np.sqrt(square), LEAST_LIGHT_TRACING, MOST_CHOSEN))
 
 
 def path_costs(plugin, vertices, camera_paths):
@@ -60,7 +60,7 @@ def events(session):
 
 
 def observed_noise(corner, values, camera_paths, light, squares, weight):
-    """The `Noise` of one iteration.
+    """The `LightTracingNoise` of one iteration.
 
     NumPy arrays: `corner` (2 x paths): pixels of camera paths, column and line; `values` (paths):
     their radiance, the `camera_paths` of a pixel one after the other; `light`, `squares` (height x
@@ -88,11 +88,11 @@ def observed_noise(corner, values, camera_paths, light, squares, weight):
             for value in values
         ]
 
-    together = max(camera_paths, 2)
-    groups = len(values) // together
-    group = values[: groups * together].reshape(groups, together)
+    group_size = max(camera_paths, 2)
+    groups = len(values) // group_size
+    group = values[: groups * group_size].reshape(groups, group_size)
     camera, seen = tile_means(
-        *corner[:, : groups * together : together],
+        *corner[:, : groups * group_size : group_size],
         group.var(axis=1, ddof=1) / camera_paths,
         group.mean(axis=1),
     )
@@ -107,4 +107,6 @@ def observed_noise(corner, values, camera_paths, light, squares, weight):
     met = np.isfinite(seen)
     sensed, camera = sensed[met], camera[met]
     relative = relative_weights((seen + light)[met])
-    return Noise(*(usual_mean(relative * noise, RARE_TILES, 1) for noise in (sensed, camera)))
+    return LightTracingNoise(
+        *(trimmed_mean(relative * noise, RARE_TILES, 1) for noise in (sensed, camera))
+    )

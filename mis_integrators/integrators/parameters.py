@@ -10,7 +10,7 @@ REFUSED = {
 }
 
 
-LARGEST = 2**31 - 1
+LARGEST_INTEGER = 2**31 - 1
 """Integers beyond this fit into no array of 32 bits."""
 
 
@@ -42,7 +42,7 @@ class Parameters:
         self.known.append(name)
         return self.props.get(name, default) if name in self.props else default
 
-    def integer(self, name, default, low, allowed, high=LARGEST):
+    def integer(self, name, default, low, allowed, high=LARGEST_INTEGER):
         """An integer in [low, high]; `allowed` is the range in words (that a number is too large is
         added where it does not say so)."""
         value = self._get(name, default)

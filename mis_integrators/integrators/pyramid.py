@@ -47,13 +47,13 @@ class Ledger:
         value = value * share if self.weighted else value
         dr.scatter(self.entries[name], value, row * self.paths + path, mask)
 
-    def met(self, path, depth, value, share, mask):
+    def hit_emitter(self, path, depth, value, share, mask):
         self._write("met", depth - 1, path, value, share, mask & (depth <= self.longest))
 
-    def direct(self, path, depth, value, share, mask):
+    def next_event(self, path, depth, value, share, mask):
         self._write("direct", depth - 1, path, value, share, mask & (depth <= self.longest))
 
-    def joined(self, path, camera_depth, light_depth, value, share, mask):
+    def connected(self, path, camera_depth, light_depth, value, share, mask):
         """A connection of vertices that are so many segments from the sensor and from the light."""
         row = (camera_depth - 1) * self.longest + light_depth - 1
         self._write(

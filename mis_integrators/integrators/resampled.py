@@ -26,22 +26,28 @@ from ..mis.resampling import (
     LENGTHS,
     ResampledWeights,
     around,
-    doubt,
     guessed_weight,
-    ignorant,
+    pmf_mismatch,
     tabulate,
+    uniform_tables,
 )
 from ..paths.camera_vertices import STEP, hit_layout, sum_before, trace_camera_vertices
 from ..paths.connect import join_sensor, list_draws
 from ..paths.light_starts import sample_light_starts
 from ..paths.sensor import Lens
-from ..paths.subpaths import junction_of, read_vertices, seen_normal, trace_light_subpaths
+from ..paths.subpaths import read_vertices, seen_normal, trace_light_subpaths, vertex_bsdf_of
 from ..paths.vertex import scattered_mean
 from ..resampling.cache_points import CacheGrid
-from ..resampling.light_vertices import END, LightEnds, list_ends
+from ..resampling.light_vertices import END, LightVertices, list_light_vertices
 from ..resampling.proposals import Proposals, cumulative_sums
 from .common import IterativeIntegrator, IterativeSession
-from .light_tracing import LEAST, MOST, best_ratio, observed_noise, path_costs
+from .light_tracing import (
+    LEAST_LIGHT_TRACING,
+    MOST_LIGHT_TRACING,
+    best_ratio,
+    observed_noise,
+    path_costs,
+)
 
 CHUNK = 1 << 18
 """Camera paths, and as many light sub-paths, traced at once at most; larger films are traced in
@@ -70,7 +76,7 @@ class ResampledIntegrator(IterativeIntegrator):
     aware = True
 
     def read_parameters(self, parameters):
-        self.light_paths = parameters.integer(
+        self.resampled_light_paths = parameters.integer(
             "light_paths", 200, 1, "from 1 to 100000", high=100000
         )
         self.resamples = parameters.integer("resamples", 1, 1, "from 1 to 1024", high=1024)
@@ -79,14 +85,14 @@ class ResampledIntegrator(IterativeIntegrator):
         self.light_tracing = parameters.number(
             "light_tracing",
             0.0,
-            lambda n: n == 0 or LEAST <= n <= MOST,
-            f"0 or from {LEAST:g} to {MOST:g}",
+            lambda n: n == 0 or LEAST_LIGHT_TRACING <= n <= MOST_LIGHT_TRACING,
+            f"0 or from {LEAST_LIGHT_TRACING:g} to {MOST_LIGHT_TRACING:g}",
         )
 
     def settings(self):
         return {
             **super().settings(),
-            "light_paths": self.light_paths,
+            "light_paths": self.resampled_light_paths,
             "resamples": self.resamples,
             "cache_neighbors": self.cache_neighbors,
             "target": self.target,
@@ -130,7 +136,7 @@ class ResampledSession(IterativeSession):
             "camera": rounded_up(4 * self.chunk),
             "draws": rounded_up(self.chunk),
             "hits": rounded_up(self.chunk),
-            "ends": rounded_up(6 * integrator.light_paths),
+            "ends": rounded_up(6 * integrator.resampled_light_paths),
         }
         self.light_tracing = integrator.light_tracing or None
         self.lens = Lens(sensor).connects
@@ -144,7 +150,7 @@ class ResampledSession(IterativeSession):
         self.expected_weight = expected_weight(sensor.film(), integrator.camera_paths)
         self.recorded = recorder()
         self.grid = CacheGrid(mi.Point3f(0), mi.Normal3f(0, 0, 1), integrator.cache_neighbors)
-        self.records, self.shares = ignorant(self.grid)
+        self.records, self.shares = uniform_tables(self.grid)
         self.cache = self.known = self.first_light = self.begun = self.vertices = None
         self._freeze()
 
@@ -163,7 +169,7 @@ class ResampledSession(IterativeSession):
     def recall(self, learned):
         if learned:
             fields = Fields(learned, "learned")
-            self.light_tracing = fields.number("light_tracing", MOST)
+            self.light_tracing = fields.number("light_tracing", MOST_LIGHT_TRACING)
             fields.finish()
 
     def _wanted_light(self, iteration):
@@ -180,7 +186,7 @@ class ResampledSession(IterativeSession):
         wanted = ratio * self.chunk
         self.light_rounds = max(round(wanted / CHUNK), 1)
         self.light_chunk = max(
-            round(wanted / self.light_rounds), self.integrator.light_paths, KNOWN_PATHS
+            round(wanted / self.light_rounds), self.integrator.resampled_light_paths, KNOWN_PATHS
         )
         self.capacity["light"] = rounded_up(int(vertices * self.light_chunk))
         self.ratio = dr.opaque(
@@ -210,7 +216,7 @@ class ResampledSession(IterativeSession):
             self.grid,
             self.records,
             self.shares,
-            integrator.light_paths,
+            integrator.resampled_light_paths,
             integrator.resamples,
             integrator.aware,
             self.ratio,
@@ -261,24 +267,28 @@ class ResampledSession(IterativeSession):
         return sample_light_starts(
             self.lights,
             seed,
-            self.integrator.light_paths,
+            self.integrator.resampled_light_paths,
             spectral["wavelengths"],
             mi.Float(sensor.shutter_open()),
         )
 
     def _ends(self, starts, light, places, found):
-        M = self.integrator.light_paths
+        M = self.integrator.resampled_light_paths
         kept = dr.minimum(found, dr.opaque(mi.UInt32, self.capacity["ends"]))
-        return LightEnds(self.traits, self.lights, starts, M, light, places, kept + M, self.reach)
+        return LightVertices(
+            self.traits, self.lights, starts, M, light, places, kept + M, self.reach
+        )
 
     def _targets(
         self, scene, sensor, tables, seed, light, count, lengths, first, cache, spectral, target
     ):
         """q*/p of every light vertex of M sub-paths (from the number `first` on) at every cache
         point if nothing stood between, row by row; whether nothing does; what makes their
-        `LightEnds`; how many vertices they have; `guessed_weight`."""
-        room, M = self.capacity["ends"], self.integrator.light_paths
-        places, found = list_ends(light, count, lengths, first, M, self.capacity["light"], room)
+        `LightVertices`; how many vertices they have; `guessed_weight`."""
+        room, M = self.capacity["ends"], self.integrator.resampled_light_paths
+        places, found = list_light_vertices(
+            light, count, lengths, first, M, self.capacity["light"], room
+        )
         starts = self._starts(sensor, seed, spectral)
         ends = self._ends(starts, light, places, found)
         index = lanes(dr.width(cache["depth"]) * (M + room))
@@ -298,7 +308,7 @@ class ResampledSession(IterativeSession):
         else:
             r = channel_mean(
                 sent.light
-                * junction_of(self.traits, z, spectral["wavelengths"], active).between(
+                * vertex_bsdf_of(self.traits, z, spectral["wavelengths"], active).f_and_pdfs(
                     z["towards"], sent.d, active
                 )[0]
             )
@@ -352,7 +362,7 @@ class ResampledSession(IterativeSession):
 
     def _pmfs(self, r, seen, found):
         """The cache points' pmfs as of `cumulative_sums`."""
-        M, room = self.integrator.light_paths, self.capacity["ends"]
+        M, room = self.integrator.resampled_light_paths, self.capacity["ends"]
         pmfs = cumulative_sums(r, seen, dr.minimum(found, room) + M, M + room)
         dr.eval(pmfs)  # a recording cannot make it
         return pmfs
@@ -392,7 +402,10 @@ class ResampledSession(IterativeSession):
         integrator, weights = self.integrator, self.weights()
         ends = self._ends(starts, light, places, found)
         proposals = Proposals(
-            self.grid, *pmfs[:2], ends.count, integrator.light_paths + self.capacity["ends"]
+            self.grid,
+            *pmfs[:2],
+            ends.count,
+            integrator.resampled_light_paths + self.capacity["ends"],
         )
         index = lanes(self.capacity["draws"] * integrator.resamples)
         chosen, factor, count = draws
@@ -413,9 +426,9 @@ class ResampledSession(IterativeSession):
         segments = z["depth"] + sent.vertices
         if integrator.max_depth > 0:
             active &= segments <= integrator.max_depth
-        value, forward, back = junction_of(self.traits, z, spectral["wavelengths"], active).between(
-            z["towards"], sent.d, active
-        )
+        value, forward, back = vertex_bsdf_of(
+            self.traits, z, spectral["wavelengths"], active
+        ).f_and_pdfs(z["towards"], sent.d, active)
         carried = z["throughput"] * value * sent.light
         active &= (dr.max(carried) > 0) & dr.all(dr.isfinite(carried))
         active = ends.unblocked(scene, z["p"], z["n"], sent, active)
@@ -424,7 +437,11 @@ class ResampledSession(IterativeSession):
         ) * dr.gather(mi.Float, factor, slot, active)
         estimate = carried * (
             share
-            * dr.rcp(integrator.light_paths * integrator.resamples * dr.maximum(probability, 1e-20))
+            * dr.rcp(
+                integrator.resampled_light_paths
+                * integrator.resamples
+                * dr.maximum(probability, 1e-20)
+            )
         )
         total = radiance + dr.zeros(mi.Spectrum, self.chunk)  # radiance may be a single zero
         dr.scatter_reduce(dr.ReduceOp.Add, total, estimate, z["path"], active)
@@ -444,15 +461,15 @@ class ResampledSession(IterativeSession):
             camera,
             z,
             z["parent"],
-            sent.across * cosine,
-            sent.mean * dr.rcp(dr.maximum(sent.across, 1e-20)),
+            sent.pdf_area * cosine,
+            sent.mean * dr.rcp(dr.maximum(sent.pdf_area, 1e-20)),
             scattered_mean(value, z["n"], sent.d),
             back,
             segments,
             weights,
             active,
         )
-        return own * dr.rcp(dr.maximum(own + forward * cosine * sent.behind + nearer, 1e-20))
+        return own * dr.rcp(dr.maximum(own + forward * cosine * sent.mis_sum + nearer, 1e-20))
 
     def _meet(self, tables, radiance, camera, hits, hit_count):
         """Radiance of camera paths with that of emission that they meet beyond the first vertex
@@ -516,7 +533,10 @@ class ResampledSession(IterativeSession):
         here, whatever they have been told."""
         spectral = self._spectral(0)
         light, traced = self._light(0, 0, spectral), self._camera(0, 0, spectral)
-        vertices, M = min(int(traced[4][0]), self.capacity["camera"]), self.integrator.light_paths
+        vertices, M = (
+            min(int(traced[4][0]), self.capacity["camera"]),
+            self.integrator.resampled_light_paths,
+        )
         self.vertices = int(light[1][0]) / self.light_chunk, vertices / self.chunk
         wanted = min(max(FEWEST_CACHE_POINTS, int(vertices * CACHE_SHARE)), max(vertices, 1))
         self.capacity |= {
@@ -529,7 +549,7 @@ class ResampledSession(IterativeSession):
         self.grid = CacheGrid(
             self.cache["p"], seen_normal(self.cache), self.integrator.cache_neighbors
         )
-        self.records, self.shares = ignorant(self.grid)
+        self.records, self.shares = uniform_tables(self.grid)
         self._freeze()
         self.first_light = light
         if self.light_tracing is None and self.lens and (self.iterations_planned or FEW) >= FEW:
@@ -566,7 +586,7 @@ class ResampledSession(IterativeSession):
         if iteration > 0 and self.known is None:
             self.known = tabulate(self.grid, *self._integrals(self.first_light, self._spectral(0)))
             self.first_light = None
-        self.records, self.shares = self.known if iteration > 0 else ignorant(self.grid)
+        self.records, self.shares = self.known if iteration > 0 else uniform_tables(self.grid)
         self._fill_tables()
 
     def _take_light(self, iteration):
@@ -591,7 +611,7 @@ class ResampledSession(IterativeSession):
         cache = read_vertices(camera, from_numpy(mi.UInt32, chosen), active, states=STEP)
         cache = {
             name: cache[name]
-            for name in ("p", "n", "ns", "towards", "value", "density", "depth", "hit", "near")
+            for name in ("p", "n", "ns", "towards", "value", "density", "depth", "hit", "d_vcm")
             if name in cache
         }
         cache["through"] = dr.full(mi.Bool, False, count)
@@ -604,14 +624,18 @@ class ResampledSession(IterativeSession):
         return cache
 
     def _integrals(self, light, spectral):
-        """`Q_s`, `Q_blind`, `doubts` and `ends_s` as `tabulate` takes them."""
-        M, points, cache = self.integrator.light_paths, dr.width(self.cache["depth"]), self.cache
+        """`Q_s`, `Q_blind`, `pmf_mismatches` and `ends_s` as `tabulate` takes them."""
+        M, points, cache = (
+            self.integrator.resampled_light_paths,
+            dr.width(self.cache["depth"]),
+            self.cache,
+        )
         sets = max(min(-(-KNOWN_PATHS // M), MOST_KNOWN_SETS, self.light_chunk // M), 1)
         normals = to_numpy(seen_normal(cache)).T
         near = around(
             to_numpy(cache["p"]).T, normals, self.integrator.cache_neighbors, self.grid.normal_cost
         )
-        Q_s, Q_blind, doubts, ends_s = (
+        Q_s, Q_blind, pmf_mismatches, ends_s = (
             np.zeros((points, LENGTHS)),
             np.zeros(points),
             np.zeros(points),
@@ -637,9 +661,9 @@ class ResampledSession(IterativeSession):
             length = np.minimum(np.array(vertices)[:used], LENGTHS) - 1
             Q_s += np.where(seen, r, 0) @ np.eye(LENGTHS)[length]
             Q_blind += r.sum(axis=1)
-            doubts += doubt(near, r, seen)
+            pmf_mismatches += pmf_mismatch(near, r, seen)
             ends_s += np.bincount(length, minlength=LENGTHS)
-        return Q_s / (sets * M), Q_blind / (sets * M), doubts / sets, ends_s / (sets * M)
+        return Q_s / (sets * M), Q_blind / (sets * M), pmf_mismatches / sets, ends_s / (sets * M)
 
     # ------------------------------------------------------------------ iterations
 

@@ -1,6 +1,6 @@
 """The merge radius of progressive photon mapping: its parameters, and how it shrinks."""
 
-SMALLEST, LARGEST = 1e-15, 1e15
+SMALLEST_RADIUS, LARGEST_RADIUS = 1e-15, 1e15
 """Merge radii whose squares, and those of their small parts and multiples, are ordinary numbers of
 single precision."""
 
@@ -11,8 +11,8 @@ def read_radius(parameters):
         parameters.number(
             "initial_radius",
             0.0,
-            lambda r: r == 0 or SMALLEST <= r <= LARGEST,
-            f"0 (automatic) or from {SMALLEST:g} to {LARGEST:g}",
+            lambda r: r == 0 or SMALLEST_RADIUS <= r <= LARGEST_RADIUS,
+            f"0 (automatic) or from {SMALLEST_RADIUS:g} to {LARGEST_RADIUS:g}",
         ),
         parameters.number("alpha", 1.0, lambda a: 0 < a <= 1, "in (0, 1]"),
     )

@@ -38,7 +38,7 @@ class PathSession(IterativeSession):
         )
         self.sampler = mi.load_dict({"type": "independent"})
         if not integrator.camera_paths and iterations is None:
-            self.samples_per_iteration = max(1, BUSY // film_sample_count(sensor))
+            self.camera_paths = max(1, BUSY // film_sample_count(sensor))
         self.split_paths(CHUNK)
 
     @property
@@ -47,7 +47,7 @@ class PathSession(IterativeSession):
 
     @property
     def learned(self):
-        return {"camera_paths": self.samples_per_iteration}
+        return {"camera_paths": self.camera_paths}
 
     def recall(self, learned):
         fields = Fields(learned, "learned")
@@ -61,7 +61,7 @@ class PathSession(IterativeSession):
         one number differ with the variation."""
         seed = self._seed(iteration, PATHS) + variation
         _, active, _, ray, weight, position, _ = start_camera_paths(
-            self.sensor, seed, first, stride, paths, self.samples_per_iteration, spectral["sample"]
+            self.sensor, seed, first, stride, paths, self.camera_paths, spectral["sample"]
         )
         differential = mi.RayDifferential3f(ray)
         self.sampler.seed(self._seed(iteration, SAMPLER, chunk), paths)

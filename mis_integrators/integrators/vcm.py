@@ -107,7 +107,7 @@ class VCMSession(BDPTSession):
     @property
     def settings(self):
         radius = {} if self.radius is None else {"radius": self.radius}
-        return {**super().settings, "photon_count": self.light_paths, **radius}
+        return {**super().settings, "photon_count": self.light_path_count, **radius}
 
     def light_count(self):
         return -(-self.integrator.photon_count // self.chunks) or super().light_count()

@@ -12,7 +12,7 @@ import numpy as np
 from ..core.film import colour_channels, colour_matrix
 from ..core.random import mix, streams
 from ..core.recording import recorder
-from ..core.render_lock import by_turns
+from ..core.render_lock import under_render_lock
 from ..core.traits import UnsupportedScene, check_film, check_variant
 from ..lights.lights import Lights
 from ..volume.films import OWN, SHARED, ViewAccumulator, own_values, splat, write_film
@@ -161,7 +161,7 @@ class MultiViewSession(IterativeSession):
 
     def __init__(self, integrator, scene, sensors, seed, iterations, camera_paths):
         super().__init__(integrator, scene, sensors[0], seed, iterations)
-        self.samples_per_iteration = camera_paths
+        self.camera_paths = camera_paths
         self.views = Views(sensors, camera_paths, integrator.plugin)
         self.traits = VolumeTraits(scene, sensors)
         self.lights = Lights(scene, integrator.plugin, by_power=False)
@@ -446,7 +446,7 @@ class MultiViewSession(IterativeSession):
         images = [np.array(tensor, dtype=np.float32) for tensor in self.view_tensors()]
         return [image if image.ndim == 3 else image[:, :, None] for image in images]
 
-    @by_turns
+    @under_render_lock
     def view_tensors(self):
         """The images so far, one tensor a view, as films develop them."""
         images, first = [], 0

@@ -48,14 +48,14 @@ class WeightedSession(BDPMSession):
         """Makes what the weights need, once: before the pilot of the radius if that is weighted,
         else after it."""
 
-    def weights(self, merging):
-        """The weights (hooks as in `trace_camera_paths` and `trace_light_paths`); `merging` is what
+    def weights(self, merge_settings):
+        """The weights (hooks as in `trace_camera_paths` and `trace_light_paths`); `merge_settings` is what
         the method of that name returns."""
         raise TypeError(f"{type(self).__name__} does not define weights")
 
-    def merging(self, radii):
+    def merge_settings(self, radii):
         """What the weights must know of the merge disks: arrays of width one, by name."""
-        raise TypeError(f"{type(self).__name__} does not define merging")
+        raise TypeError(f"{type(self).__name__} does not define merge_settings")
 
     def weigher(self, weights, kind, level, vertices, photon_map):
         """What weighs the photons of a map, of one kind, at the vertices of one strategy (`weigh`
@@ -64,16 +64,19 @@ class WeightedSession(BDPMSession):
         vertices at once (`level` is None)."""
         if kind == "caustic" or level == self.integrator.strategies - 1:
             return None
-        notebook, state = weights.notebook(), [vertices[name] for name in STATE]
+        light_state, state = weights.light_state(), [vertices[name] for name in STATE]
 
         def weigh(index, f, p, back, active):
-            return weights.merging(
+            return weights.merge_weight(
                 level,
                 state,
                 f,
                 p,
-                notebook.read(
-                    level, photon_map.notes, photon_map.place_of_notes(index, active), active
+                light_state.read(
+                    level,
+                    photon_map.mis_words,
+                    photon_map.place_of_mis_words(index, active),
+                    active,
                 ),
             )
 
@@ -100,35 +103,37 @@ class WeightedSession(BDPMSession):
         spectral = super()._spectral(iteration)
         if self._weighted:
             radii = self.radii_at(iteration) if self.radii else {"indirect": self.usual_radius()}
-            spectral["merging"] = self.merging(radii)
-            dr.make_opaque(spectral["merging"])
+            spectral["merge_settings"] = self.merge_settings(radii)
+            dr.make_opaque(spectral["merge_settings"])
         return spectral
 
     def _trace_light(self, scene, sensor, tables, seed, spectral):
         if not self._weighted:
             return super()._trace_light(scene, sensor, tables, seed, spectral)
-        notebook = self.weights(spectral["merging"]).notebook() if self.has_indirect else None
+        light_state = (
+            self.weights(spectral["merge_settings"]).light_state() if self.has_indirect else None
+        )
         return trace_light_paths(
             scene,
             self.lights,
             self.traits,
             seed,
-            self.light_paths,
+            self.light_path_count,
             self.photon_capacity,
             spectral["wavelengths"],
             sensor.shutter_open(),
             sensor.shutter_open_time(),
             self.integrator.max_depth,
             self.integrator.rr_depth,
-            notebook=notebook,
+            light_state=light_state,
         )
 
     def _trace_camera(
-        self, scene, sensor, seed, first, stride, paths, together, capacity, spectral
+        self, scene, sensor, seed, first, stride, paths, camera_paths, capacity, spectral
     ):
         if not self._weighted:
             return super()._trace_camera(
-                scene, sensor, seed, first, stride, paths, together, capacity, spectral
+                scene, sensor, seed, first, stride, paths, camera_paths, capacity, spectral
             )
         integrator = self.integrator
         return trace_camera_paths(
@@ -141,7 +146,7 @@ class WeightedSession(BDPMSession):
             first,
             stride,
             paths,
-            together,
+            camera_paths,
             spectral["sample"],
             integrator.first_vertex + integrator.strategies - 1,
             integrator.max_depth,
@@ -151,13 +156,13 @@ class WeightedSession(BDPMSession):
             self.has_caustics,
             self.has_indirect,
             False,
-            self.weights(spectral["merging"]),
+            self.weights(spectral["merge_settings"]),
         )
 
     def _gather(self, photon_map, vertices, kind, radii, spectral, grey=False):
         if not self._weighted:
             return super()._gather(photon_map, vertices, kind, radii, spectral, grey)
-        weights = self.weights(spectral["merging"])
+        weights = self.weights(spectral["merge_settings"])
         if kind == "caustic":
             return self._merge(kind, None, photon_map, vertices, weights, radii, spectral, grey)
         integrator = self.integrator
@@ -192,7 +197,7 @@ class WeightedSession(BDPMSession):
             vertices,
             radii,
             spectral["wavelengths"],
-            self.light_paths,
+            self.light_path_count,
             self.integrator.max_depth,
             only_last=kind == "indirect",
             grey=grey,

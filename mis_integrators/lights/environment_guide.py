@@ -4,7 +4,7 @@ A sun, a sky or an environment map sends its sub-paths through the disk of the w
 bounding sphere; through a window, almost none would enter. A pilot of camera paths asks from which
 directions, and through which part of the plane across each direction, the places that matter are
 lit. Sub-paths then start mostly there: a histogram over (direction cell, position cell), and one
-over the faces of the box around the lit places (`entrances`), mixed with the plain densities, which
+over the faces of the box around the lit places (`portals`), mixed with the plain densities, which
 keeps every estimate unbiased however poor the pilot. The latter also tells next-event estimation
 where the windows are, if that makes less noise.
 """
@@ -23,7 +23,7 @@ from ..core.spectra import channel_mean
 from ..core.traits import scene_bounds
 from ..paths.camera_rays import sample_camera_ray
 from .histograms import draw_cell, in_square_cell, smoothed, square_cell
-from .portals import Entrances
+from .portals import PortalDistribution
 
 POLAR_CELLS = 16
 AZIMUTH_CELLS = 32
@@ -115,17 +115,15 @@ def _sees_sky(scene, ray, active):
     return reached
 
 
-def _aimed_density(entrances, own_pdf, p, towards, active=True):
+def _aimed_density(portals, own_pdf, p, towards, active=True):
     """Density per solid angle of directions from `p` of which, near the entrances, the
     `AIMED_SHARE` is aimed at these; all others have density `own_pdf`."""
-    near = active & entrances.near(p)
-    mixed = (1 - AIMED_SHARE) * own_pdf + AIMED_SHARE * entrances.direction_density(
-        p, towards, near
-    )
+    near = active & portals.near(p)
+    mixed = (1 - AIMED_SHARE) * own_pdf + AIMED_SHARE * portals.direction_density(p, towards, near)
     return dr.select(near, mixed, own_pdf)
 
 
-def _worth_aiming(entrances, p, d, light, density, own):
+def _worth_aiming(portals, p, d, light, density, own):
     """Whether direct light is less noisy with the `AIMED_SHARE` of its directions aimed at the
     entrances.
 
@@ -137,7 +135,7 @@ def _worth_aiming(entrances, p, d, light, density, own):
     """
     if len(light) < FEWEST_RECORDS:
         return False
-    aimed = np.array(_aimed_density(entrances, mi.Float(own), mi.Point3f(p), mi.Vector3f(d)))
+    aimed = np.array(_aimed_density(portals, mi.Float(own), mi.Point3f(p), mi.Vector3f(d)))
     return np.sum(light * density / aimed) < WORTH_AIMING * np.sum(light * density / own)
 
 
@@ -156,7 +154,7 @@ class EnvironmentGuide:
     kinds).
 
     Attributes: `center`, `radius` of the scene's bounding sphere; `focus_center`, `focus_radius` of
-    the lit places that the pilot met; `entrances` of the light of environments (`None` where the
+    the lit places that the pilot met; `portals` of the light of environments (`None` where the
     pilot saw next to none); `direction_share`, the share of environment sub-paths whose direction
     comes from the emitter's own sampler; `aims`, whether next-event estimation in the box around
     the lit places aims at the entrances.
@@ -175,7 +173,7 @@ class EnvironmentGuide:
         self.row_count = row
         self._first_row = mi.UInt32(first_rows)
         self.direction_share = 1.0
-        self.entrances = None
+        self.portals = None
         self.aims = False
         self._learn(sensor)
 
@@ -193,8 +191,8 @@ class EnvironmentGuide:
             self._cdf,
             self._guided,
         ]
-        if self.entrances is not None:
-            arrays += [self._entering, *self.entrances.tables()]
+        if self.portals is not None:
+            arrays += [self._entering, *self.portals.tables()]
         return arrays + (
             [self._direction_pmf, self._direction_cdf] if self.direction_share < 1 else []
         )
@@ -243,15 +241,17 @@ class EnvironmentGuide:
             entering = of_sky[row]
             if np.count_nonzero(entering) >= FEWEST_RECORDS:
 
-                def entrances(records):
-                    return Entrances(low, high, p[:, records], d[:, records], weight[records])
+                def portals(records):
+                    return PortalDistribution(
+                        low, high, p[:, records], d[:, records], weight[records]
+                    )
 
-                self.entrances = entrances(entering)
+                self.portals = portals(entering)
                 # What half of the records have taught is tried on the others: a histogram knows
                 # those too well that it was made from.
                 odd = np.cumsum(entering) % 2 == 1
                 self.aims = _worth_aiming(
-                    entrances(entering & odd),
+                    portals(entering & odd),
                     *(x[..., entering & ~odd & (own > 0)] for x in (p, d, light, density, own)),
                 )
         pmf = smoothed(pmf.reshape(-1, POSITION_CELLS, POSITION_CELLS), LEVEL_SHARES).reshape(
@@ -262,7 +262,7 @@ class EnvironmentGuide:
         self._pmf = from_numpy(mi.Float, pmf.ravel())
         self._cdf = from_numpy(mi.Float, np.cumsum(pmf, axis=1).ravel())
         guided = np.where(total > 0, 1 - DEFENSIVE_SHARE, 0.0)
-        if self.entrances is not None:
+        if self.portals is not None:
             met = np.bincount(row, minlength=self.row_count)
             entering = np.where(
                 of_sky, (1 - DEFENSIVE_SHARE) * ENOUGH_RECORDS / (ENOUGH_RECORDS + met), 0.0
@@ -439,9 +439,9 @@ class EnvironmentGuide:
         offset -= towards * dr.dot(offset, towards)
         on_disk = dr.squared_norm(offset) <= self.radius**2
         density = guided * probability / cell_area
-        if self.entrances is not None:
+        if self.portals is not None:
             entering = self._entering_share(towards, row, active)
-            density += entering * self.entrances.density(towards, p, active)
+            density += entering * self.portals.density(towards, p, active)
             guided += entering
         return density + dr.select(on_disk, (1 - guided) / (dr.pi * self.radius**2), 0)
 
@@ -449,7 +449,7 @@ class EnvironmentGuide:
         """Share of the sub-paths of a row that start where faces are lit; none where these look
         away."""
         return dr.select(
-            self.entrances.lit(towards), dr.gather(mi.Float, self._entering, row, active), 0
+            self.portals.lit(towards), dr.gather(mi.Float, self._entering, row, active), 0
         )
 
     def sample_position(self, towards, row, sample, jitter, extra, active):
@@ -472,10 +472,10 @@ class EnvironmentGuide:
         )
         disk = mi.warp.square_to_uniform_disk_concentric(sample)
         on_disk = self.center + self.radius * (disk.x * frame.s + disk.y * frame.t)
-        if self.entrances is not None:
+        if self.portals is not None:
             enters = ~use_grid & (extra < guided + self._entering_share(towards, row, active))
             on_disk = dr.select(
-                enters, self.entrances.sample(towards, sample, jitter, active & enters), on_disk
+                enters, self.portals.sample(towards, sample, jitter, active & enters), on_disk
             )
         p = dr.select(use_grid, on_grid, on_disk)
         density = self.position_density(towards, row, p, active)
@@ -518,7 +518,7 @@ class EnvironmentGuide:
     def direct_density(self, own_pdf, p, towards, active=True):
         """Density per solid angle of next-event estimation of an environment from `p`, where its
         own sampler has density `own_pdf`."""
-        return _aimed_density(self.entrances, own_pdf, p, towards, active) if self.aims else own_pdf
+        return _aimed_density(self.portals, own_pdf, p, towards, active) if self.aims else own_pdf
 
     # ------------------------------------------------------------------ power
 

@@ -36,7 +36,7 @@ def mis_power(pdf_a, pdf_b):
     return dr.select(pdf_a > 0, dr.rcp(1 + dr.square(ratio)), 0)
 
 
-class Choice:
+class EmitterSelection:
     """A discrete choice among emitters; free of random numbers and tables where there is one
     emitter only."""
 
@@ -126,7 +126,7 @@ class Lights:
             return
         uniform = UNIFORM_SHARE * power.sum() / max(np.count_nonzero(power), 1)
         weights = (1 - UNIFORM_SHARE) * power + uniform * (power > 0) if by_power else power > 0
-        self.choice = Choice(weights)
+        self.choice = EmitterSelection(weights)
         self.numbers = registry_table(
             self.emitters, mi.EmitterPtr, range(len(self.emitters)), mi.UInt32
         )
@@ -296,7 +296,7 @@ class Lights:
             aims = (
                 active
                 & self._of_kind(index, "environment", active=active)
-                & self.guide.entrances.near(ref.p)
+                & self.guide.portals.near(ref.p)
             )
             aimed = aims & (sample.x < AIMED_SHARE)
             left = dr.select(
@@ -322,7 +322,7 @@ class Lights:
     def _aim(self, ref, ds, weight, sample, aims, aimed):
         """`(ds, weight)` of `propose_direct` with the lanes `aimed` turned towards the entrances,
         and the lanes `aims`, among which they are, counted by the density of both ways together."""
-        towards, good = self.guide.entrances.sample_direction(ref.p, sample, aimed)
+        towards, good = self.guide.portals.sample_direction(ref.p, sample, aimed)
         ds.d = dr.select(aimed, towards, ds.d)
         ds.n = dr.select(aimed, mi.Normal3f(-towards), ds.n)
         ds.p = dr.select(aimed, ref.p + towards * (2 * self.guide.radius), ds.p)
@@ -471,7 +471,7 @@ class Lights:
         flux *= dr.rcp(probability)
         return ray, dr.select(dr.isfinite(channel_mean(flux)), flux, 0), unreachable, source
 
-    def emission_ratio(self, ref, ds, active):
+    def emission_over_nee_pdf(self, ref, ds, active):
         """How likely a light sub-path brings the light of `ds` to `ref`, over how likely next-event
         estimation does: density of `sample_emission` per unit area across the ray at `ref` times
         its density of the light's point or direction, over the latter's density of `sample_direct`
@@ -490,7 +490,7 @@ class Lights:
 
     # ------------------------------------------------------------------ starts of light sub-paths, apart from what follows
 
-    def start_density(self, ref, ds, active):
+    def pdf_emission_origin(self, ref, ds, active):
         """Density with which light sub-paths start from the light's point or direction in `ds`,
         emitter's choice included: per solid angle at `ref` (points of area lights have one per
         area; the geometric term turns it); a probability for lights that no ray can meet."""
@@ -507,7 +507,7 @@ class Lights:
             density = dr.select(sky, self.guide.direction_density(own, ds.d, sky), density)
         return dr.select(active, density * self.choice.probability(index), 0)
 
-    def forward_density(self, ref, ds, active):
+    def pdf_emission_area(self, ref, ds, active):
         """Density per unit area across the ray [1/m^2] at `ref` of light sub-paths that have
         started from the point or direction in `ds`."""
         index = lookup(self.numbers, ds.emitter, mi.UInt32, active)
@@ -530,9 +530,9 @@ class Lights:
             lookup(self.numbers, emitter, mi.UInt32, active), "area", "environment", active=active
         )
 
-    def untold(self, emitter, active):
+    def has_unknown_pdf(self, emitter, active):
         """Emitters whose light rays Mitsuba samples without telling their density;
-        `forward_density` is made up."""
+        `pdf_emission_area` is made up."""
         return active & self._of_kind(
             lookup(self.numbers, emitter, mi.UInt32, active), "ray", active=active
         )

@@ -27,7 +27,7 @@ MARGIN = 0.1
 box' edges."""
 
 
-class Entrances:
+class PortalDistribution:
     """A histogram over the faces of the box `low` to `high`: of the places where lines come out of
     the box towards the light. Two densities follow it: of lines, in each direction over the plane
     across it, and of directions from a point in the box.

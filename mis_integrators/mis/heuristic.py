@@ -18,7 +18,7 @@ N_F there is eta_VM). Between neighbours all but one vertex cancels, the geometr
     merging at z_i : merging a caustic photon at z_{i+1}       =  (R / R_caustic)^2 q_i / p_i
 
 rho_e [1/m^2] is the density, as an area density at z_{i+1}, with which light sub-paths start there
-over that with which next-event estimation finds the point of the light (`Lights.emission_ratio`
+over that with which next-event estimation finds the point of the light (`Lights.emission_over_nee_pdf`
 times the cosine). Next-event estimation and BSDF sampling count as one technique, with the density
 of the former; the camera pass divides the light between them. All camera paths of a pixel make all
 strategies, each path once, so their number cancels. That strategies share their sub-paths Veach's
@@ -39,13 +39,13 @@ from ..paths.camera_pass import STATE
 from ..paths.light_starts import seen_from
 from ..weights.heuristics import add_ratio, bounded_power, weight
 
-SMALLEST = 1e-20
+SMALLEST_DENSITY = 1e-20
 """Stands for zero densities, so that the ratio of two of them is one."""
 SMALLEST_COSINE = 1e-6
 
 
 def ratio(a, b):
-    return dr.maximum(a, SMALLEST) / dr.maximum(b, SMALLEST)
+    return dr.maximum(a, SMALLEST_DENSITY) / dr.maximum(b, SMALLEST_DENSITY)
 
 
 class HeuristicWeights:
@@ -60,6 +60,8 @@ class HeuristicWeights:
     def __init__(self, lights, disk_paths, caustic_share, strategies, beta):
         self.lights, self.disk_paths, self.caustic_share = lights, disk_paths, caustic_share
         self.strategies, self.beta = strategies, beta
+
+    weighs_points_of_lights = True
 
     # ------------------------------------------------------------------ densities
 
@@ -83,20 +85,20 @@ class HeuristicWeights:
         return (
             self.disk_paths
             * dr.abs(dr.dot(ref.n, ds.d))
-            * self.lights.emission_ratio(ref, ds, mask)
+            * self.lights.emission_over_nee_pdf(ref, ds, mask)
         )
 
     # ------------------------------------------------------------------ camera paths (hooks of `trace_camera_paths`)
 
-    def begin(self, width):
+    def init(self, width):
         """State of a camera path on its way to z_i: the sum of the strategies before z_{i-1}, and
         p_{i-1}. The sum -1 stands for none, not even z_{i-1}: `add_ratio` makes zero of it."""
         return [dr.full(mi.Float, -1, width), dr.ones(mi.Float, width)]
 
-    def arrived(self, state, si, bsdf, vertex, mask):
-        return state, mi.Spectrum(1)  # not used: see direct_share
+    def propagate(self, state, si, bsdf, vertex, mask):
+        return state, mi.Spectrum(1)  # not used: see next_event_weight
 
-    def leaving(self, state, si, bsdf, bs, vertex, mask):
+    def scatter(self, state, si, bsdf, bs, vertex, mask):
         """State after a smooth scattering into `bs.wo`."""
         total, p = state
         seen_by_light = mi.SurfaceInteraction3f(si)
@@ -107,17 +109,21 @@ class HeuristicWeights:
             dr.select(mask, self.onwards(si, bsdf, bs.wo, mask), p),
         ]
 
-    def direct_share(self, state, ref, ds, mask):
+    def next_event_weight(self, state, ref, ds, mask):
         """Weight of the direct light that `ds` brings to the vertex `ref`; `state`: after leaving
         `ref` for the light."""
         before, _ = state
         share = weight(bounded_power(self.expected_photons(ref, ds, mask), self.beta) * before, 0)
         return mi.Spectrum(dr.select(mask, share, 0))
 
-    def worth_merging(self, state, share, vertex, last):
+    @staticmethod
+    def ends(bsdf, vertex, mask):
+        return mi.Bool(False)
+
+    def merge_probability(self, state, share, vertex, last):
         return mi.Float(1)
 
-    def worth_going_on(self, state, vertex):
+    def continue_probability(self, state, vertex):
         return mi.Float(1)
 
     def stored(self, state):
@@ -125,9 +131,9 @@ class HeuristicWeights:
 
     # ------------------------------------------------------------------ photons
 
-    def notebook(self):
-        """What light sub-paths note down for these weights; `None` if nothing."""
-        return Notebook(self) if self.strategies > 1 else None
+    def light_state(self):
+        """What light sub-paths carry for these weights; `None` if nothing."""
+        return LightState(self) if self.strategies > 1 else None
 
     def weigher(self, kind, level, vertices, photon_map):
         """Weight of the photons of a map at the vertices of one strategy, `level`, or of all if the
@@ -140,8 +146,11 @@ class HeuristicWeights:
             if kind == "caustic":
                 before *= bounded_power(self.caustic_share, self.beta)
             elif level < self.strategies - 1:
-                q, deeper = self.notebook().read(
-                    level, photon_map.notes, photon_map.place_of_notes(index, active), active
+                q, deeper = self.light_state().read(
+                    level,
+                    photon_map.mis_words,
+                    photon_map.place_of_mis_words(index, active),
+                    active,
                 )
                 after = add_ratio(deeper, ratio(p, q), self.beta)
             return mi.Spectrum(weight(before, after))
@@ -149,8 +158,8 @@ class HeuristicWeights:
         return weigh
 
 
-class Notebook:
-    """Notes of a light sub-path that has scattered at z_{i+1} and lands at some z_i: q_i, and for
+class LightState:
+    """Sums of a light sub-path that has scattered at z_{i+1} and lands at some z_i: q_i, and for
     each level i, up to two before the last strategy, the sum of the strategies after z_{i+1}.
     Before the last there is one strategy after z_i, and its sum is zero. Right after the first
     scattering direct light is what comes next; then q_i holds its ratio's other factor, too. (Hooks
@@ -161,15 +170,15 @@ class Notebook:
         self.weights = weights
         self.levels = weights.strategies - 2
 
-    def begin(self):
-        """That factor, the noted q (zero: has not scattered yet), the sums."""
+    def init(self):
+        """That factor, q (zero: has not scattered yet), the sums."""
         return [
             mi.Float(self.weights.caustic_share),
             mi.Float(0),
             *[mi.Float(0) for _ in range(self.levels)],
         ]
 
-    def lit(self, state, si, source, straight):
+    def first_vertex(self, state, si, source, straight):
         """State at a vertex that the light of `source` reaches on the lanes `straight`: there
         next-event estimation competes, elsewhere caustic photons do."""
         weights = self.weights
@@ -179,7 +188,7 @@ class Notebook:
             *state[1:],
         ]
 
-    def scattered(self, state, si, bsdf, wo, mask):
+    def scatter(self, state, si, bsdf, wo, mask):
         """State after a smooth scattering into local direction `wo`."""
         factor, q_before, *sums = state
         first = q_before == 0
@@ -187,7 +196,8 @@ class Notebook:
         seen_by_camera.wi = mi.Vector3f(wo)
         p = self.weights.onwards(seen_by_camera, bsdf, si.wi, mask)
         q = dr.maximum(
-            self.weights.of_light(si, bsdf, wo, mask) * dr.select(first, factor, 1), SMALLEST
+            self.weights.of_light(si, bsdf, wo, mask) * dr.select(first, factor, 1),
+            SMALLEST_DENSITY,
         )
         sums_here = [
             dr.select(first, 0, add_ratio(deeper, ratio(p, q_before), self.weights.beta))
@@ -201,11 +211,11 @@ class Notebook:
         words = [float_bits(x) for x in state[1:]]
         return words + [mi.UInt32(0)] * ((2 - len(words)) if len(words) <= 2 else -len(words) % 4)
 
-    def read(self, level, notes, index, active):
+    def read(self, level, mis_words, index, active):
         """q_level of photon `index`, merged at z_level, and the sum of the strategies after
         z_{level + 1}."""
-        count = len(self.words(self.begin()))
-        q = bits_float(dr.gather(mi.UInt32, notes, count * index, active))
+        count = len(self.words(self.init()))
+        q = bits_float(dr.gather(mi.UInt32, mis_words, count * index, active))
         if level >= self.levels:
             return q, mi.Float(0)
-        return q, bits_float(dr.gather(mi.UInt32, notes, count * index + 1 + level, active))
+        return q, bits_float(dr.gather(mi.UInt32, mis_words, count * index + 1 + level, active))

@@ -20,7 +20,7 @@ DELTA_STEPS = 3
 OWN_STREAM = 0x6E656172
 
 
-class Surroundings:
+class NeighbourRadiance:
     """For each cell `len(SHARES)` typical neighbours, each with its radiance by direct and by other
     light (spectra).
 

@@ -65,7 +65,9 @@ class Node:
     def final_response(self, n, r):
         """gamma where no strategy goes on: as at an inner vertex beyond which nothing is merged, so
         that direct light and photons have weights of their own (the papers give both the same)."""
-        photons = self.indirect / recursion.at_least(r + self.kernel, recursion.SMALLEST)
+        photons = self.indirect / recursion.at_least(
+            r + self.kernel, recursion.SMALLEST_DENOMINATOR
+        )
         return recursion.inner_response(n, self.direct, r + self.noise, photons, 0, 0, 0)
 
 
@@ -87,7 +89,11 @@ def response(level, strategies, n, r, node, albedo=None):
     if albedo is not None:
         theta, rest = recursion.kernel_share(r, node.lobe_f), recursion.kernel_rest(r, node.lobe_f)
         next_r = recursion.next_ratio(theta, node.lobe_p)
-        incident = node.indirect * node.lobe_p / recursion.at_least(node.lobe_f, recursion.SMALLEST)
+        incident = (
+            node.indirect
+            * node.lobe_p
+            / recursion.at_least(node.lobe_f, recursion.SMALLEST_DENOMINATOR)
+        )
         e_next, _ = response(
             level + 1,
             strategies,
@@ -109,19 +115,21 @@ class OptimalWeights:
     """Weights of `strategies` merging strategies, the first at camera vertex `first`.
 
     `full`: keep the recursion's integrals, else drop them (local weights). `cache`: an
-    `IrradianceCache`; `surroundings`: a `Surroundings` of its cells (full weights only). `n`:
+    `IrradianceCache`; `neighbour_radiance`: a `NeighbourRadiance` of its cells (full weights only). `n`:
     photons per unit of irradiance in the merge disk (a spectrum of width one). `caustic_cost`: what
     merging a caustic photon costs in units of merging another one (width one). `mix_diffuse`:
     whether strategies go on beyond Lambertian vertices; else the first of these is a path's last
     strategy.
     """
 
+    weighs_points_of_lights = False
+
     def __init__(
         self,
         lights,
         traits,
         cache,
-        surroundings,
+        neighbour_radiance,
         n,
         caustic_cost,
         strategies,
@@ -130,11 +138,11 @@ class OptimalWeights:
         full,
         mix_diffuse,
     ):
-        self.lights, self.traits, self.cache, self.surroundings, self.n, self.caustic_cost = (
+        self.lights, self.traits, self.cache, self.neighbour_radiance, self.n, self.caustic_cost = (
             lights,
             traits,
             cache,
-            surroundings,
+            neighbour_radiance,
             n,
             caustic_cost,
         )
@@ -144,7 +152,7 @@ class OptimalWeights:
             full,
             mix_diffuse,
         )
-        self.albedo = surroundings.albedo if surroundings else None
+        self.albedo = neighbour_radiance.albedo if neighbour_radiance else None
         self.camera_paths = camera_paths if first == 0 else 1
         self.has_caustics = traits.has_delta or lights.needs_photons_for_direct_light()
         self.context = mi.BSDFContext()
@@ -212,7 +220,7 @@ class OptimalWeights:
             unoccluded
             * known.visible_share
             * dr.abs(wo.z)
-            / recursion.at_least(channel_mean(known.direct), recursion.SMALLEST),
+            / recursion.at_least(channel_mean(known.direct), recursion.SMALLEST_DENOMINATOR),
             1,
         )
         value = lobe_f
@@ -244,7 +252,7 @@ class OptimalWeights:
     @staticmethod
     def direct_weight(u, r, node):
         """Weight of direct light at a vertex, the last strategy of its paths."""
-        return u * r / recursion.at_least(r + node.noise, recursion.SMALLEST)
+        return u * r / recursion.at_least(r + node.noise, recursion.SMALLEST_DENOMINATOR)
 
     @staticmethod
     def final_weight(u, r, node):
@@ -262,7 +270,7 @@ class OptimalWeights:
         """
         f, p = self.lobe(si, bsdf, mask)
         r = recursion.first_ratio(p, self.camera_paths)
-        around = self.surroundings.lookup(self.cache.slot(si.p, self.side(si), mask), mask)
+        around = self.neighbour_radiance.lookup(self.cache.slot(si.p, self.side(si), mask), mask)
         e = sum(
             share
             * response(
@@ -277,13 +285,13 @@ class OptimalWeights:
 
     # ------------------------------------------------------------------ camera paths (hooks of `trace_camera_paths`)
 
-    def begin(self, width):
+    def init(self, width):
         """State of a camera path: drive and r of the vertex it arrives at; after arrival tau, and
         u: e drive, or the offset G at the first strategy's vertex, or the photons' weight where
         strategies end."""
         return [mi.Spectrum(dr.full(mi.Float, value, width)) for value in (1, 1, 0, 0)]
 
-    def arrived(self, state, si, bsdf, vertex, mask):
+    def propagate(self, state, si, bsdf, vertex, mask):
         """State at a smooth vertex, and the weight of the direct light there."""
         drive, r, u, tau = state
         share = mi.Spectrum(1)
@@ -305,7 +313,7 @@ class OptimalWeights:
             share = dr.select(here, self.direct_weight(remaining, r, node), share)
         return [drive, r, u, tau], share
 
-    def leaving(self, state, si, bsdf, bs, vertex, mask):
+    def scatter(self, state, si, bsdf, bs, vertex, mask):
         """State after a smooth scattering into `bs.wo`."""
         drive, r, u, tau = state
         mask = mask & (vertex >= self.first)
@@ -339,7 +347,7 @@ class OptimalWeights:
         """Whether the vertex is the path's last strategy though there are more."""
         return (vertex >= self.first) & self.is_last(bsdf, mask)
 
-    def worth_merging(self, state, share, vertex, last):
+    def merge_probability(self, state, share, vertex, last):
         """Probability with which photons are gathered: where the weights are small, seldom."""
         _, _, u, _ = state
         weight = dr.max(dr.abs(u))
@@ -347,7 +355,7 @@ class OptimalWeights:
             weight = dr.maximum(weight, dr.max(dr.abs(share)))
         return dr.select(vertex > self.first, dr.clip(weight / WEIGHT_KEPT, SELDOM, 1), 1)
 
-    def worth_going_on(self, state, vertex):
+    def continue_probability(self, state, vertex):
         """Probability with which the path goes on from an inner vertex: the deeper weights are at
         most about the drive."""
         drive, _, _, _ = state
@@ -360,13 +368,13 @@ class OptimalWeights:
 
     # ------------------------------------------------------------------ photons
 
-    def notebook(self):
+    def light_state(self):
         """What light sub-paths note down for these weights; `None` if nothing."""
-        return Notebook(self) if self.strategies > 1 else None
+        return LightState(self) if self.strategies > 1 else None
 
-    def merging(self, level, stored, f, p, passed):
+    def merge_weight(self, level, stored, f, p, passed):
         """Weight w_{l, level} of a photon that has passed the nodes `passed` (nearest first, see
-        `Notebook.read`), merged at a camera vertex with the state `stored`, scattered there with
+        `LightState.read`), merged at a camera vertex with the state `stored`, scattered there with
         value f and density p."""
         u, tau, r = stored
         if level == 0:
@@ -391,8 +399,8 @@ class OptimalWeights:
         return dr.select(node.indirectly, dr.select(node.last, final, here + deeper), direct)
 
 
-class Notebook:
-    """Notes of light sub-paths: what is known of the last `strategies - 1` vertices that scattered
+class LightState:
+    """Sums of light sub-paths: what is known of the last `strategies - 1` vertices that scattered
     smoothly, nearest first (hooks of `trace_light_paths`). Of the farthest, at which strategies
     end, only what `Node.final_response` and its weights ask for."""
 
@@ -432,7 +440,7 @@ class Notebook:
             indirectly,
         )
 
-    def begin(self):
+    def init(self):
         def nothing():  # a vertex that does not exist has negative radiance
             zero = mi.Spectrum(0)
             return self._fields(
@@ -454,7 +462,11 @@ class Notebook:
             [type(x)(x) for x in nothing()[:4]]
         ]
 
-    def scattered(self, state, si, bsdf, wo, mask):
+    @staticmethod
+    def first_vertex(state, si, source, straight):
+        return state
+
+    def scatter(self, state, si, bsdf, wo, mask):
         view = mi.SurfaceInteraction3f(si)
         view.wi = mi.Vector3f(wo)
         f, p = self.weights.scattering(view, bsdf, si.wi, mask) if self.whole else (None, None)
@@ -474,11 +486,11 @@ class Notebook:
                 words += [float_bits(x) for x in (field if dr.depth_v(field) > 1 else [field])]
         return words + [mi.UInt32(0)] * ((2 - len(words)) if len(words) <= 2 else -len(words) % 4)
 
-    def read(self, level, notes, index, active):
+    def read(self, level, mis_words, index, active):
         """The vertices that photon `index`, merged at z_level, has passed: `Node`s, nearest first,
         as many as there are strategies beyond that level. Those that do not exist come after one
         that direct light ends."""
-        template = self.begin()
+        template = self.init()
         count = len(self.words(template))
         template = template[: self.whole + 1 - level]
         template[-1] = template[-1][:4]
@@ -492,7 +504,7 @@ class Notebook:
             words += list(
                 dr.gather(
                     mi.Vector2u if count == 2 else mi.Vector4u,
-                    notes,
+                    mis_words,
                     max(count // 4, 1) * index + part,
                     active,
                 )

@@ -103,15 +103,17 @@ class ResampledWeights:
     def blank(width):
         return [dr.zeros(mi.Float, width) for _ in range(3)]
 
-    def lit(self, si, source, reachable, active, flux):
+    def init_light(self, si, source, reachable, active, flux):
         ds = seen_from(si, source, active)
         infinite = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
         ds.d = dr.select(active & infinite, si.to_world(si.wi), ds.d)
-        start = self.lights.start_density(si, ds, active)
-        across = self.lights.forward_density(si, ds, active)
+        start = self.lights.pdf_emission_origin(si, ds, active)
+        across = self.lights.pdf_emission_area(si, ds, active)
         made = across * dr.abs(dr.dot(si.n, ds.d))
         strength = dr.select(
-            self.lights.untold(ds.emitter, active), self.lights.total_power, channel_mean(flux)
+            self.lights.has_unknown_pdf(ds.emitter, active),
+            self.lights.total_power,
+            channel_mean(flux),
         )
         row = self.row(si.p, dr.mulsign(si.n, dr.dot(si.n, ds.d)))
         better = self.gain(
@@ -127,19 +129,21 @@ class ResampledWeights:
             strength,
         ]
 
-    def left(self, state, p_forward, p_back, delta, scattered):
-        near, far, strength = state
+    def scatter(self, state, p_forward, p_back, delta, scattered):
+        d_vcm, d_vc, strength = state
         return [
-            near,
-            dr.select(delta, far, theory.far_of(near + p_back * far, p_forward)),
+            d_vcm,
+            dr.select(delta, d_vc, theory.d_vc_of(d_vcm + p_back * d_vc, p_forward)),
             dr.select(
                 delta,
                 strength,
-                dr.minimum(strength * scattered * theory.reciprocal(p_forward), theory.LARGEST),
+                dr.minimum(
+                    strength * scattered * theory.reciprocal(p_forward), theory.LARGEST_RATIO
+                ),
             ),
         ]
 
-    def arrived(self, state, density, si, squared, depth):
+    def propagate(self, state, density, si, squared, depth):
         row = self.row(si.p, dr.mulsign(si.n, dr.dot(si.n, si.to_world(si.wi))))
         better = self.gain(state[2] * self.softened(density, squared), row, depth)
         return [dr.select(density > 0, better * theory.reciprocal(density), 0), state[1], state[2]]
@@ -148,21 +152,25 @@ class ResampledWeights:
 
     def seen_by_sensor(self, connection, light):
         """Weight of a `LensConnection` of a light vertex (t = 1)."""
-        a_light = light["near"] + connection.back * light["far"]
+        a_light = light["d_vcm"] + connection.back * light["d_vc"]
         return theory.connection(connection.density * (1 / self.ratio), a_light, 0, 0, 1)
 
 
-def guessed_weight(z, sent):
+def guessed_weight(z, joined):
     """Weight that joining the cache point `z` (a record of a camera vertex) to a light vertex that
-    sends `sent` would have among itself, the techniques nearer to the light, if the surface at `z`
+    sends `joined` would have among itself, the techniques nearer to the light, if the surface at `z`
     is diffuse, and the one next to the camera; all as if nothing was resampled.
 
     What is drawn should be proportional to weight times contribution. By q* alone long light
     sub-paths matter as much as direct light, though each of them is one of many ways to make its
     path."""
-    cosine = dr.abs(dr.dot(z["n"], sent.d))
+    cosine = dr.abs(dr.dot(z["n"], joined.d))
     return dr.rcp(
-        1 + dr.minimum(cosine * (dr.inv_pi * sent.behind + sent.across * z["near"]), theory.LARGEST)
+        1
+        + dr.minimum(
+            cosine * (dr.inv_pi * joined.mis_sum + joined.pdf_area * z["d_vcm"]),
+            theory.LARGEST_RATIO,
+        )
     )
 
 
@@ -172,31 +180,31 @@ def around(p, n, neighbors, normal_cost):
     `normal_cost` as of `CacheGrid` [length^2]."""
     p, n = (p - p.mean(axis=0)).astype(np.float32), n.astype(np.float32)
     squared, count = np.sum(p**2, axis=1), min(neighbors, len(p) - 1)
-    near = np.empty((len(p), count), dtype=np.intp)
+    neighbours = np.empty((len(p), count), dtype=np.intp)
     for first in range(0, len(p), LINES):
         some = np.arange(first, min(first + LINES, len(p)))
         cost = (
             squared - 2 * p[some] @ p.T - np.float32(normal_cost) * n[some] @ n.T
         )  # but for what is the same in a row
         cost[some - first, some] = np.inf
-        near[some] = least_columns(cost, count)
-    return near
+        neighbours[some] = least_columns(cost, count)
+    return neighbours
 
 
-def doubt(near, r, seen):
+def pmf_mismatch(neighbours, r, seen):
     """How much of a cache point's light comes from light vertices that the cache points around it,
-    `near`, do not expect: a number each (C).
+    `neighbours`, do not expect: a number each (C).
 
     NumPy arrays `r`, `seen` (C x light vertices, as for `cumulative_sums`)."""
-    if not near.shape[1]:
+    if not neighbours.shape[1]:
         return np.ones(len(r))
     pmf = np.where(seen, r, 0)
     pmf = pmf / np.maximum(pmf.sum(axis=1, keepdims=True), 1e-30)
-    expected = sum(pmf[column] for column in near.T) / near.shape[1]
+    expected = sum(pmf[column] for column in neighbours.T) / neighbours.shape[1]
     return np.sum(pmf * (expected < UNEXPECTED * pmf), axis=1)
 
 
-def ignorant(grid):
+def uniform_tables(grid):
     """`(records, shares)` of the rows that have every draw count as one connection, where nothing
     is known of Q and Q_s."""
     return tuple(
@@ -205,14 +213,14 @@ def ignorant(grid):
     )
 
 
-def tabulate(grid, Q_s, Q_blind, doubts, ends_s):
+def tabulate(grid, Q_s, Q_blind, pmf_mismatches, ends_s):
     """`(records, shares)` of the rows, as `ResampledWeights` takes them.
 
     NumPy arrays: `Q_s` (C x LENGTHS), integrals at the C cache points, visibility included;
-    `Q_blind` (C), of all lengths, visibility not; `doubts` (C); `ends_s` (LENGTHS): light vertices
+    `Q_blind` (C), of all lengths, visibility not; `pmf_mismatches` (C); `ends_s` (LENGTHS): light vertices
     that a light sub-path has of each length on average.
     """
-    near = np.array(grid.table).reshape(-1, grid.neighbors)
+    neighbours = np.array(grid.table).reshape(-1, grid.neighbors)
 
     def inverse(Q):
         return np.where(Q > 0, 1 / np.where(Q > 0, Q, 1), 0)
@@ -221,14 +229,14 @@ def tabulate(grid, Q_s, Q_blind, doubts, ends_s):
     own = uniform_share(np.minimum(Q * inverse(Q_blind), 1))
     blind = np.where(Q > 0, BLIND_SHARE, 1)
     ends = max(ends_s.sum(), 1e-9)
-    uniform = np.where(Q_blind > 0, own, 1)[near].mean(axis=1)
+    uniform = np.where(Q_blind > 0, own, 1)[neighbours].mean(axis=1)
     # What a darker neighbour has least of is what matters here: 1/Q of the mean, not the mean of
     # 1/Q.
-    a = ((1 - own) * (1 - blind))[near].mean(axis=1) * inverse(Q[near].mean(axis=1))
-    c = ((1 - own) * blind)[near].mean(axis=1) * inverse(Q_blind[near].mean(axis=1))
-    e = np.clip(doubts[near].mean(axis=1), LEAST_DOUBT, 1)
-    shares = (Q_s * inverse(Q)[:, None])[near].mean(axis=1) + (~(Q > 0))[near].mean(axis=1)[
-        :, None
-    ] * (ends_s / ends)
+    a = ((1 - own) * (1 - blind))[neighbours].mean(axis=1) * inverse(Q[neighbours].mean(axis=1))
+    c = ((1 - own) * blind)[neighbours].mean(axis=1) * inverse(Q_blind[neighbours].mean(axis=1))
+    e = np.clip(pmf_mismatches[neighbours].mean(axis=1), LEAST_DOUBT, 1)
+    shares = (Q_s * inverse(Q)[:, None])[neighbours].mean(axis=1) + (~(Q > 0))[neighbours].mean(
+        axis=1
+    )[:, None] * (ends_s / ends)
     records = np.stack([a, uniform / ends, c, e], axis=1)
     return tuple(from_numpy(mi.Float, values.ravel()) for values in (records, shares))

@@ -34,38 +34,41 @@ class ConnectionWeights:
 
     # ------------------------------------------------------------------ hooks of the sub-paths
 
-    def lit(self, si, source, reachable, active, flux=None):
+    def init_light(self, si, source, reachable, active, flux=None):
         ds = seen_from(si, source, active)
         cosine = dr.maximum(dr.abs(dr.dot(si.n, ds.d)), 1e-6)
         direct = self.lights.pdf_direct(si, ds, active)
-        near, far = theory.light_start(
-            cosine * self.lights.emission_ratio(si, ds, active), direct * dr.rcp(cosine)
+        d_vcm, d_vc = theory.light_start(
+            cosine * self.lights.emission_over_nee_pdf(si, ds, active), direct * dr.rcp(cosine)
         )
         flags = ds.emitter.flags()
         met = ~(
             mi.has_flag(flags, mi.EmitterFlags.DeltaPosition)
             | mi.has_flag(flags, mi.EmitterFlags.DeltaDirection)
         )
-        return [dr.select(reachable, near, 0), dr.select(reachable & met, far, 0)]
+        return [dr.select(reachable, d_vcm, 0), dr.select(reachable & met, d_vc, 0)]
 
-    def seen(self, density, active):
+    def init_camera(self, density, active):
         return [
             dr.select(active & (density > 0), theory.camera_start(density, self.ratio), 0),
             mi.Float(0),
         ]
 
-    def left(self, state, p_forward, p_back, delta, scattered=None):
-        near, far = state
-        return [near, dr.select(delta, far, theory.far_of(self._nearer(state, p_back), p_forward))]
+    def scatter(self, state, p_forward, p_back, delta, scattered=None):
+        d_vcm, d_vc = state
+        return [
+            d_vcm,
+            dr.select(delta, d_vc, theory.d_vc_of(self._nearer(state, p_back), p_forward)),
+        ]
 
-    def arrived(self, state, density, si=None, squared=None, depth=None):
+    def propagate(self, state, density, si=None, squared=None, depth=None):
         return [dr.select(density > 0, theory.reciprocal(density), 0), state[1]]
 
-    def met(self, state, direct, emission, sampled):
+    def hit_emitter(self, state, direct, emission, sampled):
         ratio = dr.select(sampled > 0, direct * theory.reciprocal(sampled), 0)
-        return theory.met(ratio, direct * emission, state[1], self.beta)
+        return theory.hit_emitter(ratio, direct * emission, state[1], self.beta)
 
-    def direct(self, state, direct, emission, sampled, p_back, delta):
+    def next_event(self, state, direct, emission, sampled, p_back, delta):
         ratio = dr.select(delta, 0, sampled * theory.reciprocal(direct))
         return theory.connection(ratio, 1, emission, self._nearer(state, p_back), self.beta)
 
@@ -86,8 +89,8 @@ class ConnectionWeights:
         """Weight of merging a camera vertex with a light vertex of that `state` (arguments as of
         `weigh` of `transport.merging.merge`)."""
         a_light = theory.nearer(*state, back_at_light, self.beta)
-        a_camera = theory.nearer(camera["near"], camera["far"], back_at_camera, self.beta)
-        return theory.merging(a_light, a_camera, self.eta, self.beta)
+        a_camera = theory.nearer(camera["d_vcm"], camera["d_vc"], back_at_camera, self.beta)
+        return theory.merge_weight(a_light, a_camera, self.eta, self.beta)
 
     def seen_by_sensor(self, connection, light):
         """Weight of a `LensConnection` of a light vertex."""

@@ -159,17 +159,10 @@ def trace_camera_paths(
     to be gathered, as made by `new_vertex_buffer`, and how many wanted a place in it (width one).
     With `one_vertex` each path owns the place of its number.
 
-    With `weights` all photons are wanted at every smooth vertex, and direct light at each is
-    weighted: `begin(width)` gives a path's state, `arrived(state, si, bsdf, vertex, mask)` the
-    state at a smooth vertex and its weight of direct light (a spectrum), `leaving(state, si, bsdf,
-    bs, vertex, mask)` the state after a smooth scattering, `stored(state)` three spectra to keep
-    with the vertex, `worth_merging(state, share, vertex, last)` and `worth_going_on(state, vertex)`
-    probabilities with which to gather at the vertex and to leave it. An optional `ends(bsdf,
-    vertex, mask)` tells vertices beyond which no strategy goes on. Where the weight of direct light
-    depends on the point of the light, too, an optional `direct_share(state, ref, ds, mask)`
-    replaces what `arrived` said, with the state after leaving `ref` towards the light `ds`. The
-    vertex buffer is then one section for each smooth vertex of the path, of `capacity` each (a
-    path's last vertex in the last section), and `count` has one entry for each.
+    With `weights` (a `mis.state.MergeState`) all photons are wanted at every smooth vertex, and
+    direct light at each is weighted. The vertex buffer is then one section for each smooth vertex
+    of the path, of `capacity` each (a path's last vertex in the last section), and `count` has one
+    entry for each.
     """
     path, active, rng, ray, sensor_weight, splat, _ = start_camera_paths(
         sensor, seed, first, stride, n_paths, camera_paths, wavelength_sample
@@ -188,9 +181,9 @@ def trace_camera_paths(
     state = []
     if dr.hint(weights is not None, mode="scalar"):
         sections = bdd + 1
-        state = weights.begin(n_paths)
+        state = weights.init(n_paths)
     share_here = mi.Spectrum(1)  # weight of the direct light at the last smooth vertex
-    by_light = hasattr(weights, "direct_share")
+    by_light = weights is not None and weights.weighs_points_of_lights
     store = Store(
         vertices=new_vertex_buffer(capacity * sections, weights is not None),
         count=dr.zeros(mi.UInt32, sections),
@@ -217,7 +210,7 @@ def trace_camera_paths(
             light_pdf = lights.pdf_direct(origin, ds, shown & (vertex > 0))
             weight_here = share_here
             if dr.hint(by_light, mode="scalar"):
-                weight_here = weights.direct_share(state, origin, ds, shown & (vertex > 0))
+                weight_here = weights.next_event_weight(state, origin, ds, shown & (vertex > 0))
             share = dr.select(
                 vertex == 0, mi.Spectrum(1), mis_power(scatter_pdf, light_pdf) * weight_here
             )
@@ -231,10 +224,10 @@ def trace_camera_paths(
         smooth = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
 
         if dr.hint(weights is not None, mode="scalar"):
-            state, arrived_share = weights.arrived(state, si, bsdf, vertex, smooth)
+            state, arrived_share = weights.propagate(state, si, bsdf, vertex, smooth)
             share_here = dr.select(smooth, arrived_share, share_here)
         ends = vertex >= bdd  # the path's last smooth vertex
-        if dr.hint(hasattr(weights, "ends"), mode="scalar"):
+        if dr.hint(weights is not None, mode="scalar"):
             ends |= weights.ends(bsdf, vertex, smooth)
 
         # ---- Direct light
@@ -245,8 +238,8 @@ def trace_camera_paths(
             weight_here = share_here
             if dr.hint(by_light, mode="scalar"):
                 reached = smooth & (dr.max(light) > 0)  # elsewhere `ds` may not even be a number
-                left = weights.leaving(state, si, bsdf, mi.BSDFSample3f(towards), vertex, reached)
-                weight_here = weights.direct_share(left, si, ds, reached)
+                left = weights.scatter(state, si, bsdf, mi.BSDFSample3f(towards), vertex, reached)
+                weight_here = weights.next_event_weight(left, si, ds, reached)
             share = dr.select(ds.delta, 1, mis_power(light_pdf, response_pdf)) * weight_here
             radiance[smooth] += throughput * share * response * light
 
@@ -257,7 +250,7 @@ def trace_camera_paths(
         if dr.hint(weights is not None, mode="scalar"):
             last |= True
             if dr.hint(sections > 1, mode="scalar"):
-                kept = weights.worth_merging(state, share_here, vertex, ends)
+                kept = weights.merge_probability(state, share_here, vertex, ends)
                 wants &= rng.next_float32(wants) < kept
         if dr.hint(not has_caustics, mode="scalar"):
             wants &= last & has_indirect
@@ -294,9 +287,9 @@ def trace_camera_paths(
         if dr.hint(not traits.has_light_surfaces, mode="scalar"):
             active &= delta | ~ends
         if dr.hint(weights is not None, mode="scalar"):
-            state = weights.leaving(state, si, bsdf, bs, vertex, active & ~delta)
+            state = weights.scatter(state, si, bsdf, bs, vertex, active & ~delta)
             if dr.hint(sections > 1, mode="scalar"):
-                kept_on = dr.select(active & ~delta, weights.worth_going_on(state, vertex), 1)
+                kept_on = dr.select(active & ~delta, weights.continue_probability(state, vertex), 1)
                 active &= rng.next_float32(active) < kept_on
                 weight *= dr.rcp(dr.select(active, kept_on, 1))
         throughput *= weight

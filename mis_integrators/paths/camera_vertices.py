@@ -18,9 +18,9 @@ from .camera_pass import behind_emitters, start_camera_paths, with_gaps, within_
 from .roulette import russian_roulette
 from .sensor import Lens
 from .subpaths import NO_PARENT, keep_vertex, new_vertices, vertex_layout
-from .vertex import Junction, scattered_mean
+from .vertex import VertexBSDF, scattered_mean
 
-STEP = ("near", "geometry", "forward", "back", "scattered", "row")
+STEP = ("d_vcm", "geometry", "forward", "back", "scattered", "row")
 """What vertices and hits remember of the step from their parent: one over the area density with
 which it was made [m^2] (over that per solid angle [sr] for hits; zero where a delta function
 scattered on the way); the geometric term [1/m^2] (hits: the cosine at the parent), as `soften`
@@ -28,7 +28,7 @@ leaves it; densities per projected solid angle at the parent, of the camera's si
 of the light's for the one before; the parent's BSDF, channel mean [1/sr]; its row (see
 `soften`)."""
 HIT = ("light_mean", "start", "across")
-"""What a hit knows besides: `Lights.start_density` and `forward_density` of the emitter's point,
+"""What a hit knows besides: `Lights.pdf_emission_origin` and `pdf_emission_area` of the emitter's point,
 and its light, channel mean, over the former."""
 
 
@@ -66,23 +66,23 @@ def step_to_vertex(soften, left, density, cosine, squared):
     """The fields of `STEP` at a vertex that was sampled with `density` per solid angle (zero: by a
     delta function) and meets the ray under `cosine`."""
     forward, back, scattered, row, there = left
-    near = dr.select(density > 0, squared * dr.rcp(dr.maximum(density * cosine, 1e-20)), 0)
+    d_vcm = dr.select(density > 0, squared * dr.rcp(dr.maximum(density * cosine, 1e-20)), 0)
     geometry = soften.softened(there * cosine * dr.rcp(squared), squared)
-    return [dr.minimum(near, 1e15), geometry, forward, back, scattered, row]
+    return [dr.minimum(d_vcm, 1e15), geometry, forward, back, scattered, row]
 
 
 def step_to_hit(lights, soften, left, density, origin, ds, light, squared, mask):
     """The fields of `STEP` and `HIT` of emission `light` met in the point or direction `ds`, seen
     from the vertex `origin`."""
     forward, back, scattered, row, there = left
-    start = lights.start_density(origin, ds, mask)
+    start = lights.pdf_emission_origin(origin, ds, mask)
     geometry = soften.softened(there, squared)
-    near = dr.select(density > 0, dr.rcp(dr.maximum(density, 1e-20)), 0)
+    d_vcm = dr.select(density > 0, dr.rcp(dr.maximum(density, 1e-20)), 0)
     return dict(
         zip(
             (*STEP, *HIT),
             (
-                near,
+                d_vcm,
                 geometry,
                 forward,
                 back,
@@ -90,7 +90,7 @@ def step_to_hit(lights, soften, left, density, origin, ds, light, squared, mask)
                 row,
                 channel_mean(light) * dr.rcp(dr.maximum(start, 1e-20)),
                 start,
-                lights.forward_density(origin, ds, mask),
+                lights.pdf_emission_area(origin, ds, mask),
             ),
         )
     )
@@ -124,7 +124,7 @@ def trace_camera_vertices(
     the camera's rays meet at once; vertices as of `subpaths.new_vertices` with the fields of
     `STEP`; records of `hit_layout`. Counts have width one; if they exceed the capacities the
     surplus is missing. The first vertex has one over the density of camera rays there, over the
-    whole crop window, times `ratio`, as its `near`, and no parent.
+    whole crop window, times `ratio`, as its `d_vcm`, and no parent.
 
     `soften.row(p, n)` numbers places, with the normal on the side of the light;
     `soften.softened(geometry, squared)` may change the geometric term of a step that starts there,
@@ -213,11 +213,11 @@ def trace_camera_vertices(
                 dr.select(of_rays > 0, ratio * dr.rcp(dr.maximum(of_rays, 1e-20)), 0),
                 step[0],
             )
-        junction = Junction.at(traits, si, bsdf, smooth)
+        vertex_bsdf = VertexBSDF.at(traits, si, bsdf, smooth)
         wanted = smooth & (dr.max(throughput) > 0)
         slot = keep_vertex(
             store,
-            junction,
+            vertex_bsdf,
             si,
             hit,
             towards,
@@ -237,7 +237,7 @@ def trace_camera_vertices(
         delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         visible |= met & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
         wo = si.to_world(bs.wo)
-        value, p_forward, p_back = junction.between(towards, wo, active & ~delta)
+        value, p_forward, p_back = vertex_bsdf.f_and_pdfs(towards, wo, active & ~delta)
         parent = dr.select(active & ~delta, slot, parent)
         left = leave(soften, left, si, value, p_forward, p_back, wo, active & ~delta)
         density = dr.select(delta, 0, p_forward * dr.abs(dr.dot(si.n, wo)))
@@ -270,7 +270,7 @@ def sum_before(
     gain one.
     """
     layout = vertex_layout(STEP)
-    near, geometry, forward, back_there, scattered_there, row = (
+    d_vcm, geometry, forward, back_there, scattered_there, row = (
         mi.Float(step[name]) for name in STEP
     )
     parent = mi.UInt32(parent)
@@ -285,13 +285,13 @@ def sum_before(
         better = weights.gain(
             strength * scattered * geometry, mi.UInt32(row), segments - depth, active & joined
         )
-        total = dr.select(active, total + ratio * near * dr.select(joined, better, 1), total)
+        total = dr.select(active, total + ratio * d_vcm * dr.select(joined, better, 1), total)
         ratio = dr.minimum(ratio * (back * dr.rcp(dr.maximum(forward, 1e-20))), 1e15)
         strength = dr.minimum(strength * (scattered * dr.rcp(dr.maximum(back, 1e-20))), 1e15)
         back, scattered = mi.Float(back_there), mi.Float(scattered_there)
         active &= joined & (ratio > 0)
         record = layout.read(vertices["words"], parent, active, STEP)
-        near, geometry, forward = record["near"], record["geometry"], record["forward"]
+        d_vcm, geometry, forward = record["d_vcm"], record["geometry"], record["forward"]
         back_there, scattered_there, row = record["back"], record["scattered"], record["row"]
         parent = dr.gather(mi.UInt32, vertices["parent"], parent, active)
     return total

@@ -17,7 +17,7 @@ from ..core.random import vertex_streams
 from ..core.recording import lanes
 from ..core.spectra import channel_mean
 from .sensor import unblocked, unblocked_by_visible
-from .subpaths import STATES, junction_of, read_vertices, seen_normal
+from .subpaths import STATES, read_vertices, seen_normal, vertex_bsdf_of
 from .vertex import SMALLEST_COSINE
 
 
@@ -47,10 +47,10 @@ def join(traits, camera, light, wavelengths, active):
     squared = dr.maximum(dr.squared_norm(offset), 1e-20)
     distance = dr.sqrt(squared)
     d = offset * dr.rcp(distance)
-    at_camera = junction_of(traits, camera, wavelengths, active)
-    at_light = junction_of(traits, light, wavelengths, active)
-    value, p_camera, back_at_camera = at_camera.between(camera["towards"], d, active)
-    value_light, back_at_light, p_light = at_light.between(-d, light["towards"], active)
+    at_camera = vertex_bsdf_of(traits, camera, wavelengths, active)
+    at_light = vertex_bsdf_of(traits, light, wavelengths, active)
+    value, p_camera, back_at_camera = at_camera.f_and_pdfs(camera["towards"], d, active)
+    value_light, back_at_light, p_light = at_light.f_and_pdfs(-d, light["towards"], active)
     leaving = dr.abs(dr.dot(light["n"], d))
     landing = dr.maximum(dr.abs(dr.dot(light["n"], light["towards"])), SMALLEST_COSINE)
     geometry = leaving * dr.abs(dr.dot(camera["n"], d)) * dr.rcp(squared)
@@ -201,20 +201,24 @@ def list_draws(
     )
     row = grid.row(z["p"], seen_normal(z))
     simple = active & (z["density"] >= 0)
-    promised = dr.select(
+    expected_contribution = dr.select(
         simple, channel_mean(z["throughput"] * z["value"]) * grid.mean(expected, row, simple), 0
     )
     brightest = dr.zeros(mi.UInt32, paths)  # as bits: positive numbers have the same order
     dr.scatter_reduce(
-        dr.ReduceOp.Max, brightest, dr.reinterpret_array(mi.UInt32, promised), z["path"], simple
+        dr.ReduceOp.Max,
+        brightest,
+        dr.reinterpret_array(mi.UInt32, expected_contribution),
+        z["path"],
+        simple,
     )
-    dr.eval(brightest, promised)
+    dr.eval(brightest, expected_contribution)
     level = SLIGHT * dr.reinterpret_array(
         mi.Float, dr.gather(mi.UInt32, brightest, z["path"], simple)
     )
     chance = dr.select(
-        simple & (promised < level),
-        dr.maximum(promised * dr.rcp(dr.maximum(level, 1e-30)), LEAST_CHANCE),
+        simple & (expected_contribution < level),
+        dr.maximum(expected_contribution * dr.rcp(dr.maximum(level, 1e-30)), LEAST_CHANCE),
         1,
     )
     keep = active & (vertex_streams(z["path"], z["number"], seed).next_float32() < chance)
@@ -255,8 +259,8 @@ def join_sensor(
 ):
     """The `LensConnection` of light vertices (records as of `read_vertices`)."""
     d, distance, film, density, active = lens.connect(light["p"], time, aperture, active)
-    junction = junction_of(traits, light, wavelengths, active)
-    value, back, _ = junction.between(d, light["towards"], active)
+    vertex_bsdf = vertex_bsdf_of(traits, light, wavelengths, active)
+    value, back, _ = vertex_bsdf.f_and_pdfs(d, light["towards"], active)
     leaving = dr.abs(dr.dot(light["n"], d))
     landing = dr.maximum(dr.abs(dr.dot(light["n"], light["towards"])), SMALLEST_COSINE)
     active = active & (dr.max(value) > 0)

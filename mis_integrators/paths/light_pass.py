@@ -114,7 +114,7 @@ def trace_light_paths(
     max_depth: int,
     rr_depth: int,
     keep_direct: bool = False,
-    notebook=None,
+    light_state=None,
 ):
     """Traces `n_paths` light sub-paths and stores photons on surfaces that scatter smoothly.
 
@@ -132,13 +132,8 @@ def trace_light_paths(
     pass with more room. Shading normals: Veach 1997, section 5.3 (adjoint factor); where maps
     perturb normals inside BSDFs, these are evaluated from the camera's side instead.
 
-    A `notebook` writes down what weights must know of the vertices that a photon has passed:
-    `begin()` gives a sub-path's state (a list of arrays), `scattered(state, si, bsdf, wo, mask)`
-    the state after a smooth scattering into local direction `wo`, `words(state)` a list of uint32
-    words to store with a photon. An optional `lit(state, si, source, straight)` learns, at each
-    vertex, on which lanes next-event estimation could bring the same light there, from the point
-    `source` (a `DirectionSample3f` as `sample_emission` makes it). The result then has a fourth
-    array, these words.
+    With a `light_state` (a `mis.state.LightState`) the result has a fourth array: the words that it
+    stores with each photon.
     """
     lanes = lane_count(n_paths)
     lane = dr.arange(mi.UInt32, lanes)
@@ -149,10 +144,10 @@ def trace_light_paths(
         power=dr.empty(mi.UInt32, words * capacity),
         count=dr.zeros(mi.UInt32, 1),
     )
-    notes = []
-    if dr.hint(notebook is not None, mode="scalar"):
-        notes = notebook.begin()
-        store.notes = dr.empty(mi.UInt32, len(notebook.words(notes)) * capacity)
+    state = []
+    if dr.hint(light_state is not None, mode="scalar"):
+        state = light_state.init()
+        store.mis_words = dr.empty(mi.UInt32, len(light_state.words(state)) * capacity)
     path = mi.UInt32(lane)  # the lane's next path; then this one plus the number of lanes
     ray = dr.zeros(mi.Ray3f, lanes)
     flux = dr.zeros(mi.Spectrum, lanes)
@@ -180,15 +175,15 @@ def trace_light_paths(
             eta = mi.Float(1)
             active = dr.max(flux) > 0
             path += lanes
-            if dr.hint(notebook is not None, mode="scalar"):
-                notes = notebook.begin()
+            if dr.hint(light_state is not None, mode="scalar"):
+                state = light_state.init()
 
         si = scene.ray_intersect(ray, mi.RayFlags.All, coherent=False, reorder=False, active=active)
         active &= si.is_valid()
         depth += 1
         bsdf = si.bsdf(ray)
-        if dr.hint(hasattr(notebook, "lit"), mode="scalar"):
-            notes = notebook.lit(notes, si, source, active & begin & ~had_delta)
+        if dr.hint(light_state is not None, mode="scalar"):
+            state = light_state.first_vertex(state, si, source, active & begin & ~had_delta)
 
         # ---- Store a photon
         keep = (
@@ -234,16 +229,16 @@ def trace_light_paths(
                 keep,
             )
             dr.scatter(store.power, mi.Vector4u(from_where, 0, 0, 0), 2 * slot + 1, keep)
-        if dr.hint(notebook is not None, mode="scalar"):
-            words_of_notes = notebook.words(notes)
-            parts = len(words_of_notes) // 4
+        if dr.hint(light_state is not None, mode="scalar"):
+            words_of_state = light_state.words(state)
+            parts = len(words_of_state) // 4
             for part in dr.hint(range(max(parts, 1)), mode="scalar"):
                 if dr.hint(parts == 0, mode="scalar"):
-                    dr.scatter(store.notes, mi.Vector2u(words_of_notes), slot, keep)
+                    dr.scatter(store.mis_words, mi.Vector2u(words_of_state), slot, keep)
                 else:
                     dr.scatter(
-                        store.notes,
-                        mi.Vector4u(words_of_notes[4 * part : 4 * part + 4]),
+                        store.mis_words,
+                        mi.Vector4u(words_of_state[4 * part : 4 * part + 4]),
                         parts * slot + part,
                         keep,
                     )
@@ -252,8 +247,8 @@ def trace_light_paths(
         if dr.hint(max_depth > 0, mode="scalar"):
             active &= depth + 2 <= max_depth
         bs, delta, weight, wo, active = scatter_light(traits, si, bsdf, rng, active)
-        if dr.hint(notebook is not None, mode="scalar"):
-            notes = notebook.scattered(notes, si, bsdf, bs.wo, active & ~delta)
+        if dr.hint(light_state is not None, mode="scalar"):
+            state = light_state.scatter(state, si, bsdf, bs.wo, active & ~delta)
         flux *= weight
         had_delta |= delta
         scattered |= ~delta
@@ -264,6 +259,6 @@ def trace_light_paths(
             rng, flux, dr.max(flux) * strength, eta, depth >= rr_depth, active
         )
 
-    if dr.hint(notebook is not None, mode="scalar"):
-        return store.surface, store.power, store.count, store.notes
+    if dr.hint(light_state is not None, mode="scalar"):
+        return store.surface, store.power, store.count, store.mis_words
     return store.surface, store.power, store.count

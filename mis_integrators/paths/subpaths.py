@@ -4,28 +4,8 @@ Vertices of all sub-paths lie in one flat buffer each (`new_vertices`), in no pa
 `parent` leads from a vertex to the one before it. Delta scattering leaves no vertex, but counts as
 a segment; a BSDF with both parts leaves a vertex and its delta part goes on.
 
-What weights must know of a sub-path travels with it as a state, a list of floats. The object
-`weights` makes it:
-
-    lit(si, source, reachable, active, flux)   state of a light sub-path at its first vertex; `source`: the point of the light, as of `sample_emission`;
-                                               `reachable`: next-event estimation could bring the
-                                               same light; `flux`: what the path carries
-    seen(density, active)                      state of a camera sub-path at its first vertex; `density` [1/m^2]: that of camera rays there (see
-                                               `Lens.connect`), zero where the vertex cannot be
-                                               joined to the sensor
-    left(state, p_forward, p_back, delta, scattered)   after scattering; densities per projected solid angle with which this side goes on, and the
-                                               other side would go back; `scattered` [1/sr]: BSDF,
-                                               channel mean
-    arrived(state, density, si, squared, depth)   at the next vertex, made with `density` [1/m^2]; zero where the vertex before scattered by a delta
-                                               function; its interaction, squared distance from the
-                                               vertex before, and depth
-    met(state, direct, emission, sampled)      weight of emission that a camera path meets beyond the last vertex, sampled there with density `sampled`
-                                               per solid angle (zero: by a delta function), where
-                                               next-event estimation has density `direct`;
-                                               `emission`: `Lights.emission_ratio`; state: after
-                                               `left`
-    direct(state, direct, emission, sampled, p_back, delta)   weight of next-event estimation at a vertex; `emission` as an area density at the
-                                               vertex, `delta`: a light that cannot be met
+What weights must know of a sub-path travels with it as a state, a list of floats: `weights` is a
+`mis.state.ConnectionState`.
 """
 
 from __future__ import annotations
@@ -40,16 +20,16 @@ from .camera_pass import behind_emitters, start_camera_paths, with_gaps, within_
 from .light_pass import lane_count, scatter_light
 from .roulette import russian_roulette
 from .sensor import Lens
-from .vertex import Junction, scattered_mean
+from .vertex import VertexBSDF, scattered_mean
 
 NO_PARENT = 0xFFFFFFFF
-STATES = ("near", "far")
+STATES = ("d_vcm", "d_vc")
 """What the buffers call the numbers of a state."""
 
 
 def vertex_layout(states=STATES):
     """Fields of a kept vertex: position `p`, number of the sub-path `path`, `throughput` (light:
-    flux; camera: importance) that arrives, `value` and `density` as of `Junction`, the state of the
+    flux; camera: importance) that arrives, `value` and `density` as of `VertexBSDF`, the state of the
     weights, geometric normal `n`, direction `towards` the vertex before, `depth` in segments,
     shading normal `ns`, `number` among the sub-path's kept vertices."""
     return Layout(
@@ -84,19 +64,31 @@ def new_vertices(traits, capacity, states=STATES):
 
 
 def keep_vertex(
-    store, junction, si, hit, towards, throughput, path, depth, number, parent, state, states, keep
+    store,
+    vertex_bsdf,
+    si,
+    hit,
+    towards,
+    throughput,
+    path,
+    depth,
+    number,
+    parent,
+    state,
+    states,
+    keep,
 ):
     """Writes a vertex into the buffer; returns the place (valid if there was room for it)."""
     slot = dr.scatter_inc(store.count, mi.UInt32(0), keep)
     keep = keep & (slot < store.room)
     values = {
         "p": si.p,
-        "n": junction.n,
-        "ns": junction.ns,
+        "n": vertex_bsdf.n,
+        "ns": vertex_bsdf.ns,
         "towards": towards,
         "throughput": throughput,
-        "value": junction.value,
-        "density": junction.density,
+        "value": vertex_bsdf.value,
+        "density": vertex_bsdf.density,
         "path": path,
         "depth": depth,
         "number": number,
@@ -130,8 +122,8 @@ def _either(mask, yes, no):
     return [dr.select(mask, a, b) for a, b in zip(yes, no)]
 
 
-def junction_of(traits, record, wavelengths, active):
-    """The `Junction` of kept vertices, as read by `read_vertices`; without `hit` only where they
+def vertex_bsdf_of(traits, record, wavelengths, active):
+    """The `VertexBSDF` of kept vertices, as read by `read_vertices`; without `hit` only where they
     are Lambertian."""
     si = bsdf = None
     if "hit" in record:
@@ -141,7 +133,9 @@ def junction_of(traits, record, wavelengths, active):
         ray = mi.Ray3f(record["p"] - d * hit.t, d, 0, wavelengths)
         si = hit.compute_surface_interaction(ray, mi.RayFlags.All, rough)
         bsdf = si.bsdf()
-    return Junction(traits, record["n"], record["ns"], record["value"], record["density"], si, bsdf)
+    return VertexBSDF(
+        traits, record["n"], record["ns"], record["value"], record["density"], si, bsdf
+    )
 
 
 @dr.syntax
@@ -223,14 +217,14 @@ def trace_light_subpaths(
         arrival = density * dr.abs(dr.dot(si.n, towards)) * dr.rcp(squared)
         state = _either(
             first,
-            weights.lit(si, source, ~unreachable, first, flux),
-            weights.arrived(state, arrival, si, squared, depth),
+            weights.init_light(si, source, ~unreachable, first, flux),
+            weights.propagate(state, arrival, si, squared, depth),
         )
         smooth = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-        junction = Junction.at(traits, si, bsdf, smooth)
+        vertex_bsdf = VertexBSDF.at(traits, si, bsdf, smooth)
         slot = keep_vertex(
             store,
-            junction,
+            vertex_bsdf,
             si,
             hit,
             towards,
@@ -251,10 +245,10 @@ def trace_light_subpaths(
         if dr.hint(max_depth > 0, mode="scalar"):
             active &= depth + 2 <= max_depth
         bs, delta, weight, wo, active = scatter_light(traits, si, bsdf, rng, active)
-        value, p_back, p_forward = junction.between(wo, towards, active & ~delta)
+        value, p_back, p_forward = vertex_bsdf.f_and_pdfs(wo, towards, active & ~delta)
         state = _either(
             active,
-            weights.left(state, p_forward, p_back, delta, scattered_mean(value, si.n, towards)),
+            weights.scatter(state, p_forward, p_back, delta, scattered_mean(value, si.n, towards)),
             state,
         )
         density = dr.select(delta, 0, p_forward * dr.abs(dr.dot(si.n, wo)))
@@ -344,17 +338,17 @@ def trace_camera_subpaths(
             if dr.hint(hide_emitters, mode="scalar"):
                 shown &= visible  # what is behind nothing but null surfaces is hidden, too
             later = shown & (depth > 1)
-            share = weights.met(
+            share = weights.hit_emitter(
                 state,
                 lights.pdf_direct(origin, ds, later),
-                lights.emission_ratio(origin, ds, later),
+                lights.emission_over_nee_pdf(origin, ds, later),
                 density,
             )
             share = dr.select(later, share, 1)
             light = throughput * ds.emitter.eval(si, shown)
             radiance[shown] += light * share
             if dr.hint(ledger is not None, mode="scalar"):
-                ledger.met(path, depth, light, share, shown)
+                ledger.hit_emitter(path, depth, light, share, shown)
 
         active &= si.is_valid()
         met = mi.Bool(active)  # a surface, perhaps the last one
@@ -372,9 +366,11 @@ def trace_camera_subpaths(
         squared = dr.maximum(dr.squared_norm(si.p - origin.p), 1e-20)
         arrival = density * cosine * dr.rcp(squared)
         state = _either(
-            begin, weights.seen(of_rays, begin), weights.arrived(state, arrival, si, squared, depth)
+            begin,
+            weights.init_camera(of_rays, begin),
+            weights.propagate(state, arrival, si, squared, depth),
         )
-        junction = Junction.at(traits, si, bsdf, smooth)
+        vertex_bsdf = VertexBSDF.at(traits, si, bsdf, smooth)
 
         # ---- Direct light
         if dr.hint(not lights.dark, mode="scalar"):
@@ -383,12 +379,12 @@ def trace_camera_subpaths(
             direction = dr.select(
                 reached, ds.d, mi.Vector3f(0, 0, 1)
             )  # elsewhere it may not even be a number
-            response, p_camera, p_light = junction.between(towards, direction, reached)
+            response, p_camera, p_light = vertex_bsdf.f_and_pdfs(towards, direction, reached)
             facing = dr.abs(dr.dot(si.n, direction))
-            share = weights.direct(
+            share = weights.next_event(
                 state,
                 light_pdf,
-                facing * lights.emission_ratio(si, ds, reached),
+                facing * lights.emission_over_nee_pdf(si, ds, reached),
                 p_camera * facing,
                 p_light,
                 ds.delta,
@@ -396,7 +392,7 @@ def trace_camera_subpaths(
             light = throughput * response * light
             radiance[reached] += light * share
             if dr.hint(ledger is not None, mode="scalar"):
-                ledger.direct(path, depth + 1, light, share, reached)
+                ledger.next_event(path, depth + 1, light, share, reached)
 
         # ---- Keep the vertex
         wanted = smooth & (dr.max(throughput) > 0)
@@ -404,7 +400,7 @@ def trace_camera_subpaths(
             wanted &= depth + shortest <= max_depth
         slot = keep_vertex(
             store,
-            junction,
+            vertex_bsdf,
             si,
             hit,
             towards,
@@ -425,10 +421,10 @@ def trace_camera_subpaths(
         delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         visible |= met & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
         wo = si.to_world(bs.wo)
-        value, p_forward, p_back = junction.between(towards, wo, active & ~delta)
+        value, p_forward, p_back = vertex_bsdf.f_and_pdfs(towards, wo, active & ~delta)
         state = _either(
             active,
-            weights.left(state, p_forward, p_back, delta, scattered_mean(value, si.n, wo)),
+            weights.scatter(state, p_forward, p_back, delta, scattered_mean(value, si.n, wo)),
             state,
         )
         density = dr.select(delta, 0, p_forward * dr.abs(dr.dot(si.n, wo)))

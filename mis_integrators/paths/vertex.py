@@ -16,16 +16,16 @@ from ..core.traits import lookup
 
 SMALLEST_COSINE = 1e-6
 ROUGH = -1.0
-"""What `Junction.density` holds where the surface is not Lambertian."""
+"""What `VertexBSDF.density` holds where the surface is not Lambertian."""
 
 
 def scattered_mean(value, n, to_light):
-    """Mean over the channels of the BSDF [1/sr], where `value` is that of `Junction.between`: what
+    """Mean over the channels of the BSDF [1/sr], where `value` is that of `VertexBSDF.f_and_pdfs`: what
     geometric cosines turn into the light that goes on."""
     return channel_mean(value) * dr.rcp(dr.maximum(dr.abs(dr.dot(n, to_light)), SMALLEST_COSINE))
 
 
-class Junction:
+class VertexBSDF:
     """A vertex, seen from one side of it.
 
     Attributes: `n`, `ns` geometric and shading normal; `value` (a spectrum, BSDF without cosine)
@@ -61,7 +61,7 @@ class Junction:
             density = dr.select(lambertian, density, ROUGH)
         return cls(traits, mi.Vector3f(si.n), mi.Vector3f(si.sh_frame.n), value, density, si, bsdf)
 
-    def between(self, to_camera, to_light, active=True):
+    def f_and_pdfs(self, to_camera, to_light, active=True):
         """`(value, p_camera, p_light)`: radiance towards the camera per radiance from the light and
         unit of solid angle (shading cosine included, as Mitsuba's `eval`), and the densities per
         projected solid angle with which a camera path goes on to the light's side, and a light

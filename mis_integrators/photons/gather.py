@@ -27,7 +27,7 @@ def gather_photons(
     vertices,
     radii,
     wavelengths,
-    light_paths,
+    light_path_count,
     max_depth: int,
     only_last: bool,
     grey: bool = False,
@@ -145,7 +145,7 @@ def gather_photons(
     return [
         dr.select(
             active,
-            (total if grey else total * factor) / (dr.pi * dr.square(radius) * light_paths),
+            (total if grey else total * factor) / (dr.pi * dr.square(radius) * light_path_count),
             0,
         )
         for total, radius in zip(totals, radii)

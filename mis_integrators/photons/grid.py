@@ -68,16 +68,16 @@ class Grid:
 
 class PhotonMap:
     """Sorted photons: a `grid`, `start` (first photon of each table entry), `surface` and `power`
-    as in `trace_light_paths`. Its `notes` stay where light sub-paths left them, for few of them are
+    as in `trace_light_paths`. Its `mis_words` stay where light sub-paths left them, for few of them are
     ever read: `place` tells of each sorted photon where."""
 
-    def __init__(self, grid, start, surface, power, notes=None, place=None):
-        self.grid, self.start, self.surface, self.power, self.notes, self.place = (
+    def __init__(self, grid, start, surface, power, mis_words=None, place=None):
+        self.grid, self.start, self.surface, self.power, self.mis_words, self.place = (
             grid,
             start,
             surface,
             power,
-            notes,
+            mis_words,
             place,
         )
 
@@ -85,11 +85,13 @@ class PhotonMap:
         """What a recorded function can take; `with_grid` makes the map of it again."""
         arrays = {"start": self.start, "surface": self.surface, "power": self.power}
         return (
-            arrays if self.notes is None else {**arrays, "notes": self.notes, "place": self.place}
+            arrays
+            if self.mis_words is None
+            else {**arrays, "mis_words": self.mis_words, "place": self.place}
         )
 
-    def place_of_notes(self, index, active):
-        """Where among the `notes` those of photon `index` are."""
+    def place_of_mis_words(self, index, active):
+        """Where among the `mis_words` those of photon `index` are."""
         return dr.gather(mi.UInt32, self.place, index, active)
 
     @classmethod
@@ -98,10 +100,10 @@ class PhotonMap:
         return cls(Grid(bbox, cell, table_size(capacity)), **arrays)
 
 
-def build_photon_map(surface, power, count, bbox, cell, capacity: int, kind: str, notes=None):
+def build_photon_map(surface, power, count, bbox, cell, capacity: int, kind: str, mis_words=None):
     """Sorts photons into a grid of cells of edge `cell` (width one) over `bbox`.
 
-    `kind`: "all", "caustic" or "indirect" selects the photons; `notes` (None: there are none) stay
+    `kind`: "all", "caustic" or "indirect" selects the photons; `mis_words` (None: there are none) stay
     unsorted. Three passes over the photons: count, prefix sum, scatter.
     """
     size = table_size(capacity)
@@ -127,11 +129,11 @@ def build_photon_map(surface, power, count, bbox, cell, capacity: int, kind: str
     words = photon_words()
     sorted_power = _moved(power, words, capacity, index, target, active)
     place = None
-    if notes is not None:
+    if mis_words is not None:
         place = dr.empty(mi.UInt32, capacity)
         dr.scatter(place, index, target, active)
     dr.eval(sorted_surface, sorted_power, place)
-    return PhotonMap(grid, start, sorted_surface, sorted_power, notes, place)
+    return PhotonMap(grid, start, sorted_surface, sorted_power, mis_words, place)
 
 
 def _moved(source, words, capacity, index, target, active):

@@ -83,9 +83,9 @@ class IrradianceCache:
     each cell, from cell number 1 on).
     """
 
-    def __init__(self, scene, lights, surface, power, count, light_paths, bounds, wavelengths):
+    def __init__(self, scene, lights, surface, power, count, light_path_count, bounds, wavelengths):
         """`surface`, `power`, `count`: photons as `trace_light_paths` stores them, direct light's
-        included; `light_paths`: how many sub-paths made them, all of the same `wavelengths` (empty
+        included; `light_path_count`: how many sub-paths made them, all of the same `wavelengths` (empty
         in rgb and mono variants)."""
         self.origin, self.wavelengths = mi.Point3f(bounds.min), wavelengths
         self.words = 12 if colours() == 1 else 16
@@ -120,7 +120,7 @@ class IrradianceCache:
                 scene,
                 lights,
                 build_photon_map(surface, power, count, bounds, reach, capacity, "all"),
-                light_paths,
+                light_path_count,
             )
 
     @staticmethod
@@ -177,7 +177,7 @@ class IrradianceCache:
         )
         dr.eval(self.center, self.facing)
 
-    def _gather(self, scene, lights, photon_map, light_paths):
+    def _gather(self, scene, lights, photon_map, light_path_count):
         """Fills the table: density estimates at the cells' centers."""
         facing = self.facing
         channels = colours()
@@ -208,7 +208,7 @@ class IrradianceCache:
             visit,
             tuple(mi.Float(0) for _ in range(3 * channels + 4)),
         )
-        area = dr.rcp(dr.pi * dr.square(GATHER_RADIUS * self.cell) * light_paths)
+        area = dr.rcp(dr.pi * dr.square(GATHER_RADIUS * self.cell) * light_path_count)
         irradiance = [total * area for total in totals[: 3 * channels]]
         direction = mi.Vector3f(*totals[3 * channels : -1])
         direction *= dr.rsqrt(dr.maximum(dr.squared_norm(direction), 1e-30))

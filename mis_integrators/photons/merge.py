@@ -16,13 +16,13 @@ from ..core.packing import (
     unpack_normal,
 )
 from ..paths.light_pass import photon_words
-from ..paths.subpaths import STATES, junction_of, read_vertices
+from ..paths.subpaths import STATES, read_vertices, vertex_bsdf_of
 from .gather import LARGEST_COSINE_RATIO, SAME_SURFACE_COSINE, SAME_SURFACE_OFFSET
 from .grid import build_photon_map, for_each_photon, read_power
 
 
 def vertex_map(vertices, count, capacity: int, bounds, cell):
-    """A `PhotonMap` of all kept light vertices; its notes are their states. Arguments as of
+    """A `PhotonMap` of all kept light vertices; its mis_words are their states. Arguments as of
     `build_photon_map`."""
     index = dr.arange(mi.UInt32, capacity)
     active = index < dr.gather(mi.UInt32, count, 0)
@@ -30,7 +30,7 @@ def vertex_map(vertices, count, capacity: int, bounds, cell):
         vertices, index, active, ("p", "n", "depth", "towards", "throughput", *STATES)
     )
     words = photon_words()
-    surface, power, notes = (dr.empty(mi.UInt32, size * capacity) for size in (4, words, 2))
+    surface, power, mis_words = (dr.empty(mi.UInt32, size * capacity) for size in (4, words, 2))
     position, normal = (
         y["p"],
         pack_surface(dr.select(active, y["n"], mi.Vector3f(0, 0, 1)), y["depth"], mi.Bool(False)),
@@ -49,13 +49,21 @@ def vertex_map(vertices, count, capacity: int, bounds, cell):
                 words // 4 * index + part,
                 active,
             )
-    dr.scatter(notes, mi.Vector2u(*(float_bits(y[name]) for name in STATES)), index, active)
-    dr.eval(surface, power, notes)
-    return build_photon_map(surface, power, count, bounds, cell, capacity, "all", notes)
+    dr.scatter(mis_words, mi.Vector2u(*(float_bits(y[name]) for name in STATES)), index, active)
+    dr.eval(surface, power, mis_words)
+    return build_photon_map(surface, power, count, bounds, cell, capacity, "all", mis_words)
 
 
 def merge(
-    traits, photon_map, camera, radius, wavelengths, light_paths: int, max_depth: int, weigh, active
+    traits,
+    photon_map,
+    camera,
+    radius,
+    wavelengths,
+    light_path_count: int,
+    max_depth: int,
+    weigh,
+    active,
 ):
     """Radiance (a spectrum, throughput included) that the light vertices of `photon_map` within
     `radius` bring to camera vertices (records as of `read_vertices`).
@@ -65,7 +73,7 @@ def merge(
     densities per projected solid angle with which the camera's side goes on to the vertex before
     it, and the light's side to the camera's.
     """
-    junction = junction_of(traits, camera, wavelengths, active)
+    vertex_bsdf = vertex_bsdf_of(traits, camera, wavelengths, active)
     n = camera["n"]
     landing_least = 1 / LARGEST_COSINE_RATIO
 
@@ -79,16 +87,18 @@ def merge(
             hit &= unpack_depth(record.w) + camera["depth"] <= max_depth
         flux, packed = read_power(photon_map.power, index, hit)
         towards = dr.normalize(unpack_direction(packed))
-        value, p_camera, p_light = junction.between(camera["towards"], towards, hit)
-        shading = dr.abs(dr.dot(junction.ns, towards))
+        value, p_camera, p_light = vertex_bsdf.f_and_pdfs(camera["towards"], towards, hit)
+        shading = dr.abs(dr.dot(vertex_bsdf.ns, towards))
         landing = dr.abs(dr.dot(normal, towards)) * dr.rsqrt(length_squared)
         landing = dr.maximum(dr.maximum(landing, shading * landing_least), 1e-6)
         hit &= dr.max(value) > 0
-        state = dr.gather(mi.Vector2u, photon_map.notes, photon_map.place_of_notes(index, hit), hit)
+        state = dr.gather(
+            mi.Vector2u, photon_map.mis_words, photon_map.place_of_mis_words(index, hit), hit
+        )
         share = weigh([bits_float(state.x), bits_float(state.y)], p_camera, p_light)
         return (totals[0] + dr.select(hit, value * flux * (share * dr.rcp(landing)), 0),)
 
     (total,) = for_each_photon(photon_map, camera["p"], radius, active, visit, (mi.Spectrum(0),))
     return dr.select(
-        active, camera["throughput"] * total / (dr.pi * dr.square(radius) * light_paths), 0
+        active, camera["throughput"] * total / (dr.pi * dr.square(radius) * light_path_count), 0
     )

@@ -63,7 +63,7 @@ def ladder(points, weights):
     return max(spread, 1e-6) * LARGEST_SHARE * STEP ** -np.arange(LADDER_STEPS - 1, -1, -1.0)
 
 
-def middling(radii):
+def middle_index(radii):
     """The place of a middling radius of the ladder: little blur, little noise."""
     return len(radii) * 2 // 3
 
@@ -76,7 +76,7 @@ def relative_weights(mean):
     return 1 / (mean**2 + 0.1 * usual**2 + 1e-30)
 
 
-def steadied(samples, cells):
+def shrink_to_neighbours(samples, cells):
     """Means (pixels,) of `samples` (iterations, pixels), each drawn towards the mean of its
     neighbours by as much as noise is of their differences.
 
@@ -144,7 +144,7 @@ def noise_and_difference(radii, samples, weights, at_first_vertex=True, alike=Fa
     (pixels,); `at_first_vertex`: whether all noise is the photons', because the vertices that
     gather are those which the camera sees; `alike`: see `noise_of_photons`.
     """
-    variance = np.array([usual_mean(values) for values in weights * samples.var(axis=0, ddof=1)])
+    variance = np.array([trimmed_mean(values) for values in weights * samples.var(axis=0, ddof=1)])
     met = np.count_nonzero(samples, axis=(0, 2)) if alike else None
     variance = noise_of_photons(radii, variance, 0.0 if at_first_vertex else variance.min(), met)
     steps = np.diff(samples, axis=1)  # (iterations, radii - 1, pixels)
@@ -227,14 +227,14 @@ def expected_squared_bias(radii, difference, error, iterations, wanted, least=LE
     return np.einsum("qh,qhr->r", weight, bias)
 
 
-def usual_mean(values, rare=RARE_PIXELS, fewest=0):
+def trimmed_mean(values, rare=RARE_PIXELS, fewest=0):
     """Mean over pixels without the largest `rare` (a share) of them, `fewest` at least: one pixel
     at the edge of a lamp can outweigh all others."""
     kept = np.sort(values)[: max(len(values) - max(round(len(values) * rare), fewest), 1)]
     return float(np.mean(kept))
 
 
-class Choice(NamedTuple):
+class RadiusChoice(NamedTuple):
     """A radius, whether to correct estimates at edges, and what to expect then, in relative
     terms."""
 
@@ -270,8 +270,8 @@ def expect(radii, plain, corrected, mean, at_first_vertex=True, alike=False):
     weights = relative_weights(mean)
     ways, edges, best, least = {False: plain}, {False: 0.0}, plain, LEAST_BIAS
     if corrected is not None:
-        added, lacking, doubt = light_lost_at_edges(plain, corrected, weights)
-        wrong = {False: lacking**2 + doubt**2, True: (1 - lacking) ** 2 + doubt**2}
+        added, lacking, pmf_mismatch = light_lost_at_edges(plain, corrected, weights)
+        wrong = {False: lacking**2 + pmf_mismatch**2, True: (1 - lacking) ** 2 + pmf_mismatch**2}
         ways, edges = (
             {False: plain, True: corrected},
             {way: between(fine, radii, added * wrong[way]) for way in wrong},
@@ -292,7 +292,7 @@ def expect(radii, plain, corrected, mean, at_first_vertex=True, alike=False):
 
 
 def best_radius(expected, iterations, used=None, reluctance=0.0, more_noise=None):
-    """The `Choice` that minimises the predicted relative error; `used`, a radius and whether it
+    """The `RadiusChoice` that minimises the predicted relative error; `used`, a radius and whether it
     corrects, if the least error is not below its by more than this share, `reluctance`.
 
     `expected`: an `Expected`; `iterations(R, corrected)`: how many iterations there will be, so
@@ -313,7 +313,7 @@ def best_radius(expected, iterations, used=None, reluctance=0.0, more_noise=None
         choices.append(
             (
                 float(predicted[at]),
-                Choice(float(fine[at]), way, float(bias[at]), float(variance[at])),
+                RadiusChoice(float(fine[at]), way, float(bias[at]), float(variance[at])),
             )
         )
         if used is not None and used[1] == way:
@@ -321,10 +321,14 @@ def best_radius(expected, iterations, used=None, reluctance=0.0, more_noise=None
             choices.append(
                 (
                     float(predicted[at]) * (1 - reluctance),
-                    Choice(used[0], way, float(bias[at]), float(variance[at])),
+                    RadiusChoice(used[0], way, float(bias[at]), float(variance[at])),
                 )
             )
-    return min(choices)[1] if choices else Choice(float(radii[middling(radii)]), False, 0.0, 0.0)
+    return (
+        min(choices)[1]
+        if choices
+        else RadiusChoice(float(radii[middle_index(radii)]), False, 0.0, 0.0)
+    )
 
 
 def between(wanted, radii, values):

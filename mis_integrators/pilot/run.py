@@ -23,17 +23,17 @@ from .radius import (
     best_radius,
     expect,
     ladder,
-    middling,
+    middle_index,
     relative_weights,
-    steadied,
-    usual_mean,
+    shrink_to_neighbours,
+    trimmed_mean,
 )
 
 PILOT_PATHS = 4096
 FEWEST_ITERATIONS, FEWEST_TIMED_ITERATIONS, MOST_ITERATIONS = 4, 3, 16
 NEIGHBOURS = 16
 """Pilot pixels that are expected to look alike."""
-PILOT_SHARE = 0.04
+PILOT_TIME_SHARE = 0.04
 """Share of the planned iterations, or seconds, that the pilot may have once it has the fewest."""
 PILOT_INDEX = 1 << 30
 """Iteration numbers of the pilot start here, so that its random numbers are its own."""
@@ -86,11 +86,11 @@ def choose_radii(session):
         now = time.perf_counter()
         if session.seconds is not None:
             over = (
-                now - started > PILOT_SHARE * session.seconds
+                now - started > PILOT_TIME_SHARE * session.seconds
                 and done + 1 >= FEWEST_TIMED_ITERATIONS
             )
         else:
-            over = done + 1 >= max(PILOT_SHARE * count, FEWEST_ITERATIONS)
+            over = done + 1 >= max(PILOT_TIME_SHARE * count, FEWEST_ITERATIONS)
         if over or pilot.ladder is None:
             break
     if session.seconds is None:
@@ -186,13 +186,13 @@ def pilot_pixels(session):
     """`(stride, count, copies)`: the pilot's pixels are numbers 0, stride, 2 stride, ... of the
     film's, and so many camera paths go through each."""
     pixels = film_sample_count(session.sensor)
-    copies = 2 if may_choose_camera_paths(session) or session.samples_per_iteration > 1 else 1
-    count = min(pixels, PILOT_PATHS // copies)
+    pilot_camera_paths = 2 if may_choose_camera_paths(session) or session.camera_paths > 1 else 1
+    count = min(pixels, PILOT_PATHS // pilot_camera_paths)
     stride = pixels // count
     width, _ = film_size(session.sensor)
     while stride > 1 and math.gcd(stride, width) > 1:  # else the pixels would stand in columns
         stride -= 1
-    return stride, count, copies
+    return stride, count, pilot_camera_paths
 
 
 def neighbourhoods(session, stride, count):
@@ -205,7 +205,7 @@ def neighbourhoods(session, stride, count):
     return np.unique(cells, return_inverse=True)[1]
 
 
-class Noise(NamedTuple):
+class PilotNoise(NamedTuple):
     """What a pilot knows of biases and variances, relative by `relative_weights`."""
 
     expected: dict[str, Expected]
@@ -225,16 +225,19 @@ class Pilot:
     (copies, pixels) an iteration; `photons[kind]`: mean number of photons within the largest
     radius.
 
-    `copies`: camera paths of a pixel, which share the photons of their iteration. Where an
+    `pilot_camera_paths`: camera paths of a pixel, which share the photons of their iteration. Where an
     iteration may have several camera paths a pixel there are two, whose difference tells the noise
     of camera paths from that of photons.
     """
 
     def __init__(self, session):
         self.session = session
-        stride, self.pixels, self.copies = pilot_pixels(session)
-        self.camera_paths, self.camera_share = session.samples_per_iteration, CAMERA_SHARE
-        self.stride, self.paths = stride * self.copies, self.pixels * self.copies
+        stride, self.pixels, self.pilot_camera_paths = pilot_pixels(session)
+        self.camera_paths, self.camera_share = session.camera_paths, CAMERA_SHARE
+        self.stride, self.paths = (
+            stride * self.pilot_camera_paths,
+            self.pixels * self.pilot_camera_paths,
+        )
         self.cells = neighbourhoods(session, stride, self.pixels)
         self.ladder = None
         # Caustics have edges of their own; only the smooth indirect light gains from knowing the
@@ -264,7 +267,7 @@ class Pilot:
                 lanes(self.paths) // self.pixels * back,
                 self.stride,
                 self.paths,
-                self.copies,
+                self.pilot_camera_paths,
                 capacity,
                 spectral,
             )
@@ -327,7 +330,9 @@ class Pilot:
             )
 
     def _numpy(self, value):
-        return np.broadcast_to(np.array(value), self.paths).reshape(self.copies, self.pixels)
+        return np.broadcast_to(np.array(value), self.paths).reshape(
+            self.pilot_camera_paths, self.pixels
+        )
 
     def _prepare(self, photons, vertices):
         """Sets the ladder and counts photons; false if no camera path meets a surface that
@@ -365,7 +370,7 @@ class Pilot:
             return None
         mean = self.mean()
         session = self.session
-        caustics = np.mean(self.middling("caustic")) if "caustic" in self.ways else 0.0
+        caustics = np.mean(self.middle_index("caustic")) if "caustic" in self.ways else 0.0
         return Forecast(
             sum(choice.squared_bias for choice in choices.values()),
             self._variance(choices, self.camera_paths),
@@ -437,11 +442,11 @@ class Pilot:
         return choices
 
     def _best_radii(self, camera_paths, count, reluctance=None):
-        """The `Choice` for each kind of photons, in iterations of so many camera paths a pixel."""
+        """The `RadiusChoice` for each kind of photons, in iterations of so many camera paths a pixel."""
         session, choices = self.session, {}
         for kind, expected in self.noise.expected.items():
             more_noise = {
-                way: noise * (1 / camera_paths - 1 / self.copies)
+                way: noise * (1 / camera_paths - 1 / self.pilot_camera_paths)
                 for way, noise in self.noise.of_a_path[kind].items()
             }
             choices[kind] = best_radius(
@@ -457,7 +462,7 @@ class Pilot:
 
     @cached_property
     def noise(self):
-        """The `Noise` of all iterations so far; they are over when this is asked for."""
+        """The `PilotNoise` of all iterations so far; they are over when this is asked for."""
         mean = self.mean()
         weights, expected, of_a_path = relative_weights(mean), {}, {}
         for kind, ways in self.ways.items():
@@ -481,15 +486,15 @@ class Pilot:
             if len(self.direct) > 1
             else np.full(self.pixels, np.inf)
         )
-        return Noise(expected, of_a_path, usual_mean(weights * of_direct))
+        return PilotNoise(expected, of_a_path, trimmed_mean(weights * of_direct))
 
     def _between_copies(self, weights, samples):
         """Relative variance between the camera paths of a pixel, one a radius."""
-        if self.copies == 1:
+        if self.pilot_camera_paths == 1:
             return np.zeros(len(self.ladder))
         return np.array(
             [
-                usual_mean(pixels)
+                trimmed_mean(pixels)
                 for pixels in weights * np.var(samples, axis=2, ddof=1).mean(axis=0)
             ]
         )
@@ -500,10 +505,10 @@ class Pilot:
         if self.session.judged_by is not None:
             return self.session.judged_by
         image = np.mean(self.direct, axis=1) + sum(
-            np.mean(self.middling(kind), axis=1) for kind in self.ways
+            np.mean(self.middle_index(kind), axis=1) for kind in self.ways
         )  # (iterations, pixels)
-        return steadied(image, self.cells)
+        return shrink_to_neighbours(image, self.cells)
 
-    def middling(self, kind):
+    def middle_index(self, kind):
         """What photons of a kind bring at a middling radius: (iterations, copies, pixels)."""
-        return [step[middling(self.ladder)] for step in self.samples[kind, False]]
+        return [step[middle_index(self.ladder)] for step in self.samples[kind, False]]

@@ -11,23 +11,23 @@ import mitsuba as mi
 from ..core.spectra import channel_mean
 from ..paths.light_starts import read_starts
 from ..paths.sensor import unblocked
-from ..paths.subpaths import junction_of, read_vertices
+from ..paths.subpaths import read_vertices, vertex_bsdf_of
 from ..paths.vertex import SMALLEST_COSINE, scattered_mean
 
-END = ("near", "far", "strength")
+END = ("d_vcm", "d_vc", "strength")
 """Fields that the ends' states have."""
 
 
 @dataclass
-class Sent:
+class LightConnection:
     """What the end of a light sub-path sends to a point, one a lane.
 
     `d`, `distance`: from the point to the end (infinite for emitters that are); `light` (spectrum):
     per solid angle if the sub-path's density were one there, that is, times what the point's BSDF
     makes of it (cosine included) it is the contribution over the sub-path's density; unoccluded;
     `mean`: its channel mean without colours along the sub-path mixed (a product of channel means);
-    `across` [1/m^2]: density per area across `d` with which the sub-path would go on to the point;
-    `behind`: techniques nearer to the light than this one, over the density per solid angle at the
+    `pdf_area` [1/m^2]: density per area across `d` with which the sub-path would go on to the point;
+    `mis_sum`: techniques nearer to the light than this one, over the density per solid angle at the
     point with which the camera's side would make the end; `vertices`: how many the light sub-path
     has.
     """
@@ -36,12 +36,12 @@ class Sent:
     distance: mi.Float
     light: mi.Spectrum
     mean: mi.Float
-    across: mi.Float
-    behind: mi.Float
+    pdf_area: mi.Float
+    mis_sum: mi.Float
     vertices: mi.UInt32
 
 
-class LightEnds:
+class LightVertices:
     """Ends of M light sub-paths. The first M are starts (`light_starts`), the others the vertices
     at the places `list` of a buffer of `subpaths`, whose states have the fields `END`.
 
@@ -53,7 +53,7 @@ class LightEnds:
         self.vertices, self.places, self.count, self.reach = vertices, places, count, reach
 
     def send(self, p, index, time, wavelengths, active):
-        """What the ends `index` send to points `p`: a `Sent`."""
+        """What the ends `index` send to points `p`: a `LightConnection`."""
         surface = active & (index >= self.paths)
         place = dr.gather(mi.UInt32, self.places, index - self.paths, surface)
         y = read_vertices(self.vertices, place, surface, states=END)
@@ -61,18 +61,18 @@ class LightEnds:
         squared = dr.maximum(dr.squared_norm(offset), 1e-20)
         distance = dr.sqrt(squared)
         d = offset * dr.rcp(distance)
-        value, back, forward = junction_of(self.traits, y, wavelengths, surface).between(
+        value, back, forward = vertex_bsdf_of(self.traits, y, wavelengths, surface).f_and_pdfs(
             -d, y["towards"], surface
         )
         leaving = dr.abs(dr.dot(y["n"], d)) * dr.rcp(squared)
         landing = dr.maximum(dr.abs(dr.dot(y["n"], y["towards"])), SMALLEST_COSINE)
-        sent = Sent(
+        joined = LightConnection(
             d,
             distance,
             value * y["throughput"] * (leaving * dr.rcp(landing)),
             y["strength"] * scattered_mean(value, y["n"], y["towards"]) * leaving,
             forward * leaving,
-            leaving * (y["near"] + back * y["far"]),
+            leaving * (y["d_vcm"] + back * y["d_vc"]),
             y["depth"] + 1,
         )
 
@@ -81,33 +81,33 @@ class LightEnds:
         reference = dr.zeros(mi.SurfaceInteraction3f, dr.width(p))
         reference.p, reference.time, reference.wavelengths = p, time, wavelengths
         ds, light = self.lights.emitted(reference, x["emitter"], x["p"], x["n"], x["uv"], start)
-        density = self.lights.start_density(reference, ds, start)
-        across = self.lights.forward_density(reference, ds, start)
+        density = self.lights.pdf_emission_origin(reference, ds, start)
+        pdf_area = self.lights.pdf_emission_area(reference, ds, start)
         per = dr.select(density > 0, dr.rcp(dr.maximum(density, 1e-20)), 0)
         light *= per
         mean = dr.select(
-            self.lights.untold(ds.emitter, start),
-            self.lights.total_power * across,
+            self.lights.has_unknown_pdf(ds.emitter, start),
+            self.lights.total_power * pdf_area,
             channel_mean(light),
         )
         met = start & self.lights.can_be_met(ds.emitter, start)
-        return Sent(
-            dr.select(start, ds.d, sent.d),
-            dr.select(start, ds.dist, sent.distance),
-            dr.select(active, dr.select(start, light, sent.light), 0),
-            dr.select(start, mean, sent.mean),
-            dr.select(start, across, sent.across),
-            dr.select(start, dr.select(met, per, 0), sent.behind),
-            dr.select(start, 1, sent.vertices),
+        return LightConnection(
+            dr.select(start, ds.d, joined.d),
+            dr.select(start, ds.dist, joined.distance),
+            dr.select(active, dr.select(start, light, joined.light), 0),
+            dr.select(start, mean, joined.mean),
+            dr.select(start, pdf_area, joined.pdf_area),
+            dr.select(start, dr.select(met, per, 0), joined.mis_sum),
+            dr.select(start, 1, joined.vertices),
         )
 
-    def unblocked(self, scene, p, n, sent, active):
+    def unblocked(self, scene, p, n, joined, active):
         """Whether nothing stands between points `p` (geometric normals `n`) and the ends that sent
-        `sent`."""
-        return unblocked(scene, p, n, sent.d, dr.minimum(sent.distance, self.reach), active)
+        `joined`."""
+        return unblocked(scene, p, n, joined.d, dr.minimum(joined.distance, self.reach), active)
 
 
-def list_ends(vertices, count, lengths, first, paths: int, capacity: int, room: int):
+def list_light_vertices(vertices, count, lengths, first, paths: int, capacity: int, room: int):
     """Places of the vertices of the light sub-paths `first`, `first + 1`, ..., `paths` of them, in
     the order of paths and of each one's vertices, and their number (width one; above `room`: the
     surplus is missing). `lengths`: how many vertices each sub-path has."""

@@ -10,7 +10,7 @@ from .media import collision, section
 from .pivots import ON_SURFACE, added_stream, next_gap, null_stream, passing, pivot_surface
 from .shifts import Sections, at_optical_depth, total_optical_depth
 
-LARGEST = 1e15
+LARGEST_RATIO = 1e15
 """Bound of density ratios: sums of their squares stay finite."""
 BLOCKED, SHIFT_INVALID = 0.0, -1.0
 """What stands in a connection's `ratio` where a view does not see the pivot, and where it sees it
@@ -309,7 +309,7 @@ def connect(traits, shift, pivot, own, line, common, number, seed, slots, active
         line["density"]
         * dr.rcp(dr.maximum(own["density"], 1e-30))
         * dr.exp(dr.minimum(log_ratio, 60)),
-        LARGEST,
+        LARGEST_RATIO,
     )
     ratio = dr.select(active & ~empty, dr.select(lost, SHIFT_INVALID, ratio), BLOCKED)
     return {

@@ -38,9 +38,9 @@ from . import Array
 from .heuristics import bounded_power
 from .recursion import at_least, at_most
 
-SMALLEST = 1e-20
+SMALLEST_DENSITY = 1e-20
 """Stands for densities that vanish."""
-LARGEST = 1e15
+LARGEST_RATIO = 1e15
 """Bound on what a sub-path carries along."""
 
 
@@ -48,7 +48,7 @@ def norm(a: Array, b: Array, beta: float) -> Array:
     """(a^beta + b^beta)^(1/beta) of non-negative numbers."""
     if beta == 1:
         return a + b
-    larger = at_least(at_least(a, b), SMALLEST)
+    larger = at_least(at_least(a, b), SMALLEST_DENSITY)
     a, b = a / larger, b / larger
     if beta == 2:
         return larger * (a * a + b * b) ** 0.5
@@ -57,29 +57,29 @@ def norm(a: Array, b: Array, beta: float) -> Array:
 
 def reciprocal(density: Array) -> Array:
     """1 / density, bounded where the density vanishes."""
-    return at_most(1 / at_least(density, SMALLEST), LARGEST)
+    return at_most(1 / at_least(density, SMALLEST_DENSITY), LARGEST_RATIO)
 
 
-def nearer(near: Array, far: Array, p_back: Array, beta: float, eta: Array = 0.0) -> Array:
+def nearer(d_vcm: Array, d_vc: Array, p_back: Array, beta: float, eta: Array = 0.0) -> Array:
     """A_i = near_i + P' far_i + eta (the brackets of equations 40 and 41): all techniques nearer to
     the sub-path's start than the one that joins x_i with the other side, over p<(x_i). `p_back`:
     P', the other side's density at x_i for the direction to x_{i-1}."""
-    inner = norm(near, at_most(p_back * far, LARGEST), beta)
+    inner = norm(d_vcm, at_most(p_back * d_vc, LARGEST_RATIO), beta)
     return inner if isinstance(eta, float) and eta == 0 else norm(inner, eta, beta)
 
 
-def near_of(p_forward: Array, geometry: Array) -> Array:
+def d_vcm_of(p_forward: Array, geometry: Array) -> Array:
     """near_i = 1 / (P(x_{i-1}) G) (equation 34): x_i was sampled from x_{i-1} with density
     `p_forward`, over a segment with G = `geometry`. To be replaced by zero where x_{i-1} scattered
     by a delta function."""
     return reciprocal(p_forward * geometry)
 
 
-def far_of(a: Array, p_forward: Array) -> Array:
+def d_vc_of(a: Array, p_forward: Array) -> Array:
     """far_{i+1} = A_i / P(x_i) (equation 35), where `a` is A_i and x_i scattered with density
     `p_forward`; beyond a delta surface far stays what it was (equation 35 with both densities
     cancelled)."""
-    return at_most(a * reciprocal(p_forward), LARGEST)
+    return at_most(a * reciprocal(p_forward), LARGEST_RATIO)
 
 
 def light_start(emission: Array, direct: Array) -> tuple[Array, Array]:
@@ -90,8 +90,8 @@ def light_start(emission: Array, direct: Array) -> tuple[Array, Array]:
     latter density, per projected solid angle at the vertex; what it divides is technique s = 0.
     Where the light cannot be met far_1 is to be replaced by zero, where next-event estimation does
     not work both are."""
-    near = reciprocal(emission)
-    return near, at_most(near * reciprocal(direct), LARGEST)
+    d_vcm = reciprocal(emission)
+    return d_vcm, at_most(d_vcm * reciprocal(direct), LARGEST_RATIO)
 
 
 def camera_start(density: Array, ratio: Array) -> Array:
@@ -101,7 +101,7 @@ def camera_start(density: Array, ratio: Array) -> Array:
     `density` [1/m^2]: area density there of camera rays through the whole film; `ratio`: light
     sub-paths over camera paths, both of all the film. To be replaced by zero where the vertex
     cannot be joined to the sensor."""
-    return at_most(ratio * reciprocal(density), LARGEST)
+    return at_most(ratio * reciprocal(density), LARGEST_RATIO)
 
 
 def connection(
@@ -119,19 +119,21 @@ def connection(
     )
 
 
-def met(direct_over_sampled: Array, emission_density: Array, far: Array, beta: float) -> Array:
+def hit_emitter(
+    direct_over_sampled: Array, emission_density: Array, d_vc: Array, beta: float
+) -> Array:
     """Weight of emission that a camera path meets (equations 42 and 43), technique s = 0.
 
     `direct_over_sampled`: density of next-event estimation for this point over the density with
     which the path was sampled there, zero where it cannot work from the vertex before;
     `emission_density`: density of next-event estimation per solid angle there times `emission` of
-    `light_start` over the cosine at the vertex before; `far`: of the emitter's point."""
+    `light_start` over the cosine at the vertex before; `d_vc`: of the emitter's point."""
     return 1 / (
         1
         + bounded_power(
             norm(
-                at_most(direct_over_sampled, LARGEST),
-                at_most(emission_density * far, LARGEST),
+                at_most(direct_over_sampled, LARGEST_RATIO),
+                at_most(emission_density * d_vc, LARGEST_RATIO),
                 beta,
             ),
             beta,
@@ -139,7 +141,7 @@ def met(direct_over_sampled: Array, emission_density: Array, far: Array, beta: f
     )
 
 
-def merging(a_light: Array, a_camera: Array, eta: Array, beta: float) -> Array:
+def merge_weight(a_light: Array, a_camera: Array, eta: Array, beta: float) -> Array:
     """Weight of merging two sub-paths that end in one disk (equations 38 and 39): their A without
     `eta`, over it."""
     return 1 / (1 + bounded_power(a_light / eta, beta) + bounded_power(a_camera / eta, beta))

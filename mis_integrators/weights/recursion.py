@@ -28,10 +28,10 @@ import numpy as np
 
 from . import Array
 
-SMALLEST = 1e-30
+SMALLEST_DENOMINATOR = 1e-30
 """Stands for zero in a divisor: a direction that the camera path cannot take has r = 0."""
 
-LARGEST = 1e18
+LARGEST_RATIO = 1e18
 """Stands for infinity in responses and drives: products of two are still single precision
 numbers."""
 
@@ -65,13 +65,13 @@ def first_ratio(p0: Array, camera_paths: int = 1) -> Array:
 def kernel_share(r: Array, f: Array) -> Array:
     """theta_i = r_i / (r_i + f_i), in [0, 1]: how much of the remaining weight strategies before
     z_i could take cheaply."""
-    return r / at_least(r + f, SMALLEST)
+    return r / at_least(r + f, SMALLEST_DENOMINATOR)
 
 
 def kernel_rest(r: Array, f: Array) -> Array:
     """1 - theta_i = f_i / (r_i + f_i), without cancellation where the BSDF nearly vanishes (f_i <<
     r_i)."""
-    return f / at_least(r + f, SMALLEST)
+    return f / at_least(r + f, SMALLEST_DENOMINATOR)
 
 
 def next_ratio(theta: Array, p: Array) -> Array:
@@ -85,7 +85,7 @@ def next_ratio(theta: Array, p: Array) -> Array:
 def deepest_response(n: Array, luminance: Array, c: Array, r: Array) -> Array:
     """gamma_{K-1} = n L / (r_{K-1} + b/L): expected photons over what merging at the deepest vertex
     costs."""
-    return n * luminance / at_least(r + c, SMALLEST)
+    return n * luminance / at_least(r + c, SMALLEST_DENOMINATOR)
 
 
 def inner_response(
@@ -104,28 +104,33 @@ def inner_response(
     theta_i) eta_{i+1}>, second_moment = <(1 - theta_i)^2 eta_{i+1}>, <.> the mean over the camera
     path's directions at z_i. Local weights leave the three out (zero).
     """
-    return n * direct / at_least(r, SMALLEST) + n * photon_sum + second_moment + tau * first_moment
+    return (
+        n * direct / at_least(r, SMALLEST_DENOMINATOR)
+        + n * photon_sum
+        + second_moment
+        + tau * first_moment
+    )
 
 
 def remainder(gamma: Array) -> Array:
     """e_i = 1 - eta_i = 1 / (1 + gamma_i), in (0, 1]."""
-    return 1 / (1 + at_most(gamma, LARGEST))
+    return 1 / (1 + at_most(gamma, LARGEST_RATIO))
 
 
 def response(gamma: Array) -> Array:
     """eta_i = gamma_i / (1 + gamma_i), in [0, 1], without cancellation where gamma_i is small."""
-    gamma = at_most(gamma, LARGEST)
+    gamma = at_most(gamma, LARGEST_RATIO)
     return gamma / (1 + gamma)
 
 
 def carry(first_moment: Array, mean_remainder: Array) -> Array:
     """tau_i = <(1 - theta_i) eta_{i+1}> / <e_{i+1}>."""
-    return first_moment / at_least(mean_remainder, SMALLEST)
+    return first_moment / at_least(mean_remainder, SMALLEST_DENOMINATOR)
 
 
 def root_offset(mean_f_eta: Array, mean_remainder: Array) -> Array:
     """n F / N_B = <f_0 eta_1> / <e_1>, the drift of the whole pixel [1/sr]."""
-    return mean_f_eta / at_least(mean_remainder, SMALLEST)
+    return mean_f_eta / at_least(mean_remainder, SMALLEST_DENOMINATOR)
 
 
 # ---------------------------------------------------------------- down: drives
@@ -134,22 +139,22 @@ def root_offset(mean_f_eta: Array, mean_remainder: Array) -> Array:
 def first_drive(offset: Array, f0: Array) -> Array:
     """drive_1 = d_1 / H_1 = 1 + (n F / N_B) / f_0, where f_0 > 0; grows without bound as f_0 falls:
     what is finite is its product with f_0."""
-    return 1 + offset / at_least(f0, SMALLEST)
+    return 1 + offset / at_least(f0, SMALLEST_DENOMINATOR)
 
 
 def next_drive(drive: Array, e: Array, tau: Array, rest: Array) -> Array:
     """drive_{i+1} = (1 + tau_i / (1 - theta_i)) e_i drive_i, rest = 1 - theta_i = `kernel_rest`;
     unbounded as f_i falls, like the first."""
     u = e * drive
-    return u + tau * u / at_least(rest, SMALLEST)
+    return u + tau * u / at_least(rest, SMALLEST_DENOMINATOR)
 
 
 def bounded_drive(drive: Array, r: Array) -> Array:
-    """drive_i, at most `LARGEST`, and 0 where r_i = 0: strategies at z_i and beyond that cannot
+    """drive_i, at most `LARGEST_RATIO`, and 0 where r_i = 0: strategies at z_i and beyond that cannot
     make a path must not share in it.
 
     A function of the path alone, common to all deeper weights: they still sum to one."""
-    return at_most(at_most(drive, LARGEST), at_most(r, 1) / SMALLEST)
+    return at_most(at_most(drive, LARGEST_RATIO), at_most(r, 1) / SMALLEST_DENOMINATOR)
 
 
 # ---------------------------------------------------------------- up: weights
@@ -163,7 +168,7 @@ def direct_weight(drive: Array, e: Array) -> Array:
 
 def deepest_weight(drive: Array, e: Array, r: Array, c: Array) -> Array:
     """w_{K, K-1} = e_{K-1} drive_{K-1} r_{K-1} / (r_{K-1} + b/L)."""
-    return e * drive * (r / at_least(r + c, SMALLEST))
+    return e * drive * (r / at_least(r + c, SMALLEST_DENOMINATOR))
 
 
 def inner_weight(drive: Array, e: Array, theta: Array, deeper: Array) -> Array:

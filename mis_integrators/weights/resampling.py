@@ -26,20 +26,20 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from . import Array
-from .recursion import LARGEST, SMALLEST, at_least, at_most
+from .recursion import LARGEST_RATIO, SMALLEST_DENOMINATOR, at_least, at_most
 
 # ---------------------------------------------------------------- the draw
 
 
 def proposal_weight(q_star: Array, p: Array) -> Array:
     """r = q*/p, zero for what cannot be proposed (p = 0)."""
-    return at_most(q_star / at_least(p, SMALLEST), LARGEST) * (p > 0)
+    return at_most(q_star / at_least(p, SMALLEST_DENOMINATOR), LARGEST_RATIO) * (p > 0)
 
 
 def safe_share(total: Array, uniform: Array) -> Array:
     """Share of the uniform pmf in the mixture: `uniform`, but all of it where nothing is worth
     drawing (`total` = 0)."""
-    return uniform + (1 - uniform) * (total <= SMALLEST)
+    return uniform + (1 - uniform) * (total <= SMALLEST_DENOMINATOR)
 
 
 def pmf(r: Array, total: Array, count: Array, uniform: Array = 0.0) -> Array:
@@ -49,7 +49,7 @@ def pmf(r: Array, total: Array, count: Array, uniform: Array = 0.0) -> Array:
     Without a uniform share a proposal that the cached pmf gives nothing, though it contributes,
     would be lost."""
     share = safe_share(total, uniform)
-    return (1 - share) * (r / at_least(total, SMALLEST)) + share / count
+    return (1 - share) * (r / at_least(total, SMALLEST_DENOMINATOR)) + share / count
 
 
 def density_ratio(probability: Array, M: int) -> Array:
@@ -60,7 +60,7 @@ def density_ratio(probability: Array, M: int) -> Array:
 def estimate(g: Array, p: Array, probability: Array, M: int) -> Array:
     """What one of the N drawn proposals says: g / (M p P_r); I is the mean over the draws (and over
     p(Z))."""
-    return g / at_least(M * p * probability, SMALLEST)
+    return g / at_least(M * p * probability, SMALLEST_DENOMINATOR)
 
 
 # ---------------------------------------------------------------- the weights
@@ -78,8 +78,8 @@ def gain(ratio: Array, share: Array, M: int, N: int = 1) -> Array:
 
     `ratio` = q/p and `share` = Q_s/Q. From zero (never drawn) to M (always drawn). M = 1 and a
     uniform pmf over S lengths give 1/S."""
-    x = at_most(ratio, LARGEST) * (N / M)
-    return M * (x / at_least(x + bracket(share, M), SMALLEST))
+    x = at_most(ratio, LARGEST_RATIO) * (N / M)
+    return M * (x / at_least(x + bracket(share, M), SMALLEST_DENOMINATOR))
 
 
 def resampled_density(p: Array, q: Array, share: Array, M: int, N: int = 1) -> Array:
@@ -91,17 +91,20 @@ def technique_weights(densities: Sequence[Array], counts: Sequence[Array]) -> li
     """w_t = n_t p_t / sum_i n_i p_i, a list. n_t = 1 for t in Lambda_RIS, N_t samples for t in
     Lambda_IS; zero for a path without techniques."""
     parts = [n * density for n, density in zip(counts, densities)]
-    total = at_least(sum(parts), SMALLEST)
+    total = at_least(sum(parts), SMALLEST_DENOMINATOR)
     return [part / total for part in parts]
 
 
-def doubtful_ratio(whole: Array, spare: Array, doubt: Array) -> Array:
+def doubtful_ratio(whole: Array, spare: Array, pmf_mismatch: Array) -> Array:
     """q/p to put into `gain` where the pmf is a cached one, made for a place near by: 1 / E[p/q],
     for 1/q is what the variance is linear in.
 
     `whole`: q/p if the cache sees what can be seen here; `spare`: what is left of it if it does
-    not, which happens with the probability `doubt`."""
-    return 1 / ((1 - doubt) / at_least(whole, SMALLEST) + doubt / at_least(spare, SMALLEST))
+    not, which happens with the probability `pmf_mismatch`."""
+    return 1 / (
+        (1 - pmf_mismatch) / at_least(whole, SMALLEST_DENOMINATOR)
+        + pmf_mismatch / at_least(spare, SMALLEST_DENOMINATOR)
+    )
 
 
 # ---------------------------------------------------------------- the noise

@@ -53,7 +53,7 @@ class FakeSession:
     """Iteration k adds an image of the value k, so that the mean after n of them is (n + 1) / 2."""
 
     iterations_planned = 5
-    samples_per_iteration = 2
+    camera_paths = 2
     channels = ["R", "G", "B", "var.R"]
     settings, learned = {"initial_radius": 0.5}, {}
 
@@ -300,7 +300,7 @@ def test_passes_are_independent_and_add_up(scene, monkeypatch):
     )
     integrator = mi.load_dict({"type": "ptracer"})
     session = MitsubaSession(loaded.integrator(), loaded, loaded.sensors()[0], seed=0, spp=10)
-    assert (session.iterations_planned, session.samples_per_iteration) == (3, 4)
+    assert (session.iterations_planned, session.camera_paths) == (3, 4)
     first, again, other = (
         MitsubaSession(integrator, noisy, sensor, seed=seed, spp=8) for seed in (0, 0, 1)
     )
@@ -333,7 +333,7 @@ def test_sampler_that_rounds_up(rgb):
     session = MitsubaSession(
         mi.load_dict({"type": "path"}), scene, scene.sensors()[0], seed=0, spp=10
     )
-    assert (session.iterations_planned, session.samples_per_iteration) == (1, 16)
+    assert (session.iterations_planned, session.camera_paths) == (1, 16)
     session.iterate()
     np.testing.assert_allclose(session.image(), 1, rtol=1e-5)
 

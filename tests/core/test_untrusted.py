@@ -406,7 +406,7 @@ def test_any_value_that_was_learned(sessions, name, value):
     else:
         assert (
             all(0 < radius < float("inf") for radius in session.radii.values())
-            and 0 < session.samples_per_iteration < 2**32
+            and 0 < session.camera_paths < 2**32
         )
 
 

@@ -227,7 +227,7 @@ def test_a_path_of_given_time_keeps_the_processor_busy(rgb, monkeypatch, seconds
         session.plan_time(seconds)
     session.iterate()
     trial = next(trial for trial in session.decision.trials if trial.name == "path")
-    assert session.decision.plugin == "path" and session.samples_per_iteration == samples
+    assert session.decision.plugin == "path" and session.camera_paths == samples
     segments = trial.cost / samples / 1e-4
     assert 1 < segments < 4
     one = auto(camera_paths=1).session(scene, spp=8)
@@ -317,9 +317,9 @@ def test_camera_paths_of_the_chosen_are_its_own(rgb, monkeypatch):
     session.plan_time(1000.0)
     session.iterate()
     assert (
-        session.samples_per_iteration
+        session.camera_paths
         == session.settings["camera_paths"]
-        == session.decision.session.samples_per_iteration
+        == session.decision.session.camera_paths
         == 3
     )
     trial = session.decision.trials[0]
@@ -329,7 +329,7 @@ def test_camera_paths_of_the_chosen_are_its_own(rgb, monkeypatch):
     )
     other = auto().session(caustic_scene("point"))
     other.recall(json.loads(json.dumps(session.learned)))
-    assert other.samples_per_iteration == 3
+    assert other.camera_paths == 3
 
 
 def test_prediction_is_checked(rgb):

@@ -101,12 +101,12 @@ class JointPaths:
 
     def camera(self, weights):
         """What a camera path stores at each vertex, and its states after leaving them."""
-        state, stored, left = weights.begin(self.COUNT), [], []
+        state, stored, left = weights.init(self.COUNT), [], []
         for number, (_, _, si, bsdf, bs) in enumerate(self.vertices):
             vertex = dr.full(mi.UInt32, number, self.COUNT)
-            state, _ = weights.arrived(state, si, bsdf, vertex, self.valid)
+            state, _ = weights.propagate(state, si, bsdf, vertex, self.valid)
             stored.append(weights.stored(state))
-            state = weights.leaving(state, si, bsdf, bs, vertex, self.valid)
+            state = weights.scatter(state, si, bsdf, bs, vertex, self.valid)
             dr.eval(state, stored)
             left.append(state)
         return stored, left
@@ -115,7 +115,7 @@ class JointPaths:
         """Weight of the direct light at the last vertex: of a sample of next-event estimation, and
         of emission that the path meets."""
         _, _, si, _, _ = self.vertices[-1]
-        sampled = weights.direct_share(left[-1], si, self.light, self.valid)
+        sampled = weights.next_event_weight(left[-1], si, self.light, self.valid)
         if self.light.delta[0]:
             return sampled, sampled
         lamp = self.scene.ray_intersect(si.spawn_ray(self.light.d))
@@ -124,13 +124,13 @@ class JointPaths:
             self.light.p
         )  # the ray starts a bit off the surface, and may even miss the lamp's edge
         met = mi.DirectionSample3f(self.scene, lamp, mi.Interaction3f(si))
-        return sampled, weights.direct_share(left[-1], mi.Interaction3f(si), met, self.valid)
+        return sampled, weights.next_event_weight(left[-1], mi.Interaction3f(si), met, self.valid)
 
     def notes(self, weights, merged, straight):
         """Notes of the light sub-path whose photon lands on vertex `merged`; `straight`: it came to
         the last vertex straight from the light."""
-        notebook = weights.notebook()
-        state = notebook.begin()
+        light_state = weights.light_state()
+        state = light_state.init()
         source = dr.zeros(mi.DirectionSample3f, self.COUNT)
         source.p, source.n, source.emitter = self.light.p, self.light.n, self.light.emitter
         for number in reversed(range(merged + 1, len(self.vertices))):
@@ -141,12 +141,12 @@ class JointPaths:
                 if straight
                 else si.to_local(dr.normalize(unpack_direction(pack_direction(si.to_world(bs.wo)))))
             )
-            state = notebook.lit(
+            state = light_state.first_vertex(
                 state, view, source, self.valid & straight & (number == len(self.vertices) - 1)
             )
-            state = notebook.scattered(state, view, bsdf, si.wi, self.valid)
+            state = light_state.scatter(state, view, bsdf, si.wi, self.valid)
             dr.eval(state)
-        words = notebook.words(state)
+        words = light_state.words(state)
         result = dr.zeros(mi.UInt32, len(words) * self.COUNT)
         for offset, word in enumerate(words):
             dr.scatter(
@@ -186,7 +186,7 @@ class JointPaths:
         dr.scatter(power, (mi.Vector2u if channels == 1 else mi.Vector4u)(*record), index)
         notes = (
             self.notes(weights, level, straight)
-            if kind == "indirect" and weights.notebook()
+            if kind == "indirect" and weights.light_state()
             else None
         )
         photon_map = build_photon_map(
@@ -343,7 +343,7 @@ def test_emission_ratio(rgb, emitter):
     active = si.is_valid() & (dr.max(flux) > 0)
     ds = dr.copy(source)
     ds.d, ds.dist = -ray.d, dr.norm(ds.p - si.p)
-    ratio = lights.emission_ratio(si, ds, active)
+    ratio = lights.emission_over_nee_pdf(si, ds, active)
     delta = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Delta)
     _, sampled = ds.emitter.sample_direction(si, mi.Point2f(0.5), active)
     pdf = lights.pdf_direct(si, ds, active & ~delta)
@@ -527,6 +527,6 @@ def test_radii(rgb):
     assert session.radii["indirect"] > 0 and session.radii["caustic"] > 0
     session.radii = {"indirect": 0.04, "caustic": 0.02}
     session.prepare(None)
-    weights = session.weights(session._spectral(0)["merging"])
+    weights = session.weights(session._spectral(0)["merge_settings"])
     assert weights.caustic_share[0] == pytest.approx(4, rel=1e-5)
     assert weights.disk_paths[0] == pytest.approx(np.pi * 0.04**2 * 5000, rel=1e-5)

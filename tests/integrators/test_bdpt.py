@@ -20,7 +20,7 @@ from mis_integrators.paths.subpaths import (
     trace_light_subpaths,
     vertex_layout,
 )
-from mis_integrators.paths.vertex import Junction
+from mis_integrators.paths.vertex import VertexBSDF
 from mis_integrators.photons.merge import merge, vertex_map
 
 import drjit as dr
@@ -150,14 +150,14 @@ class JointPaths:
             dr.eval(ray, self.vertices, rng, self.valid, self.aperture)
         dr.eval(self.light, self.light_pdf)
 
-    def junction(self, number):
+    def vertex_bsdf(self, number):
         _, si, bsdf, *_ = self.vertices[number]
-        return Junction.at(self.traits, si, bsdf, self.valid)
+        return VertexBSDF.at(self.traits, si, bsdf, self.valid)
 
     def densities(self, number):
         """(p_camera, p_light) at a vertex."""
         _, si, _, to_camera, to_light, _ = self.vertices[number]
-        _, p_camera, p_light = self.junction(number).between(to_camera, to_light, self.valid)
+        _, p_camera, p_light = self.vertex_bsdf(number).f_and_pdfs(to_camera, to_light, self.valid)
         return p_camera, p_light
 
     def segment(self, i, j):
@@ -174,15 +174,17 @@ class JointPaths:
         density = self.lens.density(si.p, si.time, self.aperture, self.valid) * dr.abs(
             dr.dot(si.n, to_camera)
         )
-        states, state = [], weights.seen(density, self.valid)
+        states, state = [], weights.init_camera(density, self.valid)
         for number in range(self.length):
             states.append(state)
             p_camera, p_light = self.densities(number)
             delta = self.vertices[number][-1]
-            left = weights.left(state, p_camera, p_light, delta)
+            left = weights.scatter(state, p_camera, p_light, delta)
             if number < self.length - 1:
                 near, far, squared = self.segment(number, number + 1)
-                state = weights.arrived(left, dr.select(delta, 0, p_camera * near * far / squared))
+                state = weights.propagate(
+                    left, dr.select(delta, 0, p_camera * near * far / squared)
+                )
             dr.eval(state, left)
         return states, left, p_camera, p_light
 
@@ -191,16 +193,16 @@ class JointPaths:
         source = dr.zeros(mi.DirectionSample3f, self.COUNT)
         source.p, source.n, source.emitter = self.light.p, self.light.n, self.light.emitter
         states = {
-            self.length - 1: weights.lit(
+            self.length - 1: weights.init_light(
                 last, source, dr.full(mi.Bool, True, self.COUNT), self.valid
             )
         }
         for number in range(self.length - 1, 0, -1):
             p_camera, p_light = self.densities(number)
             delta = self.vertices[number][-1]
-            left = weights.left(states[number], p_light, p_camera, delta)
+            left = weights.scatter(states[number], p_light, p_camera, delta)
             near, far, squared = self.segment(number, number - 1)
-            states[number - 1] = weights.arrived(
+            states[number - 1] = weights.propagate(
                 left, dr.select(delta, 0, p_light * near * far / squared)
             )
             dr.eval(states[number - 1])
@@ -212,18 +214,18 @@ class JointPaths:
         towards = to_camera if side == "camera" else to_light
         seen = mi.SurfaceInteraction3f(si)
         seen.wi = si.to_local(towards)
-        junction = Junction.at(self.traits, seen, si.bsdf(), self.valid)
+        vertex_bsdf = VertexBSDF.at(self.traits, seen, si.bsdf(), self.valid)
         hit = mi.PreliminaryIntersection3f(hit)
         return {
             "p": si.p,
-            "n": junction.n,
-            "ns": junction.ns,
+            "n": vertex_bsdf.n,
+            "ns": vertex_bsdf.ns,
             "towards": towards,
             "throughput": mi.Spectrum(1),
-            "value": junction.value,
-            "density": junction.density,
-            "near": state[0],
-            "far": state[1],
+            "value": vertex_bsdf.value,
+            "density": vertex_bsdf.density,
+            "d_vcm": state[0],
+            "d_vc": state[1],
             **({"hit": hit} if self.traits.has_rough else {}),
         }
 
@@ -234,12 +236,12 @@ class JointPaths:
         last = self.vertices[-1][1]
         delta = [np.array(v[-1]) for v in self.vertices]
         facing = dr.abs(dr.dot(last.n, self.light.d))
-        emission = self.lights.emission_ratio(last, self.light, self.valid)
+        emission = self.lights.emission_over_nee_pdf(last, self.light, self.valid)
         result = {}
         met = dr.select(
             self.light.delta,
             0,
-            weights.met(
+            weights.hit_emitter(
                 left,
                 self.lights.pdf_direct(last, self.light, self.valid),
                 emission,
@@ -248,7 +250,7 @@ class JointPaths:
         )
         result[0] = np.array(met)
         result[1] = np.array(
-            weights.direct(
+            weights.next_event(
                 camera[-1],
                 self.light_pdf,
                 emission * facing,
@@ -391,20 +393,20 @@ def test_states_of_traced_subpaths(rgb, kind):
         later,
     )
     sides = (before["towards"], d) if kind == "camera" else (d, before["towards"])
-    _, p_camera, p_light = Junction.at(traits, si, si.bsdf(), later).between(*sides, later)
+    _, p_camera, p_light = VertexBSDF.at(traits, si, si.bsdf(), later).f_and_pdfs(*sides, later)
     forward, back = (p_camera, p_light) if kind == "camera" else (p_light, p_camera)
-    left = weights.left([before["near"], before["far"]], forward, back, mi.Bool(False))
+    left = weights.scatter([before["d_vcm"], before["d_vc"]], forward, back, mi.Bool(False))
     geometry = dr.abs(dr.dot(before["n"], d) * dr.dot(here["n"], d)) / dr.squared_norm(
         here["p"] - before["p"]
     )
-    near, far = weights.arrived(left, forward * geometry)
+    near, far = weights.propagate(left, forward * geometry)
     mask = np.array(later) & (np.array(here["depth"]) == np.array(before["depth"]) + 1)
     assert (
         mask.sum() > 100
         and (np.array(here["number"]) == np.array(before["number"]) + 1)[mask].all()
     )
     assert (np.array(here["path"]) == np.array(before["path"]))[mask].all()
-    for mine, expected in ((here["near"], near), (here["far"], far)):
+    for mine, expected in ((here["d_vcm"], near), (here["d_vc"], far)):
         ratio = np.array(mine)[mask] / np.array(expected)[mask]
         assert np.mean(np.abs(ratio - 1) < 2e-3) > 0.98, np.sort(ratio)
 

@@ -18,13 +18,13 @@ from mis_integrators.paths.camera_vertices import (
 from mis_integrators.paths.connect import join_sensor
 from mis_integrators.paths.subpaths import (
     NO_PARENT,
-    junction_of,
     new_vertices,
     read_vertices,
+    vertex_bsdf_of,
     vertex_layout,
 )
-from mis_integrators.paths.vertex import Junction, scattered_mean
-from mis_integrators.resampling.light_vertices import END, LightEnds
+from mis_integrators.paths.vertex import VertexBSDF, scattered_mean
+from mis_integrators.resampling.light_vertices import END, LightVertices
 
 import drjit as dr
 import mitsuba as mi
@@ -75,15 +75,15 @@ class ResampledPaths(JointPaths):
         seen.wi = si.to_local(towards)
         depth = number + 1 if side == "camera" else self.length - number
         slot = dr.arange(mi.UInt32, self.COUNT) + number * self.COUNT
-        junction = Junction.at(self.traits, seen, si.bsdf(), self.valid)
+        vertex_bsdf = VertexBSDF.at(self.traits, seen, si.bsdf(), self.valid)
         values = {
             "p": si.p,
-            "n": junction.n,
-            "ns": junction.ns,
+            "n": vertex_bsdf.n,
+            "ns": vertex_bsdf.ns,
             "towards": towards,
             "throughput": 1,
-            "value": junction.value,
-            "density": junction.density,
+            "value": vertex_bsdf.value,
+            "density": vertex_bsdf.density,
             "path": slot,
             "depth": depth,
             "number": number,
@@ -115,7 +115,7 @@ class ResampledPaths(JointPaths):
                     *[mi.Float(0)] * 5,
                 ]
             slot = self.keep(buffer, STEP, number, "camera", state, parent)
-            value, *_ = self.junction(number).between(to_camera, to_light, self.valid)
+            value, *_ = self.vertex_bsdf(number).f_and_pdfs(to_camera, to_light, self.valid)
             left = leave(weights, left, si, value, p_camera, p_light, to_light, ~delta)
             density = dr.select(delta, 0, p_camera * dr.abs(dr.dot(si.n, to_light)))
             parent = dr.select(delta, parent, slot)
@@ -132,10 +132,12 @@ class ResampledPaths(JointPaths):
         seen = mi.SurfaceInteraction3f(last)
         seen.wi = last.to_local(self.light.d)
         flux = self.brought / (
-            self.lights.start_density(last, self.light, self.valid)
-            * self.lights.forward_density(last, self.light, self.valid)
+            self.lights.pdf_emission_origin(last, self.light, self.valid)
+            * self.lights.pdf_emission_area(last, self.light, self.valid)
         )
-        state = weights.lit(seen, source, dr.full(mi.Bool, True, self.COUNT), self.valid, flux)
+        state = weights.init_light(
+            seen, source, dr.full(mi.Bool, True, self.COUNT), self.valid, flux
+        )
         for number in range(self.length - 1, -1, -1):
             _, si, _, to_camera, to_light, delta = self.vertices[number]
             slots[number] = self.keep(
@@ -143,14 +145,14 @@ class ResampledPaths(JointPaths):
             )
             if number:
                 p_camera, p_light = self.densities(number)
-                value, *_ = self.junction(number).between(to_camera, to_light, self.valid)
-                left = weights.left(
+                value, *_ = self.vertex_bsdf(number).f_and_pdfs(to_camera, to_light, self.valid)
+                left = weights.scatter(
                     state, p_light, p_camera, delta, scattered_mean(value, si.n, to_light)
                 )
                 near, far, squared = self.segment(number, number - 1)
                 seen = mi.SurfaceInteraction3f(self.vertices[number - 1][1])
                 seen.wi = seen.to_local(self.vertices[number - 1][4])
-                state = weights.arrived(
+                state = weights.propagate(
                     left,
                     dr.select(delta, 0, p_light * near * far / squared),
                     seen,
@@ -207,7 +209,7 @@ class ResampledPaths(JointPaths):
         )
         for z in range(self.length - 1, -1, -1):
             places = dr.zeros(mi.UInt32, self.COUNT) if z == self.length - 1 else light_slots[z + 1]
-            ends = LightEnds(
+            ends = LightVertices(
                 self.traits,
                 self.lights,
                 starts,
@@ -225,7 +227,7 @@ class ResampledPaths(JointPaths):
                 [],
                 self.valid,
             )
-            value, forward, back = self.junction_at(camera, camera_slots[z]).between(
+            value, forward, back = self.junction_at(camera, camera_slots[z]).f_and_pdfs(
                 vertex["towards"], sent.d, self.valid
             )
             share = session._share(
@@ -264,7 +266,7 @@ class ResampledPaths(JointPaths):
         return {s: np.broadcast_to(w, self.COUNT)[valid] for s, w in result.items()}
 
     def junction_at(self, buffer, slots):
-        return junction_of(
+        return vertex_bsdf_of(
             self.traits, read_vertices(buffer, slots, self.valid, states=STEP), [], self.valid
         )
 
@@ -759,20 +761,25 @@ def test_pilot_sees_all_of_the_film(rgb, monkeypatch):
 def test_best_ratio_is_the_best():
     """Against a search along n; what no light sub-path brings, and what nothing else brings, end at
     the bounds."""
-    from mis_integrators.integrators.light_tracing import LEAST, MOST_CHOSEN, Noise, best_ratio
+    from mis_integrators.integrators.light_tracing import (
+        LEAST_LIGHT_TRACING,
+        MOST_CHOSEN,
+        LightTracingNoise,
+        best_ratio,
+    )
 
-    n = np.geomspace(LEAST, MOST_CHOSEN, 4001)
+    n = np.geomspace(LEAST_LIGHT_TRACING, MOST_CHOSEN, 4001)
     for light, camera, light_cost, camera_cost in np.exp(
         np.random.default_rng(1).normal(0, 1, (50, 4))
     ):
         best = n[np.argmin((camera + light / n) * (camera_cost + n * light_cost))]
-        assert best_ratio(Noise(light, camera), light_cost, camera_cost) == pytest.approx(
-            best, rel=1e-3
-        )
+        assert best_ratio(
+            LightTracingNoise(light, camera), light_cost, camera_cost
+        ) == pytest.approx(best, rel=1e-3)
     assert (
-        best_ratio(Noise(0, 1), 1, 1) == LEAST
-        and best_ratio(Noise(1, 0), 1, 1) == MOST_CHOSEN
-        and best_ratio(Noise(0, 0), 1, 1) == LEAST
+        best_ratio(LightTracingNoise(0, 1), 1, 1) == LEAST_LIGHT_TRACING
+        and best_ratio(LightTracingNoise(1, 0), 1, 1) == MOST_CHOSEN
+        and best_ratio(LightTracingNoise(0, 0), 1, 1) == LEAST_LIGHT_TRACING
     )
 
 

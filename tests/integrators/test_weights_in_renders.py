@@ -71,28 +71,28 @@ class JointPaths:
     def camera(self, weights, last):
         """What a camera path stores at each vertex up to the `last`, and its weight of direct light
         there."""
-        state, stored, shares = weights.begin(dr.width(self.valid)), [], []
+        state, stored, shares = weights.init(dr.width(self.valid)), [], []
         for number, (si, bsdf, bs) in enumerate(self.vertices[: last + 1]):
             vertex = mi.UInt32(number) + dr.zeros(mi.UInt32, dr.width(self.valid))
-            state, share = weights.arrived(state, si, bsdf, vertex, self.valid)
+            state, share = weights.propagate(state, si, bsdf, vertex, self.valid)
             dr.eval(state, share)
             stored.append(weights.stored(state))
             shares.append(share)
-            state = weights.leaving(state, si, bsdf, bs, vertex, self.valid)
+            state = weights.scatter(state, si, bsdf, bs, vertex, self.valid)
             dr.eval(state)
         return stored, shares
 
     def photon(self, weights, merged, first):
         """Notes of the light sub-path that starts to scatter at vertex `first` and whose photon
         lands on vertex `merged`, written and read as a photon's are."""
-        notebook = weights.notebook()
-        state = notebook.begin()
+        light_state = weights.light_state()
+        state = light_state.init()
         for si, bsdf, bs in reversed(self.vertices[merged + 1 : first + 1]):
             view = mi.SurfaceInteraction3f(si)
             view.wi = mi.Vector3f(bs.wo)
-            state = notebook.scattered(state, view, bsdf, si.wi, self.valid)
+            state = light_state.scatter(state, view, bsdf, si.wi, self.valid)
             dr.eval(state)
-        words = notebook.words(state)
+        words = light_state.words(state)
         notes = dr.zeros(mi.UInt32, len(words) * dr.width(self.valid))
         index = dr.arange(mi.UInt32, dr.width(self.valid))
         for offset, word in enumerate(words):
@@ -102,7 +102,7 @@ class JointPaths:
                 len(words) * index + offset,
             )
         dr.eval(notes)
-        return notebook.read(merged, notes, index, mi.Bool(True))
+        return light_state.read(merged, notes, index, mi.Bool(True))
 
 
 @pytest.mark.thinned(3, 3)
@@ -122,7 +122,7 @@ def test_weights_of_a_path_sum_to_one(variant_name, family, emitter, mix, kind, 
         tray(family, emitter), seed=1
     )
     session.start()
-    weights = session.weights(session._spectral(0)["merging"])
+    weights = session.weights(session._spectral(0)["merge_settings"])
     paths = JointPaths(session, strategies + 1)
     stored, shares = paths.camera(weights, strategies - 1)
     valid = np.array(paths.valid)
@@ -137,7 +137,7 @@ def test_weights_of_a_path_sum_to_one(variant_name, family, emitter, mix, kind, 
             si, bsdf, bs = paths.vertices[merged]
             f, p = weights.scattering(si, bsdf, bs.wo, paths.valid)
             dr.eval(f, p)
-            weight = weights.merging(
+            weight = weights.merge_weight(
                 merged, stored[merged], f, p, paths.photon(weights, merged, length - 1)
             )
             dr.eval(weight)
@@ -157,10 +157,10 @@ def test_a_direction_that_the_camera_never_takes_is_left_to_the_photons(rgb):
     says."""
     session = weighted(strategies=3, mix_diffuse=True).session(tray("lambertian", "point"), seed=1)
     session.start()
-    weights = session.weights(session._spectral(0)["merging"])
+    weights = session.weights(session._spectral(0)["merge_settings"])
     paths = JointPaths(session, 3)
     stored, _ = paths.camera(weights, 0)
-    weight = weights.merging(
+    weight = weights.merge_weight(
         0, stored[0], mi.Spectrum(0.3), mi.Float(0), paths.photon(weights, 0, 2)
     )
     assert np.allclose(np.array(weight), 1)
@@ -591,7 +591,7 @@ def test_what_the_cache_knows_of_direct_light():
             [
                 np.median(np.array(known.noise)),
                 (np.array(known.visible_share) > 0).mean(),
-                float(session.surroundings.albedo[0]),
+                float(session.neighbour_radiance.albedo[0]),
             ]
         )
     assert facts[0][0] < 5 and facts[0][1] > 0.5

@@ -44,7 +44,9 @@ def test_flux_is_light_over_densities(rgb, emitter):
         source.uv,
         active,
     )
-    found = light / (lights.start_density(si, ds, active) * lights.forward_density(si, ds, active))
+    found = light / (
+        lights.pdf_emission_origin(si, ds, active) * lights.pdf_emission_area(si, ds, active)
+    )
     used = spread(active)
     assert used.sum() > 500
     a, b = (spread(dr.mean(x))[used] for x in (found, flux))
@@ -80,7 +82,7 @@ def test_starts_light_the_scene(rgb, emitter):
     ds, light = lights.emitted(
         si, starts["emitter"], starts["p"], starts["n"], starts["uv"], mi.Bool(True)
     )
-    density = lights.start_density(si, ds, mi.Bool(True))
+    density = lights.pdf_emission_origin(si, ds, mi.Bool(True))
     a = np.array(dr.select(density > 0, dr.mean(light) / density, 0))
     total, error2 = 0.0, 0.0
     for e in scene.emitters():

@@ -748,7 +748,7 @@ def test_windows_are_known_from_all_directions():
         if not known:
             guided = np.array(guide._guided)
             guide._guided = mi.Float(np.where(guided > 0, guided + np.array(guide._entering), 0))
-            guide.entrances = None
+            guide.portals = None
         ray, flux, *_ = Lights(scene, guide=guide).sample_emission(
             streams(dr.arange(mi.UInt32, count), mi.UInt32(7)), mi.Float(0), []
         )

@@ -223,21 +223,25 @@ def test_steadied_means_do_not_know_their_own_noise():
         return np.mean(radius.relative_weights(mean) * samples.var(axis=0, ddof=1))
 
     assert noise(samples.mean(axis=0)) < 0.8 * noise(truth)
-    assert noise(radius.steadied(samples, cells)) == pytest.approx(noise(truth), rel=0.15)
+    assert noise(radius.shrink_to_neighbours(samples, cells)) == pytest.approx(
+        noise(truth), rel=0.15
+    )
 
 
 def test_steadied_means_keep_what_is_real():
     rng, cells = np.random.default_rng(4), np.arange(PIXELS) // 16
     truth = np.exp(rng.normal(size=PIXELS))
-    np.testing.assert_allclose(radius.steadied(np.array([truth] * 3), cells), truth)
+    np.testing.assert_allclose(radius.shrink_to_neighbours(np.array([truth] * 3), cells), truth)
     noisy = truth * rng.normal(1, 0.1, size=(3, PIXELS))
     weights, plain, right = (
         radius.relative_weights(mean)
-        for mean in (radius.steadied(noisy, cells), noisy.mean(axis=0), truth)
+        for mean in (radius.shrink_to_neighbours(noisy, cells), noisy.mean(axis=0), truth)
     )
     assert np.std(weights / right) < 1.1 * np.std(plain / right) < 0.2
-    assert radius.steadied(noisy, cells).sum() == pytest.approx(noisy.mean(axis=0).sum())
-    np.testing.assert_array_equal(radius.steadied(noisy[:1], cells), noisy[0])
+    assert radius.shrink_to_neighbours(noisy, cells).sum() == pytest.approx(
+        noisy.mean(axis=0).sum()
+    )
+    np.testing.assert_array_equal(radius.shrink_to_neighbours(noisy[:1], cells), noisy[0])
 
 
 def test_ladder_needs_vertices():

@@ -95,8 +95,8 @@ class RandomPaths:
             else:
                 a = theory.nearer(near, far, self.to_light[i], beta, self.eta)
                 states[i + 1] = (
-                    theory.near_of(self.to_camera[i], self.geometry[i]),
-                    theory.far_of(a, self.to_camera[i]),
+                    theory.d_vcm_of(self.to_camera[i], self.geometry[i]),
+                    theory.d_vc_of(a, self.to_camera[i]),
                 )
         return states
 
@@ -111,8 +111,8 @@ class RandomPaths:
             else:
                 a = theory.nearer(near, far, self.to_camera[i], beta, self.eta)
                 states[i - 1] = (
-                    theory.near_of(self.to_light[i], self.geometry[i - 1]),
-                    theory.far_of(a, self.to_light[i]),
+                    theory.d_vcm_of(self.to_light[i], self.geometry[i - 1]),
+                    theory.d_vc_of(a, self.to_light[i]),
                 )
         return states
 
@@ -128,12 +128,14 @@ class RandomPaths:
 
         for kind, number in self.densities():
             if kind == "merge":
-                result[kind, number] = theory.merging(
+                result[kind, number] = theory.merge_weight(
                     of_light(number, 0), of_camera(number, 0), self.eta, beta
                 )
             elif number == 0:
                 share = 0 * self.direct if self.delta[1] else self.direct / self.to_light[1]
-                result[kind, 0] = theory.met(share, self.direct * self.emission, camera[0][1], beta)
+                result[kind, 0] = theory.hit_emitter(
+                    share, self.direct * self.emission, camera[0][1], beta
+                )
             elif number == k:
                 result[kind, k] = theory.connection(
                     self.lens / self.ratio, of_light(k - 1, self.eta), 0, 0, beta
@@ -201,16 +203,16 @@ def test_extremes_in_single_precision(beta):
     with np.errstate(over="ignore"):
         for a, b, c, d in itertools.product(values, repeat=4):
             near, far = (
-                theory.near_of(a, b),
-                theory.far_of(
-                    theory.nearer(theory.near_of(b, c), theory.near_of(c, d), d, beta), a
+                theory.d_vcm_of(a, b),
+                theory.d_vc_of(
+                    theory.nearer(theory.d_vcm_of(b, c), theory.d_vcm_of(c, d), d, beta), a
                 ),
             )
             inner = theory.nearer(near, far, d, beta)
             for weight in (
                 theory.connection(a, inner, b, inner, beta),
-                theory.met(min(a, 1e30), b * np.float32(1e-10), far, beta),
-                theory.merging(inner, inner, np.float32(1e-6), beta),
+                theory.hit_emitter(min(a, 1e30), b * np.float32(1e-10), far, beta),
+                theory.merge_weight(inner, inner, np.float32(1e-6), beta),
             ):
                 assert 0 <= weight <= 1, (a, b, c, d, weight)
 
