@@ -31,8 +31,10 @@ chosen: Path | None = None
 found none."""
 
 _INSTALL = (
-    f"install LLVM {OLDEST_WORKING} to {NEWEST_TESTED}: `apt-get install libllvm19` (Debian, Ubuntu), `dnf install llvm-libs` (Fedora), "
-    "`pacman -S llvm-libs` (Arch), `conda install -c conda-forge libllvm19`, or `brew install llvm@19` (macOS)"
+    f"install LLVM {OLDEST_WORKING} to {NEWEST_TESTED}: `apt-get install libllvm19` (Debian, "
+    "Ubuntu), `dnf install llvm-libs` (Fedora), "
+    "`pacman -S llvm-libs` (Arch), `conda install -c conda-forge libllvm19`, or `brew install "
+    "llvm@19` (macOS)"
 )
 
 
@@ -128,7 +130,8 @@ def problem_with_variable(environment: Mapping[str, str]) -> str | None:
     version = version_of(library)
     if version and version[0] < OLDEST_WORKING:
         return (
-            f"{VARIABLE} names {library}, LLVM {version[0]}, which aborts the process in code generation; "
+            f"{VARIABLE} names {library}, LLVM {version[0]}, which aborts the process in code "
+            "generation; "
             f"unset it or name LLVM {OLDEST_WORKING} or newer"
         )
     return None

@@ -189,5 +189,9 @@ def difference(then: Mapping[str, Any], now: Mapping[str, Any]) -> str | None:
         before, after = then[group], now[group]
         for name in sorted(before.keys() | after.keys()):
             if before.get(name) != after.get(name):
-                return f"it was made with {sign}{shown(name)} = {shown(before.get(name, '(default)'))}, not {after.get(name, '(default)')}"
+                return (
+                    f"it was made with {sign}{shown(name)} = "
+                    f"{shown(before.get(name, '(default)'))}, not "
+                    f"{after.get(name, '(default)')}"
+                )
     return None

@@ -94,7 +94,8 @@ def _render_alone(options: argparse.Namespace, interrupt: Interrupt) -> int:
             opened = _request(options).open(needs_views)
             for description in unfinite_data(opened.loaded.scene):
                 _warn(
-                    f"{description} (NaN or infinite): what they light or colour is left out of the image"
+                    f"{description} (NaN or infinite): what they light or colour is left out of "
+                    "the image"
                 )
             session: Any = opened.session
             if learned:
@@ -122,21 +123,24 @@ def _render_alone(options: argparse.Namespace, interrupt: Interrupt) -> int:
         if pixels := session.unfinite_pixels():
             metadata["unfinitePixels"] = pixels
             _warn(
-                f"{pixels} pixels had values that are not finite (NaN or infinite) in some iterations; those values are left out"
+                f"{pixels} pixels had values that are not finite (NaN or infinite) in some "
+                "iterations; those values are left out"
             )
         if target:
             target.update(session)
             metadata["relativeError"] = target.error
             if target.black:
                 _warn(
-                    "the image is black, so that its relative error says nothing: is there light, and does the camera look at it?"
+                    "the image is black, so that its relative error says nothing: is there "
+                    "light, and does the camera look at it?"
                 )
         # Before the workers are left, which may take long.
         written = _write(options, session, metadata, options.output, kept)
         for suffix in (".preview.exr", ".preview.png"):
             options.output.with_suffix(suffix).unlink(missing_ok=True)
     report = (
-        f"{metadata['spp']} samples per pixel in {clock.rendering:.1f} s (and {clock.compiling:.1f} s of "
+        f"{metadata['spp']} samples per pixel in {clock.rendering:.1f} s (and "
+        f"{clock.compiling:.1f} s of "
         f"compiling){_about_error(target)}: {written}"
     )
     if broken:
@@ -211,7 +215,10 @@ def _about_error(target: TargetError | None) -> str:
         return ""
     if math.isinf(target.error):
         return ", relative error unknown after one iteration"
-    return f", relative error {target.error:.3g}{'' if target.error <= target.target else f' (target {target.target:g} not reached)'}"
+    return (
+        ", relative error "
+        f"{target.error:.3g}{'' if target.error <= target.target else f' (target {target.target:g} not reached)'}"
+    )
 
 
 def _metadata(

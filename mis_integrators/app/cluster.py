@@ -229,7 +229,8 @@ def _check_address(scheduler: str) -> None:
         "ssl_context"
     ):
         raise ValueError(
-            "Dask's configuration names no certificates; set distributed.comm.tls.ca-file, distributed.comm.tls.client.cert and "
+            "Dask's configuration names no certificates; set distributed.comm.tls.ca-file, "
+            "distributed.comm.tls.client.cert and "
             "distributed.comm.tls.client.key"
         )
 
@@ -605,7 +606,8 @@ class DistributedSession:
             (arrays, done, seconds), fetched = copy.fetching.result()
         except distributed.KilledWorker as error:
             raise ClusterError(
-                f"{FAILURES_ALLOWED} workers died with the same iterations in hand; is there too little memory?"
+                f"{FAILURES_ALLOWED} workers died with the same iterations in hand; is there too "
+                "little memory?"
             ) from error
         except (
             distributed.CancelledError,
@@ -617,7 +619,8 @@ class DistributedSession:
             self._drop(batch, copy)
             self._count_overdue(
                 batch,
-                f"the sums of {batch} could not be fetched within {FETCHING_SECONDS:.0f} s, {HAND_OUTS} times",
+                f"the sums of {batch} could not be fetched within {FETCHING_SECONDS:.0f} s, "
+                f"{HAND_OUTS} times",
             )
             return False
         except ClusterError:

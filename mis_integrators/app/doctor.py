@@ -153,7 +153,10 @@ def machine() -> list[Finding]:
     writable = os.access(cache if cache.exists() else Path.home(), os.W_OK)
     advice = None
     if not writable or room < LEAST_CACHE:
-        advice = f"make {cache} writable, with {LEAST_CACHE} GiB of room; else all kernels are compiled anew"
+        advice = (
+            f"make {cache} writable, with {LEAST_CACHE} GiB of room; else all kernels are "
+            "compiled anew"
+        )
     findings.append(
         Finding(
             "cache",

@@ -55,7 +55,8 @@ def of_package() -> str:
 def changes(then: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
     """What differs between two results of ``scene_digests``, a phrase each."""
     return [
-        f"{name} {'is new' if name not in then else 'is gone' if name not in now else 'has changed'}"
+        f"{name} "
+        f"{'is new' if name not in then else 'is gone' if name not in now else 'has changed'}"
         for name in sorted({*then, *now})
         if then.get(name) != now.get(name)
     ]

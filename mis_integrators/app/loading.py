@@ -129,7 +129,8 @@ def _keep_out_foreign_libraries(names: list[str]) -> None:
     for name in sorted({*names, *PLUGINS} - set(own)):
         if library := _foreign_library(f"{name}{suffix}"):
             raise RuntimeError(
-                f'{library} is not loaded for the plugin "{name}": only plugins in Mitsuba\'s own folder are; remove this file'
+                f'{library} is not loaded for the plugin "{name}": only plugins in Mitsuba\'s '
+                "own folder are; remove this file"
             )
     _load_own([name for name, library in own.items() if _foreign_library(library.name)])
 

@@ -84,14 +84,17 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
         "--target-error",
         type=_positive_number,
         metavar="E",
-        help="stop when the estimated relative error of the image is E or less, such as 0.05: the root mean square over the pixels of standard "
-        "deviation over brightness, without the worst 0.1 %% of the pixels; --spp or --time are then upper bounds, and there is none without them",
+        help="stop when the estimated relative error of the image is E or less, such as 0.05: "
+        "the root mean square over the pixels of standard "
+        "deviation over brightness, without the worst 0.1 %% of the pixels; --spp or --time are "
+        "then upper bounds, and there is none without them",
     )
     add(
         "--like",
         type=Path,
         metavar="FILE.exr",
-        help="render again what this image of mis-render shows: with its integrator, parameters, seed and samples, and what was found out for it, such "
+        help="render again what this image of mis-render shows: with its integrator, parameters, "
+        "seed and samples, and what was found out for it, such "
         "as merge radii; the scene must be the same",
     )
     add("--seed", type=_seed, metavar="S", help="seed of the random numbers (default: 0)")
@@ -101,7 +104,8 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     add(
         "--all-views",
         action="store_true",
-        help="render all views of the scene together (all sensors, and the children of a batch) into a contact sheet",
+        help="render all views of the scene together (all sensors, and the children of a batch) "
+        "into a contact sheet",
     )
     add(
         "--frames",
@@ -123,26 +127,30 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     add(
         "--resume",
         action="store_true",
-        help="go on from FILE.checkpoint if there is one, with the same scene and settings; --spp, --time and --target-error may differ, and "
+        help="go on from FILE.checkpoint if there is one, with the same scene and settings; "
+        "--spp, --time and --target-error may differ, and "
         "--time counts what was rendered before. Implies --checkpoint 60",
     )
     add(
         "--preview",
         type=_positive_number,
         metavar="SECONDS",
-        help="write the image so far to FILE.preview.exr and .png every so many seconds, until the image is there",
+        help="write the image so far to FILE.preview.exr and .png every so many seconds, until "
+        "the image is there",
     )
     where = parser.add_mutually_exclusive_group()
     where.add_argument(
         "--workers",
         type=_workers,
         metavar="N",
-        help="spread the iterations over so many processes of this machine; --time then includes their compiling",
+        help="spread the iterations over so many processes of this machine; --time then includes "
+        "their compiling",
     )
     where.add_argument(
         "--scheduler",
         metavar="ADDRESS",
-        help="spread the iterations over the workers of a Dask cluster, such as tcp://host:8786, which must find the scene under "
+        help="spread the iterations over the workers of a Dask cluster, such as tcp://host:8786, "
+        "which must find the scene under "
         "the same path",
     )
     add("--quiet", action="store_true", help="print errors only")
@@ -183,7 +191,10 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
 
 def versions() -> str:
     """The versions that an image depends on; of this package a hash of its sources, too."""
-    return f"mis_integrators {__version__} ({fingerprint.of_package()}), mitsuba {mi.__version__}, drjit {dr.__version__}"
+    return (
+        f"mis_integrators {__version__} ({fingerprint.of_package()}), mitsuba "
+        f"{mi.__version__}, drjit {dr.__version__}"
+    )
 
 
 def _assignment(text: str) -> tuple[str, str]:

@@ -119,7 +119,8 @@ def _attribute_of(image: Path, what: str) -> str:
         header = OpenEXR.File(str(image), header_only=True).header() if is_exr else {}
     except Exception as error:  # OpenEXR raises errors of many kinds for files that are damaged
         raise Malformed(
-            f"{what}: cannot be read: {shown(getattr(error, 'strerror', None) or ' '.join(str(error).split()))}"
+            f"{what}: cannot be read: "
+            f"{shown(getattr(error, 'strerror', None) or ' '.join(str(error).split()))}"
         ) from None
     if ATTRIBUTE not in header:
         raise Malformed(f"{what}: not an image of mis-render, or of an earlier version")

@@ -47,14 +47,16 @@ class Request:
             if not self.variant.startswith("cuda_") or dr.has_backend(dr.JitBackend.CUDA):
                 raise
             raise RuntimeError(
-                f"{self.variant} needs an NVIDIA GPU and its driver, and Dr.Jit finds none; use --variant llvm_ad_rgb"
+                f"{self.variant} needs an NVIDIA GPU and its driver, and Dr.Jit finds none; use "
+                "--variant llvm_ad_rgb"
             ) from None
         loaded = loading.load(Path(self.scene), self.variables, self.plugin, self.parameters)
         sensor = _sensor(loaded.scene, self.sensor)
         spp = sensor.sampler().sample_count() if self.spp is None else self.spp
         if needs_views and not hasattr(loaded.integrator, "views_session"):
             raise ValueError(
-                f'{needs_views}: "{loaded.plugin}" renders one view at a time; use -i volpath_multiview'
+                f'{needs_views}: "{loaded.plugin}" renders one view at a time; use -i '
+                "volpath_multiview"
             )
         if self.all_views:
             session = loaded.integrator.views_session(loaded.scene, seed=self.seed, spp=spp)

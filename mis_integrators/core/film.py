@@ -114,8 +114,8 @@ def add_squares(sums, colour, weight):
     iteration."""
     colour, weight = mi.TensorXd(colour), mi.TensorXd(weight)
     sums.add("square", colour * colour)
-    sums.add("cross", colour * weight)
     sums.add("weight_square", weight * weight)
+    sums.add("cross", colour * weight)  # last: Dr.Jit widens an operand of one element in place
 
 
 def spread(sums, mean):
@@ -123,13 +123,18 @@ def spread(sums, mean):
     return sums["square"] - 2 * mean * sums["cross"] + mean * mean * sums["weight_square"]
 
 
-def finite_pixels(block):
-    """Which pixels of a block tensor have values that are all finite: a mask of shape (height,
-    width, 1)."""
+def unfinite_pixels(block):
+    """One for each pixel of a block tensor that has a value which is not finite, else zero: shape
+    (height, width, 1)."""
     finite = dr.isfinite(block[:, :, :1])
     for channel in range(1, block.shape[2]):
         finite &= dr.isfinite(block[:, :, channel : channel + 1])
-    return finite
+    return mi.TensorXf(dr.select(finite.array, mi.Float(0), mi.Float(1)), finite.shape)
+
+
+def zero_where(left_out, block):
+    """A block tensor without the pixels that are `left_out` (as of `unfinite_pixels`)."""
+    return dr.select(left_out > 0, 0, block)
 
 
 class Accumulator:
@@ -171,13 +176,13 @@ class Accumulator:
 
     def add(self, block, iteration, techniques=None):
         """Adds the block tensor of an iteration, and that of its techniques' images."""
-        finite = finite_pixels(block)
+        left_out = unfinite_pixels(block)
         if techniques is not None:
-            finite &= finite_pixels(techniques)
-            self.sums.add("techniques", dr.select(finite, techniques, 0))
-        block = dr.select(finite, block, 0)
+            left_out = dr.maximum(left_out, unfinite_pixels(techniques))
+            self.sums.add("techniques", zero_where(left_out, techniques))
+        block = zero_where(left_out, block)
         self.sums.add("total", block)
-        self.sums.add("left_out", dr.select(finite, mi.Float(0), mi.Float(1)))
+        self.sums.add("left_out", left_out)
         if self.with_variance:
             add_squares(self.sums, block[:, :, :3], block[:, :, -1:])
         self.sums.done.add(iteration)
@@ -189,7 +194,7 @@ class Accumulator:
         total = self.sums["total"]
         weight = total[:, :, -1:]
         weight = dr.select(weight == 0, 1, weight)
-        return total[:, :, :3] / weight, weight
+        return total[:, :, :3] / mi.TensorXd(weight), weight  # a copy, as in `add_squares`
 
     def variance_of_mean(self):
         """Estimated variance of each pixel's mean (height, width, 3) from the iterations, by the

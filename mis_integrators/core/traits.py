@@ -125,7 +125,8 @@ def unfinite_data(scene):
                 r"^object_\d+", outermost.class_name(), name
             )  # an address, where there is no id
             found.append(
-                f"{shown(place)} of {owner.class_name()} has {count} of {values.size} values that are not finite"
+                f"{shown(place)} of {owner.class_name()} has {count} of {values.size} values "
+                "that are not finite"
             )
     return found
 
@@ -187,7 +188,8 @@ def check_film(sensor, plugin):
     if not (width and height):
         full_width, full_height = film.size()
         raise UnsupportedScene(
-            f"{plugin}: nothing can be rendered on a film of {width} x {height} pixels (the crop window of "
+            f"{plugin}: nothing can be rendered on a film of {width} x {height} pixels (the crop "
+            "window of "
             f"{full_width} x {full_height}); width and height must be at least 1"
         )
 
@@ -197,12 +199,14 @@ def check_scene(scene, sensor, plugin):
     sampling."""
     if mi.is_polarized:
         raise UnsupportedScene(
-            f"{plugin}: polarised variants are not supported (active: {mi.variant()}); use an unpolarised "
+            f"{plugin}: polarised variants are not supported (active: {mi.variant()}); use an "
+            "unpolarised "
             'one such as "llvm_ad_rgb"'
         )
     if has_media(scene):
         raise UnsupportedScene(
-            f'{plugin}: participating media are not supported by this surface integrator; use "volpath"'
+            f"{plugin}: participating media are not supported by this surface integrator; use "
+            '"volpath"'
         )
     check_emitters(scene, plugin)
     if mi.has_flag(sensor.film().flags(), mi.FilmFlags.Special):
@@ -214,7 +218,8 @@ def check_emitters(scene, plugin):
     for shape in scene.shapes():
         if shape.is_emitter() and shape.class_name() in _UNSAMPLED_SHAPES:
             raise UnsupportedScene(
-                f"{plugin}: Mitsuba cannot sample points on a {shape.class_name()} shape, so it cannot be an "
+                f"{plugin}: Mitsuba cannot sample points on a {shape.class_name()} shape, so it "
+                "cannot be an "
                 "emitter here; use a mesh, sphere, rectangle, disk or cylinder"
             )
 

@@ -73,7 +73,8 @@ class Fields:
     def refuse(self, name: str, allowed: str) -> Malformed:
         """The error that the value of a field is not ``allowed``."""
         return Malformed(
-            f'{self._what}: "{name}" = {shown(self._given.get(name))} is not allowed: expected {allowed}'
+            f'{self._what}: "{name}" = {shown(self._given.get(name))} is not allowed: expected '
+            f"{allowed}"
         )
 
     def any(self, name: str) -> Any:
@@ -94,7 +95,8 @@ class Fields:
         if not is_number(value) or not 0 <= value <= most or (positive and not value):
             raise self.refuse(
                 name,
-                f"a number, {'more than' if positive else 'at least'} 0{'' if math.isinf(most) else f', at most {most:g}'}",
+                f"a number, {'more than' if positive else 'at least'} "
+                f"0{'' if math.isinf(most) else f', at most {most:g}'}",
             )
         return float(value)
 

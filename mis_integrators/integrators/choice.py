@@ -172,7 +172,8 @@ def choose(integrator, scene, sensor, seed, iterations, seconds):
             likely and takes < WORTH_SHARE * (whole - gone)
         ):
             reasons.append(
-                f"not {name}: trying it would take more than {WORTH_SHARE if likely else TRIAL_TIME_SHARE:.0%} of the time"
+                f"not {name}: trying it would take more than "
+                f"{WORTH_SHARE if likely else TRIAL_TIME_SHARE:.0%} of the time"
             )
             continue
         weighting &= not likely
@@ -238,7 +239,10 @@ def _why_not_path(session, forecast):
                 f"not path: it cannot see the caustics, {forecast.caustic_share:.1%} of the light"
             )
     elif forecast.caustic_share > RARE:
-        return f"not path: it would meet the caustics, {forecast.caustic_share:.1%} of the light, by chance only"
+        return (
+            f"not path: it would meet the caustics, {forecast.caustic_share:.1%} of the "
+            "light, by chance only"
+        )
     return None
 
 

@@ -103,8 +103,10 @@ class IterativeIntegrator(mi.AdjointIntegrator):
         pixels = sum(film_sample_count(sensor) for sensor in sensors)
         if self.initial_camera_paths * pixels > MOST_PATHS:
             raise ValueError(
-                f'{self.plugin}: parameter "camera_paths" = {self.camera_paths} makes more than {MOST_PATHS} paths an iteration on '
-                f"{pixels} pixels; ask for more samples per pixel (spp), and so more iterations, instead, or crop the film"
+                f'{self.plugin}: parameter "camera_paths" = {self.camera_paths} makes more than '
+                f"{MOST_PATHS} paths an iteration on "
+                f"{pixels} pixels; ask for more samples per pixel (spp), and so more iterations, "
+                "instead, or crop the film"
             )
 
     def planned_iterations(self, spp, camera_paths):
@@ -147,7 +149,8 @@ class IterativeIntegrator(mi.AdjointIntegrator):
             sensors = scene.sensors()
             if not 0 <= sensor < len(sensors):
                 raise UnsupportedScene(
-                    f"{self.plugin}: the scene has {len(sensors)} sensors; sensor {sensor} does not exist"
+                    f"{self.plugin}: the scene has {len(sensors)} sensors; sensor {sensor} does "
+                    "not exist"
                 )
             return sensors[sensor]
         return sensor
@@ -269,7 +272,8 @@ class IterativeSession:
         """Runs one iteration to its end: that of the given number, or the first that is missing."""
         if mi.variant() != self.variant:
             raise RuntimeError(
-                f"{self.integrator.plugin}: this render was begun under the variant {self.variant}, but the active one is now "
+                f"{self.integrator.plugin}: this render was begun under the variant "
+                f"{self.variant}, but the active one is now "
                 f"{mi.variant()}"
             )
         with dr.suspend_grad(), self.sums.all_or_nothing():

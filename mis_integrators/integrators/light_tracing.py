@@ -37,8 +37,9 @@ class LightTracingNoise:
 
 def best_ratio(noise, light_cost, camera_cost):
     """Light sub-paths for each camera path: n that makes (camera + light / n) (camera_cost + n
-    light_cost) least, n^2 = light camera_cost / (camera light_cost), from `LEAST_LIGHT_TRACING` to `MOST_CHOSEN`.
-    `light_cost`, `camera_cost`: of a light sub-path and of a camera path, in the same unit."""
+    light_cost) least, n^2 = light camera_cost / (camera light_cost), from `LEAST_LIGHT_TRACING` to
+    `MOST_CHOSEN`. `light_cost`, `camera_cost`: of a light sub-path and of a camera path, in the
+    same unit."""
     square = noise.light * camera_cost / max(noise.camera * light_cost, 1e-30)
     return float(np.clip(np.sqrt(square), LEAST_LIGHT_TRACING, MOST_CHOSEN))
 

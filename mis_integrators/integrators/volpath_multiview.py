@@ -490,7 +490,8 @@ def render_views(scene, integrator=None, spp=0, seed=0):
         )
     if not hasattr(integrator, "views_session"):
         raise UnsupportedScene(
-            f"render_views: the integrator must be a volpath_multiview, not {integrator.class_name()}"
+            "render_views: the integrator must be a volpath_multiview, not "
+            f"{integrator.class_name()}"
         )
     with dr.suspend_grad():
         spp = spp or max((sensor.sampler().sample_count() for sensor in scene.sensors()), default=1)

@@ -49,8 +49,8 @@ class WeightedSession(BDPMSession):
         else after it."""
 
     def weights(self, merge_settings):
-        """The weights (hooks as in `trace_camera_paths` and `trace_light_paths`); `merge_settings` is what
-        the method of that name returns."""
+        """The weights (hooks as in `trace_camera_paths` and `trace_light_paths`); `merge_settings`
+        is what the method of that name returns."""
         raise TypeError(f"{type(self).__name__} does not define weights")
 
     def merge_settings(self, radii):

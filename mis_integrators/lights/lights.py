@@ -189,7 +189,8 @@ class Lights:
             kind = "environment" if emitter.is_environment() else "ray"
         if kind in ("ray", "directionalarea") and mi.is_spectral:
             raise UnsupportedScene(
-                f"{plugin}: emitter {name} is not supported in spectral variants (its light rays choose "
+                f"{plugin}: emitter {name} is not supported in spectral variants (its light rays "
+                "choose "
                 "their own wavelengths); use an rgb or mono variant"
             )
         return kind

@@ -18,11 +18,11 @@ N_F there is eta_VM). Between neighbours all but one vertex cancels, the geometr
     merging at z_i : merging a caustic photon at z_{i+1}       =  (R / R_caustic)^2 q_i / p_i
 
 rho_e [1/m^2] is the density, as an area density at z_{i+1}, with which light sub-paths start there
-over that with which next-event estimation finds the point of the light (`Lights.emission_over_nee_pdf`
-times the cosine). Next-event estimation and BSDF sampling count as one technique, with the density
-of the former; the camera pass divides the light between them. All camera paths of a pixel make all
-strategies, each path once, so their number cancels. That strategies share their sub-paths Veach's
-theory does not see: the optimal weights do.
+over that with which next-event estimation finds the point of the light
+(`Lights.emission_over_nee_pdf` times the cosine). Next-event estimation and BSDF sampling count as
+one technique, with the density of the former; the camera pass divides the light between them. All
+camera paths of a pixel make all strategies, each path once, so their number cancels. That
+strategies share their sub-paths Veach's theory does not see: the optimal weights do.
 
 The weights are functions of the joint path alone, with its own vertices up to the merge radius. Not
 in them: Russian roulette, the choices at delta surfaces (alike from both sides), and the defensive

@@ -115,9 +115,9 @@ class OptimalWeights:
     """Weights of `strategies` merging strategies, the first at camera vertex `first`.
 
     `full`: keep the recursion's integrals, else drop them (local weights). `cache`: an
-    `IrradianceCache`; `neighbour_radiance`: a `NeighbourRadiance` of its cells (full weights only). `n`:
-    photons per unit of irradiance in the merge disk (a spectrum of width one). `caustic_cost`: what
-    merging a caustic photon costs in units of merging another one (width one). `mix_diffuse`:
+    `IrradianceCache`; `neighbour_radiance`: a `NeighbourRadiance` of its cells (full weights only).
+    `n`: photons per unit of irradiance in the merge disk (a spectrum of width one). `caustic_cost`:
+    what merging a caustic photon costs in units of merging another one (width one). `mix_diffuse`:
     whether strategies go on beyond Lambertian vertices; else the first of these is a path's last
     strategy.
     """

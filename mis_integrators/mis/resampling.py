@@ -158,8 +158,8 @@ class ResampledWeights:
 
 def guessed_weight(z, joined):
     """Weight that joining the cache point `z` (a record of a camera vertex) to a light vertex that
-    sends `joined` would have among itself, the techniques nearer to the light, if the surface at `z`
-    is diffuse, and the one next to the camera; all as if nothing was resampled.
+    sends `joined` would have among itself, the techniques nearer to the light, if the surface at
+    `z` is diffuse, and the one next to the camera; all as if nothing was resampled.
 
     What is drawn should be proportional to weight times contribution. By q* alone long light
     sub-paths matter as much as direct light, though each of them is one of many ways to make its
@@ -217,8 +217,8 @@ def tabulate(grid, Q_s, Q_blind, pmf_mismatches, ends_s):
     """`(records, shares)` of the rows, as `ResampledWeights` takes them.
 
     NumPy arrays: `Q_s` (C x LENGTHS), integrals at the C cache points, visibility included;
-    `Q_blind` (C), of all lengths, visibility not; `pmf_mismatches` (C); `ends_s` (LENGTHS): light vertices
-    that a light sub-path has of each length on average.
+    `Q_blind` (C), of all lengths, visibility not; `pmf_mismatches` (C); `ends_s` (LENGTHS): light
+    vertices that a light sub-path has of each length on average.
     """
     neighbours = np.array(grid.table).reshape(-1, grid.neighbors)
 

@@ -28,8 +28,8 @@ leaves it; densities per projected solid angle at the parent, of the camera's si
 of the light's for the one before; the parent's BSDF, channel mean [1/sr]; its row (see
 `soften`)."""
 HIT = ("light_mean", "start", "across")
-"""What a hit knows besides: `Lights.pdf_emission_origin` and `pdf_emission_area` of the emitter's point,
-and its light, channel mean, over the former."""
+"""What a hit knows besides: `Lights.pdf_emission_origin` and `pdf_emission_area` of the emitter's
+point, and its light, channel mean, over the former."""
 
 
 def hit_layout():

@@ -29,8 +29,8 @@ STATES = ("d_vcm", "d_vc")
 
 def vertex_layout(states=STATES):
     """Fields of a kept vertex: position `p`, number of the sub-path `path`, `throughput` (light:
-    flux; camera: importance) that arrives, `value` and `density` as of `VertexBSDF`, the state of the
-    weights, geometric normal `n`, direction `towards` the vertex before, `depth` in segments,
+    flux; camera: importance) that arrives, `value` and `density` as of `VertexBSDF`, the state of
+    the weights, geometric normal `n`, direction `towards` the vertex before, `depth` in segments,
     shading normal `ns`, `number` among the sub-path's kept vertices."""
     return Layout(
         {

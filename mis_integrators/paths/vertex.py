@@ -20,8 +20,8 @@ ROUGH = -1.0
 
 
 def scattered_mean(value, n, to_light):
-    """Mean over the channels of the BSDF [1/sr], where `value` is that of `VertexBSDF.f_and_pdfs`: what
-    geometric cosines turn into the light that goes on."""
+    """Mean over the channels of the BSDF [1/sr], where `value` is that of `VertexBSDF.f_and_pdfs`:
+    what geometric cosines turn into the light that goes on."""
     return channel_mean(value) * dr.rcp(dr.maximum(dr.abs(dr.dot(n, to_light)), SMALLEST_COSINE))
 
 

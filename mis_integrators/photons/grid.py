@@ -68,8 +68,8 @@ class Grid:
 
 class PhotonMap:
     """Sorted photons: a `grid`, `start` (first photon of each table entry), `surface` and `power`
-    as in `trace_light_paths`. Its `mis_words` stay where light sub-paths left them, for few of them are
-    ever read: `place` tells of each sorted photon where."""
+    as in `trace_light_paths`. Its `mis_words` stay where light sub-paths left them, for few of them
+    are ever read: `place` tells of each sorted photon where."""
 
     def __init__(self, grid, start, surface, power, mis_words=None, place=None):
         self.grid, self.start, self.surface, self.power, self.mis_words, self.place = (
@@ -103,8 +103,8 @@ class PhotonMap:
 def build_photon_map(surface, power, count, bbox, cell, capacity: int, kind: str, mis_words=None):
     """Sorts photons into a grid of cells of edge `cell` (width one) over `bbox`.
 
-    `kind`: "all", "caustic" or "indirect" selects the photons; `mis_words` (None: there are none) stay
-    unsorted. Three passes over the photons: count, prefix sum, scatter.
+    `kind`: "all", "caustic" or "indirect" selects the photons; `mis_words` (None: there are none)
+    stay unsorted. Three passes over the photons: count, prefix sum, scatter.
     """
     size = table_size(capacity)
     grid = Grid(bbox, cell, size)

@@ -85,8 +85,8 @@ class IrradianceCache:
 
     def __init__(self, scene, lights, surface, power, count, light_path_count, bounds, wavelengths):
         """`surface`, `power`, `count`: photons as `trace_light_paths` stores them, direct light's
-        included; `light_path_count`: how many sub-paths made them, all of the same `wavelengths` (empty
-        in rgb and mono variants)."""
+        included; `light_path_count`: how many sub-paths made them, all of the same `wavelengths`
+        (empty in rgb and mono variants)."""
         self.origin, self.wavelengths = mi.Point3f(bounds.min), wavelengths
         self.words = 12 if colours() == 1 else 16
         capacity = dr.width(surface) // 4

@@ -292,8 +292,8 @@ def expect(radii, plain, corrected, mean, at_first_vertex=True, alike=False):
 
 
 def best_radius(expected, iterations, used=None, reluctance=0.0, more_noise=None):
-    """The `RadiusChoice` that minimises the predicted relative error; `used`, a radius and whether it
-    corrects, if the least error is not below its by more than this share, `reluctance`.
+    """The `RadiusChoice` that minimises the predicted relative error; `used`, a radius and whether
+    it corrects, if the least error is not below its by more than this share, `reluctance`.
 
     `expected`: an `Expected`; `iterations(R, corrected)`: how many iterations there will be, so
     that larger gathers and the correction are charged for; `more_noise`: by whether it corrects,

@@ -225,9 +225,9 @@ class Pilot:
     (copies, pixels) an iteration; `photons[kind]`: mean number of photons within the largest
     radius.
 
-    `pilot_camera_paths`: camera paths of a pixel, which share the photons of their iteration. Where an
-    iteration may have several camera paths a pixel there are two, whose difference tells the noise
-    of camera paths from that of photons.
+    `pilot_camera_paths`: camera paths of a pixel, which share the photons of their iteration. Where
+    an iteration may have several camera paths a pixel there are two, whose difference tells the
+    noise of camera paths from that of photons.
     """
 
     def __init__(self, session):
@@ -442,7 +442,8 @@ class Pilot:
         return choices
 
     def _best_radii(self, camera_paths, count, reluctance=None):
-        """The `RadiusChoice` for each kind of photons, in iterations of so many camera paths a pixel."""
+        """The `RadiusChoice` for each kind of photons, in iterations of so many camera paths a
+        pixel."""
         session, choices = self.session, {}
         for kind, expected in self.noise.expected.items():
             more_noise = {

@@ -26,10 +26,10 @@ class LightConnection:
     per solid angle if the sub-path's density were one there, that is, times what the point's BSDF
     makes of it (cosine included) it is the contribution over the sub-path's density; unoccluded;
     `mean`: its channel mean without colours along the sub-path mixed (a product of channel means);
-    `pdf_area` [1/m^2]: density per area across `d` with which the sub-path would go on to the point;
-    `mis_sum`: techniques nearer to the light than this one, over the density per solid angle at the
-    point with which the camera's side would make the end; `vertices`: how many the light sub-path
-    has.
+    `pdf_area` [1/m^2]: density per area across `d` with which the sub-path would go on to the
+    point; `mis_sum`: techniques nearer to the light than this one, over the density per solid angle
+    at the point with which the camera's side would make the end; `vertices`: how many the light
+    sub-path has.
     """
 
     d: mi.Vector3f

@@ -15,7 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.film import add_squares, colour_channels, finite_pixels, spread
+from ..core.film import add_squares, colour_channels, spread, unfinite_pixels, zero_where
 from ..core.sums import Sums
 
 SHARED = 4
@@ -103,14 +103,11 @@ class ViewAccumulator:
     def add(self, shared, own, iteration):
         """Adds the layers of an iteration, tensors (height, width, `SHARED`) and (height, width,
         `OWN`)."""
-        finite = finite_pixels(shared) & finite_pixels(own)
-        shared = dr.select(finite, shared, 0)
-        self.sums.add("own", dr.select(finite, own, 0))
+        left_out = dr.maximum(unfinite_pixels(shared), unfinite_pixels(own))
+        shared = zero_where(left_out, shared)
+        self.sums.add("own", zero_where(left_out, own))
         same, other = ((iteration + step) % 2 for step in range(2))
-        for name, value in (
-            ("shared", shared),
-            ("left_out", dr.select(finite, mi.Float(0), mi.Float(1))),
-        ):
+        for name, value in (("shared", shared), ("left_out", left_out)):
             self.sums.add(f"{name}{same}", value)
             if f"{name}{other}" not in self.sums.tensors:
                 self.sums.add(f"{name}{other}", dr.zeros(mi.TensorXd, value.shape))

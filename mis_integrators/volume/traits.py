@@ -83,7 +83,8 @@ def check_volume_scene(scene, plugin):
     check_variant(scene, plugin)
     if mi.is_polarized:
         raise UnsupportedScene(
-            f"{plugin}: polarised variants are not supported (active: {mi.variant()}); use an unpolarised "
+            f"{plugin}: polarised variants are not supported (active: {mi.variant()}); use an "
+            "unpolarised "
             'one such as "llvm_ad_rgb"'
         )
     check_emitters(scene, plugin)

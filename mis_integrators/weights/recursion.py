@@ -150,8 +150,8 @@ def next_drive(drive: Array, e: Array, tau: Array, rest: Array) -> Array:
 
 
 def bounded_drive(drive: Array, r: Array) -> Array:
-    """drive_i, at most `LARGEST_RATIO`, and 0 where r_i = 0: strategies at z_i and beyond that cannot
-    make a path must not share in it.
+    """drive_i, at most `LARGEST_RATIO`, and 0 where r_i = 0: strategies at z_i and beyond that
+    cannot make a path must not share in it.
 
     A function of the path alone, common to all deeper weights: they still sum to one."""
     return at_most(at_most(drive, LARGEST_RATIO), at_most(r, 1) / SMALLEST_DENOMINATOR)

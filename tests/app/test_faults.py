@@ -502,3 +502,34 @@ def test_texel_is_named_from_python(spotted, tmp_path, capfd):
     assert np.isfinite(image).all()
     said = "".join(capfd.readouterr())
     assert said.count("bdpt: ") == 1 and "reflectance.data of BitmapTexture" in said
+
+
+@pytest.mark.parametrize("plugin", ["bdpm", "bdpt", "volpath_multiview", "path"])
+@pytest.mark.parametrize("size", [(1, 1), (1, 3), (3, 1)])
+def test_films_of_few_pixels(rgb, plugin, size):
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "light": {"type": "constant"},
+            "ball": {"type": "sphere", "bsdf": {"type": "diffuse"}},
+            "sensor": {
+                "type": "perspective",
+                "to_world": mi.ScalarTransform4f().translate([0, 0, -4]),
+                "film": {
+                    "type": "hdrfilm",
+                    "width": size[0],
+                    "height": size[1],
+                    "rfilter": {"type": "box"},
+                },
+            },
+        }
+    )
+    session = make_session(mi.load_dict({"type": plugin}), scene, scene.sensors()[0], 0, 2)
+    session.keep_variance()
+    for number in range(2):
+        session.iterate(number)
+    assert session.image().shape[:2] == size[::-1] and session.unfinite_pixels() == 0
+    assert all(np.isfinite(estimate).all() for estimate in session.estimate())
+    assert {name: array.shape for name, array in session.sums.arrays().items()} == {
+        name: tuple(shape) for name, shape in session.sum_shapes().items()
+    }
