@@ -90,7 +90,7 @@ def slope_interval(
     return mean_interval(slopes, level) if slopes else Interval(math.nan, math.nan, math.nan)
 
 
-# --- Student's t ----------------------------------------------------------------------------------------
+# --- Student's t ----------------------------------------------------------------------------------
 
 
 def t_two_sided(t: float, freedom: float) -> float:

@@ -110,7 +110,7 @@ def mape(image: np.ndarray, references: References) -> float:
     return float(np.abs(relative_differences(image, references)).mean())
 
 
-# --- Bias and variance ----------------------------------------------------------------------------------
+# --- Bias and variance ----------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -159,7 +159,7 @@ def efficiency(variance: float, seconds: float) -> float:
     return 1 / (variance * seconds) if variance * seconds > 0 else float("inf")
 
 
-# --- Robust means ---------------------------------------------------------------------------------------
+# --- Robust means ---------------------------------------------------------------------------------
 
 
 def trimmed_mean(values: np.ndarray, share: float = TRIMMED_SHARE) -> float:
@@ -185,7 +185,7 @@ def median_of_means(values: np.ndarray, groups: int = GROUPS) -> float:
     )
 
 
-# --- FLIP -----------------------------------------------------------------------------------------------
+# --- FLIP -----------------------------------------------------------------------------------------
 
 
 def flip(image: np.ndarray, references: References) -> tuple[float, np.ndarray] | None:

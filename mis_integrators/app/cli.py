@@ -215,10 +215,8 @@ def _about_error(target: TargetError | None) -> str:
         return ""
     if math.isinf(target.error):
         return ", relative error unknown after one iteration"
-    return (
-        ", relative error "
-        f"{target.error:.3g}{'' if target.error <= target.target else f' (target {target.target:g} not reached)'}"
-    )
+    missed = f" (target {target.target:g} not reached)" if target.error > target.target else ""
+    return f", relative error {target.error:.3g}{missed}"
 
 
 def _metadata(

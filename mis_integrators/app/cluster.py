@@ -105,7 +105,7 @@ class Job:
     threads: int | None
 
 
-# --- In the worker ------------------------------------------------------------------------------------
+# --- In the worker --------------------------------------------------------------------------------
 
 _open: dict[str, Session] = {}
 # Sessions live in one thread, whatever thread Dask calls from.
@@ -161,7 +161,7 @@ def _open_session(job: Job, threads: int, address: str) -> Session:
     return opened.session
 
 
-# --- In the process that gathers --------------------------------------------------------------------
+# --- In the process that gathers ------------------------------------------------------------------
 
 
 @contextlib.contextmanager

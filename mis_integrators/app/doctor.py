@@ -34,8 +34,10 @@ import sys
 import mis_integrators, mitsuba as mi, numpy as np
 mi.set_variant(sys.argv[1])
 scene = mi.load_dict({"type": "scene",
-    "sensor": {"type": "perspective", "film": {"type": "hdrfilm", "width": 8, "height": 8, "pixel_format": "rgb"}},
-    "box": {"type": "sphere", "radius": 3.0, "flip_normals": True, "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}},
+    "sensor": {"type": "perspective",
+        "film": {"type": "hdrfilm", "width": 8, "height": 8, "pixel_format": "rgb"}},
+    "box": {"type": "sphere", "radius": 3.0, "flip_normals": True,
+        "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}},
             "light": {"type": "area", "radiance": {"type": "rgb", "value": 1.0}}}})
 integrator = mi.load_dict({"type": sys.argv[2], "rr_depth": 1000, "max_depth": 12})
 print("brightness", float(np.mean(np.array(integrator.render(scene, spp=64, seed=1)))))

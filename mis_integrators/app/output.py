@@ -125,11 +125,10 @@ def write_png(path: Path, image: np.ndarray, channels: Sequence[str]) -> bool:
     Values that are no numbers become black. Returns ``False``, and writes nothing, if the image has
     no colour channels (a film of spectral bands). Raises ``OSError`` as ``write_exr`` does.
     """
-    for names, pixel_format in _PICTURES:
-        if set(names) <= set(channels):
-            break
-    else:
+    kinds = [kind for kind in _PICTURES if set(kind[0]) <= set(channels)]
+    if not kinds:
         return False
+    names, pixel_format = kinds[0]
     picture = np.nan_to_num(image[..., [channels.index(name) for name in names]], posinf=1).astype(
         np.float32
     )

@@ -158,7 +158,9 @@ class SceneTraits:
         self.perturbed = registry_table(bsdfs, mi.BSDFPtr, perturbed, mi.Bool)
         # Nested BSDFs count on their own, so a perturbed (bump- or normal-mapped) Lambertian shows
         # through its wrapper.
-        self.has_rough = any((f & flag.Smooth) and not l for f, l in zip(flags, lambertian))
+        self.has_rough = any(
+            (f & flag.Smooth) and not simple for f, simple in zip(flags, lambertian)
+        )
         self.has_rough_glass = any(f & flag.GlossyTransmission for f in flags)
         self.lambertian = registry_table(bsdfs, mi.BSDFPtr, lambertian, mi.Bool)
         delta = mi.EmitterFlags.DeltaPosition | mi.EmitterFlags.DeltaDirection

@@ -643,7 +643,7 @@ class ResampledSession(IterativeSession):
         )
         for k in range(sets):
             r, seen, _, _, found, vertices, _ = self._ends_fit(
-                lambda: self._pilot_pass(
+                lambda k=k: self._pilot_pass(
                     self.scene,
                     self.sensor,
                     self._tables,

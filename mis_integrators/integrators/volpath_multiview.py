@@ -214,7 +214,7 @@ class MultiViewSession(IterativeSession):
     def _trace_first(self, scene, tables, number, seed, spectral):
         integrator = self.integrator
         active = (number < self.views.paths) & (integrator.max_depth != 0)
-        pivot, radiance, rng = trace_first_segments(
+        pivot, radiance, _ = trace_first_segments(
             scene,
             self.views,
             self.traits,

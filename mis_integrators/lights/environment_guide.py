@@ -286,7 +286,7 @@ class EnvironmentGuide:
         environment = next(((i, e) for i, e in self.infinite if e.is_environment()), None)
         if environment is None:
             return
-        index, emitter = environment
+        _, emitter = environment
         tests, seen = np.zeros(DIRECTION_CELLS), np.zeros(DIRECTION_CELLS)
         for place, rng in places:
             towards = mi.warp.square_to_uniform_sphere(next_2d(rng))

@@ -489,7 +489,7 @@ class Lights:
                 )
         return ratio
 
-    # ------------------------------------------------------------------ starts of light sub-paths, apart from what follows
+    # --- starts of light sub-paths, apart from what follows --------------------------------------
 
     def pdf_emission_origin(self, ref, ds, active):
         """Density with which light sub-paths start from the light's point or direction in `ds`,

@@ -88,7 +88,7 @@ class HeuristicWeights:
             * self.lights.emission_over_nee_pdf(ref, ds, mask)
         )
 
-    # ------------------------------------------------------------------ camera paths (hooks of `trace_camera_paths`)
+    # --- camera paths (`mis.state.MergeState`) ---------------------------------------------------
 
     def init(self, width):
         """State of a camera path on its way to z_i: the sum of the strategies before z_{i-1}, and

@@ -3,6 +3,8 @@ neighbours' radiance."""
 
 from __future__ import annotations
 
+import itertools
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -54,7 +56,7 @@ class NeighbourRadiance:
                 value = channel_mean(spectrum) if channels == 1 else spectrum[channel]
                 value = np.array(dr.select(active, value, 0)).reshape(cells, RAYS)
                 value = np.take_along_axis(value, order, axis=1)
-                for group, (a, b) in enumerate(zip(ends[:-1], ends[1:])):
+                for group, (a, b) in enumerate(itertools.pairwise(ends)):
                     table[1:, group, number, channel] = value[:, a:b].mean(axis=1)
         self.table = from_numpy(mi.Float, table.ravel())
 

@@ -283,7 +283,7 @@ class OptimalWeights:
             1 + dr.square(photons / TRUSTED_PHOTONS)
         )
 
-    # ------------------------------------------------------------------ camera paths (hooks of `trace_camera_paths`)
+    # --- camera paths (`mis.state.MergeState`) ---------------------------------------------------
 
     def init(self, width):
         """State of a camera path: drive and r of the vertex it arrives at; after arrival tau, and

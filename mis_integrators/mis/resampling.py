@@ -4,7 +4,8 @@ Hooks of `transport.subpaths` and `transport.camera_vertices`, and what resampli
 technique of a joint path. All techniques of a path evaluate one function: a technique that joins a
 light sub-path Y to the camera vertex z is taken to draw it with
 
-    q/p = (a + c) r + b  if a cache point of z sees what z sees, else  c r + b,    r = f_y rho G softened,    G softened = G d^2 / (d^2 + h^2)
+    q/p = (a + c) r + b  if a cache point of z sees what z sees, else  c r + b,
+    r = f_y rho G softened,    G softened = G d^2 / (d^2 + h^2)
 
 where the parts are the cached pmfs' visible, blind and uniform ones (`proposals`), and the second
 case has a probability e. The four numbers of z and the lengths' shares Q_s/Q are looked up by place
@@ -97,7 +98,7 @@ class ResampledWeights:
             MOST_GAIN * self.N,
         )
 
-    # ------------------------------------------------------------------ hooks of the light sub-paths
+    # --- light sub-paths -------------------------------------------------------------------------
 
     @staticmethod
     def blank(width):

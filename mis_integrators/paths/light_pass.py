@@ -243,7 +243,7 @@ def trace_light_paths(
                         keep,
                     )
 
-        # ---- Go on: a photon on the next surface needs one more segment, and the camera one after it
+        # ---- Go on: the next photon needs one more segment, and the camera one after it
         if dr.hint(max_depth > 0, mode="scalar"):
             active &= depth + 2 <= max_depth
         bs, delta, weight, wo, active = scatter_light(traits, si, bsdf, rng, active)

@@ -241,7 +241,7 @@ def trace_light_subpaths(
         parent = dr.select(smooth, slot, parent)
         dr.scatter(store.lengths, number, path, smooth)
 
-        # ---- Go on: a vertex on the next surface needs one more segment, and the sensor one after it
+        # ---- Go on: the next vertex needs one more segment, and the sensor one after it
         if dr.hint(max_depth > 0, mode="scalar"):
             active &= depth + 2 <= max_depth
         bs, delta, weight, wo, active = scatter_light(traits, si, bsdf, rng, active)

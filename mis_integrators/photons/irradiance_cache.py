@@ -136,7 +136,7 @@ class IrradianceCache:
             1 / 3
         )  # smaller cells would share entries of the index
         cell = TRIAL_SHARE * diagonal
-        for trial in range(3):
+        for _ in range(3):
             cell = min(max(cell, smallest), LARGEST_SHARE * diagonal)
             self.cell = dr.opaque(mi.Float, cell)
             self.columns, self.lines = (

@@ -61,7 +61,7 @@ class Shifted:
     valid: Any
 
 
-# --- Elementary functions on either kind of array -----------------------------------------------------
+# --- Elementary functions on either kind of array -------------------------------------------------
 
 
 def _is_numpy(x: Array) -> bool:
@@ -121,7 +121,7 @@ def _log_sum(a: Array, b: Array) -> Array:
     return larger + (np.log1p(np.exp(gap)) if _is_numpy(gap) else dr.log(1 + dr.exp(gap)))
 
 
-# --- A segment's scales --------------------------------------------------------------------------------
+# --- A segment's scales ---------------------------------------------------------------------------
 
 
 def _inside(t: Array, tmin: Array, tmax: Array) -> Array:
@@ -170,9 +170,9 @@ def _invert(sections: Sections, x: Array, density: Callable[[Array], Array]) -> 
     return t, majorant
 
 
-def at_length(sections: Sections, l: Array) -> tuple[Array, Array]:
-    """Where the length in media reaches l: t and the majorant there."""
-    return _invert(sections, l, lambda mu: 1.0 + 0 * mu)
+def at_length(sections: Sections, length: Array) -> tuple[Array, Array]:
+    """Where the length in media reaches a value: t and the majorant there."""
+    return _invert(sections, length, lambda mu: 1.0 + 0 * mu)
 
 
 def at_optical_depth(sections: Sections, tau: Array) -> tuple[Array, Array]:
@@ -201,7 +201,7 @@ def _ratio(a: Array, b: Array) -> Array:
     return a / _where(b > 0, b, 1.0)
 
 
-# --- Stretches: both ends stay where they are ------------------------------------------------------------
+# --- Stretches: both ends stay where they are -----------------------------------------------------
 
 
 def raw_depth(base: Sections, target: Sections, t: Array) -> Shifted:
@@ -259,7 +259,7 @@ def primary_sample(base: Sections, target: Sections, t: Array) -> Shifted:
     )
 
 
-# --- Copies: earlier work, for comparison -----------------------------------------------------------------
+# --- Copies: earlier work, for comparison ---------------------------------------------------------
 
 
 def raw_depth_copy(base: Sections, target: Sections, t: Array) -> Shifted:

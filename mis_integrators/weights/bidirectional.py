@@ -16,18 +16,19 @@ is a density P per projected solid angle times the geometric term G = |cos cos| 
 just made. Seen from the end of a sub-path, all techniques that join nearer to its start are summed
 up in one number
 
-    S_i = p<(x_i) A_i,    A_i = near_i + P'(x_i) far_i  [+ eta]
+    S_i = p<(x_i) A_i,    A_i = d_vcm_i + P'(x_i) d_vc_i  [+ eta]
 
 where p<(x_i) [1/m^2] is the density with which the other side makes x_i, P' [1/sr] that with which
 it goes on from there, and
 
-    near_i = 1 / p>(x_i), or zero where x_{i-1} cannot be joined to x_i [m^2]
-    far_i  = A_{i-1} / P(x_{i-1}) [m^2 sr]; beyond a delta surface, whose two densities cancel, far_{i-1}
+    d_vcm_i = 1 / p>(x_i), or zero where x_{i-1} cannot be joined to x_i [m^2]
+    d_vc_i  = A_{i-1} / P(x_{i-1}) [m^2 sr]; beyond a delta surface, whose two densities cancel,
+              d_vc_{i-1}
 
-are what a sub-path carries along. `eta` [m^2] is the merging technique's pi R^2 N at x_i itself
-(zero without merging). The sub-paths' first vertices have densities of their own (`light_start`,
-`camera_start`). With the exponent beta, sums are beta-norms, so that no number is ever squared
-while it has a unit.
+are what a sub-path carries along (dVCM and dVC there). `eta` [m^2] is the merging technique's pi
+R^2 N at x_i itself (zero without merging). The sub-paths' first vertices have densities of their
+own (`light_start`, `camera_start`). With the exponent beta, sums are beta-norms, so that no number
+is ever squared while it has a unit.
 
 All arrays broadcast; NumPy and Dr.Jit alike.
 """

@@ -28,8 +28,10 @@ def gain(ratio: Array, total: Array) -> Array:
     """w_{i->j} p_j(x_j) |dx_j/dx_i| / p_i(x_i): the weight of the path in view j times what turns
     f/p_{i->j} into f/p_j.
 
-    `total` is the sum of the `summand` over all views that can make the path, the path's own included. Only there do heuristics differ:
-    mis:   w = 1 / S_r with S_r = sum_k r_k (balance heuristic); mwis has the same numerator, and its weights (1 / S_r) p_jj / p_ij = r_j / S_r
+    `total` is the sum of the `summand` over all views that can make the path, the path's own
+    included. Only there do heuristics differ:
+    mis:   w = 1 / S_r with S_r = sum_k r_k (balance heuristic); mwis has the same numerator, and
+           its weights (1 / S_r) p_jj / p_ij = r_j / S_r
     are this very gain. power: w = 1 / sum_k r_k^2.
     none:  w = 1 / (number of views that can make the path), whatever their densities.
     """

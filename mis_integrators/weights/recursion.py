@@ -10,9 +10,11 @@ photons at z_i; direct light at z_j is the last strategy of family j + 1. Every 
 
     f_i    BSDF value at z_i between z_{i-1} and z_{i+1}, without cosine [1/sr]
     p_i    density of the camera path's next direction at z_i, per projected solid angle [1/sr]
-    L0_i   luminance of z_i towards z_{i-1} under direct light; L_i the same under all light [W/(m^2 sr)]
+    L0_i   luminance of z_i towards z_{i-1} under direct light; L_i the same under all light
+           [W/(m^2 sr)]
     c      b/L at the deepest vertex, b the integral of f^2 over incident indirect radiance [1/sr]
-    n      photons per unit of irradiance: merge area times light sub-paths over the light's flux [m^2/W]
+    n      photons per unit of irradiance: merge area times light sub-paths over the light's flux
+           [m^2/W]
     N_B    camera paths an iteration that share z0
 
 The derivation's H_i, T_i, kappa_i and d_i enter only by the ratios r_i = H_i / T_i (H_i the cost

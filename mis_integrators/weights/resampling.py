@@ -13,7 +13,8 @@ that broadcasts, NumPy or Dr.Jit, one element a light sub-path:
     p    density of the light sub-path, product area measure
     q*   target density, not normalised, in the same measure
     r    q*/p
-    Q    integral of q* over light sub-paths of all lengths, estimated by (1/M) sum of r over all proposals; Q_s: over those of length s
+    Q    integral of q* over light sub-paths of all lengths, estimated by (1/M) sum of r over all
+         proposals; Q_s: over those of length s
     q    q*/Q, and q_s = q*/Q_s
     g    w f, what the estimate sums up
 
