@@ -10,8 +10,8 @@ import mitsuba as mi
 
 from ..mis.neighbour_radiance import NeighbourRadiance
 from ..mis.optimal import OptimalWeights
-from ..paths.light_pass import trace_light_paths
 from ..photons.irradiance_cache import IrradianceCache
+from ..photons.trace import trace_light_paths
 from .common import MOST_LIGHT_PATHS
 from .weighted import WeightedBDPM, WeightedSession
 

@@ -6,8 +6,8 @@ import drjit as dr
 import mitsuba as mi
 
 from ..paths.camera_pass import STATE, trace_camera_paths
-from ..paths.light_pass import trace_light_paths
 from ..photons.gather import gather_photons, vertex_section
+from ..photons.trace import trace_light_paths
 from .bdpm import BDPM, BDPMSession
 
 

@@ -14,10 +14,10 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.packing import Store
-from ..core.random import next_2d, streams
+from ..core.random import next_2d
 from ..core.records import Layout
 from .camera_pass import behind_emitters, start_camera_paths, with_gaps, within_crop
-from .light_pass import lane_count, scatter_light
+from .light import trace_light
 from .roulette import russian_roulette
 from .sensor import Lens
 from .vertex import VertexBSDF, scattered_mean
@@ -138,7 +138,74 @@ def vertex_bsdf_of(traits, record, wavelengths, active):
     )
 
 
-@dr.syntax
+class VertexVisitor:
+    """Keeps the smooth vertices of light sub-paths (a `LightVisitor`).
+
+    Its state: how many vertices a sub-path has kept, the place of the last one, the density of its
+    direction (per solid angle; zero after a delta function), the last surface's point, and the
+    state of `weights`.
+    """
+
+    def __init__(self, traits, weights, n_paths, capacity):
+        self.traits, self.weights = traits, weights
+        self.store = Store(
+            vertices=new_vertices(traits, capacity, weights.states),
+            room=dr.opaque(mi.UInt32, capacity),
+            count=dr.zeros(mi.UInt32, 1),
+            lengths=dr.zeros(mi.UInt32, n_paths),
+        )
+
+    def blank(self, lanes):
+        number, parent = dr.zeros(mi.UInt32, lanes), dr.full(mi.UInt32, NO_PARENT, lanes)
+        density, origin = dr.zeros(mi.Float, lanes), dr.zeros(mi.Point3f, lanes)
+        return [number, parent, density, origin, self.weights.blank(lanes)]
+
+    def begin(self, state):
+        _, _, density, origin, sums = state
+        return [mi.UInt32(0), mi.UInt32(NO_PARENT), density, origin, sums]
+
+    def arrive(self, state, at, active):
+        number, parent, density, origin, sums = state
+        si, weights = at.si, self.weights
+        first = active & at.first
+        squared = dr.maximum(dr.squared_norm(si.p - origin), 1e-20)
+        arrival = density * dr.abs(dr.dot(si.n, at.towards)) * dr.rcp(squared)
+        sums = _either(
+            first,
+            weights.init_light(si, at.source, ~at.had_delta, first, at.flux),
+            weights.propagate(sums, arrival, si, squared, at.depth),
+        )
+        smooth = active & mi.has_flag(at.bsdf.flags(), mi.BSDFFlags.Smooth)
+        at.vertex_bsdf = VertexBSDF.at(self.traits, si, at.bsdf, smooth)
+        slot = keep_vertex(
+            self.store,
+            at.vertex_bsdf,
+            si,
+            at.hit,
+            at.towards,
+            at.flux,
+            at.path,
+            at.depth,
+            number,
+            parent,
+            sums,
+            weights.states,
+            smooth,
+        )
+        number = dr.select(smooth, number + 1, number)
+        dr.scatter(self.store.lengths, number, at.path, smooth)
+        return [number, dr.select(smooth, slot, parent), density, origin, sums]
+
+    def leave(self, state, at, wo, delta, active):
+        number, parent, _, _, sums = state
+        si, away = at.si, at.si.to_world(wo)
+        value, p_back, p_forward = at.vertex_bsdf.f_and_pdfs(away, at.towards, active & ~delta)
+        mean = scattered_mean(value, si.n, at.towards)
+        sums = _either(active, self.weights.scatter(sums, p_forward, p_back, delta, mean), sums)
+        density = dr.select(delta, 0, p_forward * dr.abs(dr.dot(si.n, away)))
+        return [number, parent, density, mi.Point3f(si.p), sums]
+
+
 def trace_light_subpaths(
     scene,
     lights,
@@ -159,108 +226,21 @@ def trace_light_subpaths(
     than `capacity`: the surplus is missing), and the number of kept vertices of each path.
     `throughput` is flux through the surface, for one sub-path.
     """
-    lanes = lane_count(n_paths)
-    lane = dr.arange(mi.UInt32, lanes)
-    rng = streams(lane, seed)
-    count, stride = dr.opaque(mi.UInt32, n_paths), dr.opaque(mi.UInt32, lanes)
-    store = Store(
-        vertices=new_vertices(traits, capacity, weights.states),
-        room=dr.opaque(mi.UInt32, capacity),
-        count=dr.zeros(mi.UInt32, 1),
-        lengths=dr.zeros(mi.UInt32, n_paths),
+    visitor = VertexVisitor(traits, weights, n_paths, capacity)
+    trace_light(
+        scene,
+        lights,
+        traits,
+        visitor,
+        seed,
+        n_paths,
+        wavelengths,
+        shutter_open,
+        shutter_time,
+        max_depth,
+        rr_depth,
     )
-    next_path = mi.UInt32(lane)
-    path = mi.UInt32(lane)
-    ray = dr.zeros(mi.Ray3f, lanes)
-    flux = dr.zeros(mi.Spectrum, lanes)
-    strength = dr.zeros(mi.Float, lanes)  # for roulette: one over the flux at the start
-    depth = dr.zeros(mi.UInt32, lanes)
-    number = dr.zeros(mi.UInt32, lanes)
-    parent = dr.full(mi.UInt32, NO_PARENT, lanes)
-    eta = dr.ones(mi.Float, lanes)
-    state = weights.blank(lanes)
-    density = dr.zeros(
-        mi.Float, lanes
-    )  # of the direction, per solid angle; zero after a delta function
-    origin = dr.zeros(mi.Point3f, lanes)
-    active = dr.full(mi.Bool, False, lanes)
-
-    while dr.hint(active | (next_path < count), label="light sub-paths"):
-        # ---- Start the lane's next path where one has ended
-        begin = ~active & (next_path < count)
-        source = dr.zeros(mi.DirectionSample3f)
-        unreachable = mi.Bool(False)
-        if begin:
-            time = mi.Float(shutter_open)
-            if dr.hint(shutter_time > 0, mode="scalar"):
-                time += rng.next_float32() * shutter_time
-            ray, flux, unreachable, source = lights.sample_emission(rng, time, wavelengths)
-            strength = dr.rcp(dr.maximum(dr.max(flux), 1e-38))
-            depth = mi.UInt32(0)
-            number = mi.UInt32(0)
-            parent = mi.UInt32(NO_PARENT)
-            eta = mi.Float(1)
-            active = dr.max(flux) > 0
-            path = mi.UInt32(next_path)
-            next_path += stride
-
-        hit = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
-        active &= hit.is_valid()
-        si = hit.compute_surface_interaction(ray, mi.RayFlags.All, active=active)
-        depth += 1
-        bsdf = si.bsdf(ray)
-        towards = -ray.d
-
-        # ---- Arrive
-        first = active & begin
-        squared = dr.maximum(dr.squared_norm(si.p - origin), 1e-20)
-        arrival = density * dr.abs(dr.dot(si.n, towards)) * dr.rcp(squared)
-        state = _either(
-            first,
-            weights.init_light(si, source, ~unreachable, first, flux),
-            weights.propagate(state, arrival, si, squared, depth),
-        )
-        smooth = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-        vertex_bsdf = VertexBSDF.at(traits, si, bsdf, smooth)
-        slot = keep_vertex(
-            store,
-            vertex_bsdf,
-            si,
-            hit,
-            towards,
-            flux,
-            path,
-            depth,
-            number,
-            parent,
-            state,
-            weights.states,
-            smooth,
-        )
-        number = dr.select(smooth, number + 1, number)
-        parent = dr.select(smooth, slot, parent)
-        dr.scatter(store.lengths, number, path, smooth)
-
-        # ---- Go on: the next vertex needs one more segment, and the sensor one after it
-        if dr.hint(max_depth > 0, mode="scalar"):
-            active &= depth + 2 <= max_depth
-        bs, delta, weight, wo, active = scatter_light(traits, si, bsdf, rng, active)
-        value, p_back, p_forward = vertex_bsdf.f_and_pdfs(wo, towards, active & ~delta)
-        state = _either(
-            active,
-            weights.scatter(state, p_forward, p_back, delta, scattered_mean(value, si.n, towards)),
-            state,
-        )
-        density = dr.select(delta, 0, p_forward * dr.abs(dr.dot(si.n, wo)))
-        origin = mi.Point3f(si.p)
-        flux *= weight
-        eta *= bs.eta
-        ray = si.spawn_ray(wo)
-
-        flux, active = russian_roulette(
-            rng, flux, dr.max(flux) * strength, eta, depth >= rr_depth, active
-        )
-
+    store = visitor.store
     return store.vertices, store.count, store.lengths
 
 

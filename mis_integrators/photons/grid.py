@@ -13,7 +13,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.packing import bits_float, unpack_caustic
-from ..paths.light_pass import photon_words
+from .trace import photon_words
 
 RUN = 32
 """Photons of a row that a query tests at once: one bit of a word each."""

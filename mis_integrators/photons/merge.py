@@ -15,10 +15,10 @@ from ..core.packing import (
     unpack_direction,
     unpack_normal,
 )
-from ..paths.light_pass import photon_words
 from ..paths.subpaths import STATES, read_vertices, vertex_bsdf_of
 from .gather import LARGEST_COSINE_RATIO, SAME_SURFACE_COSINE, SAME_SURFACE_OFFSET
 from .grid import build_photon_map, for_each_photon, read_power
+from .trace import photon_words
 
 
 def vertex_map(vertices, count, capacity: int, bounds, cell):

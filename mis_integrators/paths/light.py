@@ -1,22 +1,18 @@
-"""Light sub-paths and the photons they leave."""
+"""The tracer of light sub-paths: one loop, for photons as for vertices that are joined."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Protocol
 
 import drjit as dr
 import mitsuba as mi
 
-from ..core.packing import Store, float_bits, pack_direction, pack_surface
 from ..core.random import next_2d, streams
 from ..core.traits import lookup
 from .roulette import russian_roulette
 
-
-def photon_words():
-    """32-bit words of a photon's second record: its flux (one a channel or wavelength) and its
-    packed direction, padded to a power of two so that it moves in one packet."""
-    channels = dr.size_v(mi.Spectrum)
-    return {1: 2, 3: 4, 4: 8}[channels]
-
+Array = Any
 
 PATHS_PER_LANE = 8
 """Light sub-paths that a SIMD lane of a CPU traces one after the other: a lane whose path has ended
@@ -100,69 +96,88 @@ def scatter_light(traits, si, bsdf, rng, active):
     return bs, delta, weight * adjoint, wo, active
 
 
+@dataclass
+class LightArrival:
+    """Light sub-paths at a surface, one a lane.
+
+    `si`, `hit`: the interaction, and what it is computed from; `bsdf`: of the surface; `towards`:
+    unit vector to where the sub-path came from; `flux` [W] that one sub-path carries; `path`: its
+    number; `depth`: segments so far; `first`: no surface was met before; `source`: the point of
+    the light, valid where `first`; `had_delta`: met a delta surface, or started out of reach of
+    next-event estimation; `scattered`: met a smooth surface.
+    """
+
+    si: mi.SurfaceInteraction3f
+    hit: mi.PreliminaryIntersection3f
+    bsdf: mi.BSDFPtr
+    towards: mi.Vector3f
+    flux: mi.Spectrum
+    path: mi.UInt32
+    depth: mi.UInt32
+    first: mi.Bool
+    source: mi.DirectionSample3f
+    had_delta: mi.Bool
+    scattered: mi.Bool
+
+
+class LightVisitor(Protocol):
+    """What is done at the surfaces that light sub-paths meet. Its state, a list of arrays, travels
+    with them."""
+
+    def blank(self, lanes: int) -> list[Any]:
+        """The state before any sub-path."""
+
+    def begin(self, state: list[Any]) -> list[Any]:
+        """The state of a sub-path that starts."""
+
+    def arrive(self, state: list[Any], at: LightArrival, active: Array) -> list[Any]:
+        """The state at a surface; here photons and vertices are stored."""
+
+    def leave(
+        self, state: list[Any], at: LightArrival, wo: Array, delta: Array, active: Array
+    ) -> list[Any]:
+        """The state after scattering into the local direction `wo`, by a delta function or not."""
+
+
 @dr.syntax
-def trace_light_paths(
+def trace_light(
     scene,
     lights,
     traits,
+    visitor,
     seed,
     n_paths: int,
-    capacity: int,
     wavelengths,
     shutter_open: float,
     shutter_time: float,
     max_depth: int,
     rr_depth: int,
-    keep_direct: bool = False,
-    light_state=None,
 ):
-    """Traces `n_paths` light sub-paths and stores photons on surfaces that scatter smoothly.
+    """Traces `n_paths` light sub-paths and shows each surface that they meet to the `visitor`, a
+    `LightVisitor`, which stores what is to be kept.
 
-    Stored are photons of two or more segments that have scattered smoothly at least once
-    ("indirect"), and photons that have met only delta surfaces on the way from the emitter
-    ("caustic"); a photon's first smooth vertex straight from the emitter is next-event estimation's
-    business and is stored with `keep_direct` only (of kind "caustic"). `max_depth` counts the
-    segments of a whole path (0 or less: unlimited); a photon's own depth is its number of segments
-    from the emitter.
-
-    Returns `(surface, power, count)`: uint32 arrays with four words a photon (position's bits;
-    normal, depth and kind packed) and `photon_words()` words a photon (bits of the flux that one
-    sub-path carries, packed direction to where it came from), in no particular order, and the
-    number of photons, of width one. If it exceeds `capacity` the surplus is missing: repeat the
-    pass with more room. Shading normals: Veach 1997, section 5.3 (adjoint factor); where maps
-    perturb normals inside BSDFs, these are evaluated from the camera's side instead.
-
-    With a `light_state` (a `mis.state.LightState`) the result has a fourth array: the words that it
-    stores with each photon.
+    `max_depth` counts the segments of a whole path (0 or less: unlimited): a sub-path goes on only
+    where another segment and one to the camera fit. Shading normals: Veach 1997, section 5.3.
     """
     lanes = lane_count(n_paths)
     lane = dr.arange(mi.UInt32, lanes)
     rng = streams(lane, seed)
-    words = photon_words()
-    store = Store(
-        surface=dr.empty(mi.UInt32, 4 * capacity),
-        power=dr.empty(mi.UInt32, words * capacity),
-        count=dr.zeros(mi.UInt32, 1),
-    )
-    state = []
-    if dr.hint(light_state is not None, mode="scalar"):
-        state = light_state.init()
-        store.mis_words = dr.empty(mi.UInt32, len(light_state.words(state)) * capacity)
-    path = mi.UInt32(lane)  # the lane's next path; then this one plus the number of lanes
+    count, stride = dr.opaque(mi.UInt32, n_paths), dr.opaque(mi.UInt32, lanes)
+    next_path = mi.UInt32(lane)
+    path = mi.UInt32(lane)
     ray = dr.zeros(mi.Ray3f, lanes)
     flux = dr.zeros(mi.Spectrum, lanes)
     strength = dr.zeros(mi.Float, lanes)  # for roulette: one over the flux at the start
-    had_delta = dr.full(
-        mi.Bool, False, lanes
-    )  # met a delta surface (or is out of next-event estimation's reach)
-    scattered = dr.full(mi.Bool, False, lanes)  # met a smooth surface
+    had_delta = dr.full(mi.Bool, False, lanes)
+    scattered = dr.full(mi.Bool, False, lanes)
     depth = dr.zeros(mi.UInt32, lanes)
     eta = dr.ones(mi.Float, lanes)
+    state = visitor.blank(lanes)
     active = dr.full(mi.Bool, False, lanes)
 
-    while dr.hint(active | (path < n_paths), label="light sub-paths"):
+    while dr.hint(active | (next_path < count), label="light sub-paths"):
         # ---- Start the lane's next path where one has ended
-        begin = ~active & (path < n_paths)
+        begin = ~active & (next_path < count)
         source = dr.zeros(mi.DirectionSample3f)
         if begin:
             time = mi.Float(shutter_open)
@@ -173,92 +188,31 @@ def trace_light_paths(
             scattered = mi.Bool(False)
             depth = mi.UInt32(0)
             eta = mi.Float(1)
+            state = visitor.begin(state)
             active = dr.max(flux) > 0
-            path += lanes
-            if dr.hint(light_state is not None, mode="scalar"):
-                state = light_state.init()
+            path = mi.UInt32(next_path)
+            next_path += stride
 
-        si = scene.ray_intersect(ray, mi.RayFlags.All, coherent=False, reorder=False, active=active)
-        active &= si.is_valid()
+        # ---- Arrive
+        hit = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
+        active &= hit.is_valid()
+        si = hit.compute_surface_interaction(ray, mi.RayFlags.All, active=active)
         depth += 1
-        bsdf = si.bsdf(ray)
-        if dr.hint(light_state is not None, mode="scalar"):
-            state = light_state.first_vertex(state, si, source, active & begin & ~had_delta)
-
-        # ---- Store a photon
-        keep = (
-            active
-            & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-            & (scattered | had_delta | keep_direct)
+        at = LightArrival(
+            si, hit, si.bsdf(ray), -ray.d, flux, path, depth, begin, source, had_delta, scattered
         )
-        slot = dr.scatter_inc(store.count, mi.UInt32(0), keep)
-        keep &= slot < capacity
-        dr.scatter(
-            store.surface,
-            mi.Vector4u(
-                float_bits(si.p.x),
-                float_bits(si.p.y),
-                float_bits(si.p.z),
-                pack_surface(si.n, depth, ~scattered),
-            ),
-            slot,
-            keep,
-        )
-        from_where = pack_direction(-ray.d)
-        if dr.hint(words == 2, mode="scalar"):
-            dr.scatter(store.power, mi.Vector2u(float_bits(flux[0]), from_where), slot, keep)
-        elif dr.hint(words == 4, mode="scalar"):
-            dr.scatter(
-                store.power,
-                mi.Vector4u(
-                    float_bits(flux[0]), float_bits(flux[1]), float_bits(flux[2]), from_where
-                ),
-                slot,
-                keep,
-            )
-        else:
-            dr.scatter(
-                store.power,
-                mi.Vector4u(
-                    float_bits(flux[0]),
-                    float_bits(flux[1]),
-                    float_bits(flux[2]),
-                    float_bits(flux[3]),
-                ),
-                2 * slot,
-                keep,
-            )
-            dr.scatter(store.power, mi.Vector4u(from_where, 0, 0, 0), 2 * slot + 1, keep)
-        if dr.hint(light_state is not None, mode="scalar"):
-            words_of_state = light_state.words(state)
-            parts = len(words_of_state) // 4
-            for part in dr.hint(range(max(parts, 1)), mode="scalar"):
-                if dr.hint(parts == 0, mode="scalar"):
-                    dr.scatter(store.mis_words, mi.Vector2u(words_of_state), slot, keep)
-                else:
-                    dr.scatter(
-                        store.mis_words,
-                        mi.Vector4u(words_of_state[4 * part : 4 * part + 4]),
-                        parts * slot + part,
-                        keep,
-                    )
+        state = visitor.arrive(state, at, active)
 
-        # ---- Go on: the next photon needs one more segment, and the camera one after it
+        # ---- Go on: the next surface needs one more segment, and the sensor one after it
         if dr.hint(max_depth > 0, mode="scalar"):
             active &= depth + 2 <= max_depth
-        bs, delta, weight, wo, active = scatter_light(traits, si, bsdf, rng, active)
-        if dr.hint(light_state is not None, mode="scalar"):
-            state = light_state.scatter(state, si, bsdf, bs.wo, active & ~delta)
-        flux *= weight
+        bs, delta, weight, wo, active = scatter_light(traits, si, at.bsdf, rng, active)
+        state = visitor.leave(state, at, bs.wo, delta, active)
         had_delta |= delta
         scattered |= ~delta
+        flux *= weight
         eta *= bs.eta
         ray = si.spawn_ray(wo)
-
         flux, active = russian_roulette(
             rng, flux, dr.max(flux) * strength, eta, depth >= rr_depth, active
         )
-
-    if dr.hint(light_state is not None, mode="scalar"):
-        return store.surface, store.power, store.count, store.mis_words
-    return store.surface, store.power, store.count
