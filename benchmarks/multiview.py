@@ -278,7 +278,7 @@ def invalid_shifts(path: Path, options: argparse.Namespace) -> list[Row]:
     return rows
 
 
-# --- Figure 3 ---------------------------------------------------------------------------------------------
+# --- Figure 3 -----------------------------------------------------------------
 
 
 def draw_densities(path: Path) -> None:

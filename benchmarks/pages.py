@@ -70,7 +70,7 @@ def chip(label: str, style: charts.Style) -> str:
     return f'<span class="chip" style="background:{charts.colour_name(style)}"></span>{html.escape(label)}'
 
 
-# --- Summary --------------------------------------------------------------------------------------------
+# --- Summary ------------------------------------------------------------------
 
 
 def summary(rows: Sequence[Row], failures: dict[str, dict[str, str]], what: str) -> str:
@@ -122,7 +122,7 @@ square error without the worst 0.1 % of the pixels; green: least error; red: mor
 {"".join(lines)}<tr class="total"><td>geometric mean</td><td></td><td></td>{total}</tr></table></div>"""
 
 
-# --- Scenes ---------------------------------------------------------------------------------------------
+# --- Scenes -------------------------------------------------------------------
 
 
 def pictures(measurement: Measurement, rows: Sequence[Row], folder: Path) -> str:
@@ -267,7 +267,7 @@ def variance(name: str, picture: Path) -> str:
     )
 
 
-# --- Several views --------------------------------------------------------------------------------------
+# --- Several views ------------------------------------------------------------
 
 
 def view_counts(rows: Sequence[Row], races: Mapping[str, Race], folder: Path) -> str:
@@ -326,7 +326,7 @@ def _view_cards(scene: str, race: Race, labels: Sequence[str], style, folder: Pa
     return "".join(cards)
 
 
-# --- Stability ------------------------------------------------------------------------------------------
+# --- Stability ----------------------------------------------------------------
 
 
 def choices(rows: Sequence[Row]) -> str:

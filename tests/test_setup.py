@@ -45,7 +45,7 @@ def library(root: Path, name: str, *links: str) -> Path:
     return file
 
 
-# --- Which LLVM -----------------------------------------------------------------------------------
+# --- Which LLVM ---------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -331,7 +331,7 @@ def test_tested_versions_are_printed(capsys):
     assert capsys.readouterr().out == f"{llvm.OLDEST_WORKING} {llvm.NEWEST_TESTED}\n"
 
 
-# --- Registration ---------------------------------------------------------------------------------
+# --- Registration -------------------------------------------------------------
 
 CHECK = """
 def check(variant):
@@ -367,7 +367,7 @@ def test_scalar_variant_says_what_the_plugins_need():
     assert "llvm_ad_*" in result.stderr.splitlines()[-1]
 
 
-# --- Newer versions -------------------------------------------------------------------------------
+# --- Newer versions -----------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -415,7 +415,7 @@ def test_newest_tested_versions_are_those_of_the_package():
         assert re.search(rf'"{name}>={major}\.{minor}\.\d+,<{major}\.{minor + 1}"', text), name
 
 
-# --- The package ----------------------------------------------------------------------------------
+# --- The package --------------------------------------------------------------
 
 
 def test_modules_that_define_plugin_classes_are_loaded_anew(rgb):

@@ -111,7 +111,7 @@ def closed_form(world):
     return dict(zip(world.families(), values))
 
 
-# ---------------------------------------------------------------- optimal weights of known worlds
+# --- optimal weights of known worlds ------------------------------------------
 
 
 def test_recursion(case):
@@ -247,7 +247,7 @@ def test_drjit_arrays(case, local, rgb):
     assert distance(weights, expected) < 1e-5  # fused multiply-adds round otherwise
 
 
-# ---------------------------------------------------------------- extreme worlds
+# --- extreme worlds -----------------------------------------------------------
 
 
 @pytest.mark.parametrize("K", [2, 3, 4, 5])
@@ -310,7 +310,7 @@ def test_few_photons(K):
     assert all(np.allclose(weights[l, l - 1], 1, atol=1e-6) for l in range(2, K))
 
 
-# ---------------------------------------------------------------- any input
+# --- any input ----------------------------------------------------------------
 
 values = st.one_of(st.just(0.0), st.floats(1e-12, 1e6))
 factors = st.one_of(st.just(0.0), st.floats(1e-3, 1e3))
@@ -392,7 +392,7 @@ def test_responses():
     assert np.allclose(recursion.kernel_rest(r, f), [1, 0, 1e-12, 0], rtol=1e-6, atol=0)
 
 
-# ---------------------------------------------------------------- heuristics
+# --- heuristics ---------------------------------------------------------------
 
 
 @given(st.lists(st.floats(-13, 13), min_size=1, max_size=6), st.sampled_from([1, 2, 3, 1.5]))

@@ -56,7 +56,7 @@ def exact_divisor():
     return truth() ** 2 + RELATIVE_OFFSET
 
 
-# --- Metrics --------------------------------------------------------------------------------------------
+# --- Metrics ------------------------------------------------------------------
 
 
 def test_squared_error_is_free_of_the_references_noise():
@@ -153,7 +153,7 @@ def test_flip():
     assert little == pytest.approx(little_map.mean(), rel=1e-4)
 
 
-# --- Confidence -----------------------------------------------------------------------------------------
+# --- Confidence ---------------------------------------------------------------
 
 
 def covered(trials, make, true):

@@ -88,7 +88,7 @@ def use(monkeypatch):
     return use
 
 
-# --- What is written ------------------------------------------------------------------------------
+# --- What is written ----------------------------------------------------------
 
 
 def test_image_metadata_and_preview(scene, tmp_path):
@@ -205,7 +205,7 @@ def test_preview_of_luminance_and_of_spectral_bands(tmp_path, rgb):
     assert not output.write_png(tmp_path / "bands.png", image, ["S400"])
 
 
-# --- Which integrator, which sensor ---------------------------------------------------------------
+# --- Which integrator, which sensor -------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -279,7 +279,7 @@ def test_sensor_is_chosen(scene, tmp_path):
     assert read(tmp_path / "a.exr")[1]["R"].shape == (6, 5)
 
 
-# --- How much is rendered -------------------------------------------------------------------------
+# --- How much is rendered -----------------------------------------------------
 
 
 def test_passes_are_independent_and_add_up(scene, monkeypatch):
@@ -413,7 +413,7 @@ def test_why_bdpm_auto_chose_is_said(scene, tmp_path, capsys):
     assert capsys.readouterr() == ("", "")
 
 
-# --- Errors ---------------------------------------------------------------------------------------
+# --- Errors -------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -547,7 +547,7 @@ def test_picture_that_cannot_be_written_is_named(scene, tmp_path, use, capsys):
     assert read(tmp_path / "a.exr")[0]["iterations"] == 5
 
 
-# --- Ctrl-C ---------------------------------------------------------------------------------------
+# --- Ctrl-C -------------------------------------------------------------------
 
 
 def test_interrupt_writes_what_there_is(scene, tmp_path, use, capsys):

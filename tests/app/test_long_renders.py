@@ -29,7 +29,7 @@ def scene(tmp_path, rgb) -> Path:
     return write_scene(tmp_path)
 
 
-# --- Sums and iterations ----------------------------------------------------------------------------
+# --- Sums and iterations ------------------------------------------------------
 
 
 def test_iterations_are_a_set():
@@ -73,7 +73,7 @@ def test_sums_are_merged_once():
     np.testing.assert_array_equal(sums["total"], 2)
 
 
-# --- What a scene consists of -------------------------------------------------------------------------
+# --- What a scene consists of -------------------------------------------------
 
 
 @pytest.mark.parametrize("comment", ["<!-- one -->", "<!-- a -- b, value='none.ply' -->"])
@@ -93,7 +93,7 @@ def test_scene_that_only_mitsuba_takes_has_its_digests(tmp_path, rgb, comment):
     assert sorted(digests) == sorted([f"{tmp_path}/it's & co.bmp", "scene.xml"])
 
 
-# --- Resuming ---------------------------------------------------------------------------------------
+# --- Resuming -----------------------------------------------------------------
 
 PLUGINS = {
     "bdpm_opt3": {"mix_diffuse": True, "variance": True},
@@ -354,7 +354,7 @@ def test_sigterm_is_like_ctrl_c(scene, tmp_path):
     )
 
 
-# --- What is refused --------------------------------------------------------------------------------
+# --- What is refused ----------------------------------------------------------
 
 
 @pytest.fixture
@@ -442,7 +442,7 @@ def test_damage_is_found(kept, tmp_path, scene, capsys):
     assert "damaged" in error and error.count("\n") == 1
 
 
-# --- Disks that are full ----------------------------------------------------------------------------
+# --- Disks that are full ------------------------------------------------------
 
 
 def test_full_disk_leaves_the_checkpoint_and_the_image_before(scene, tmp_path):
@@ -520,7 +520,7 @@ def test_png_that_is_cut_short_is_an_error(tmp_path, rgb, monkeypatch):
     assert (tmp_path / "a.png").read_bytes() == before
 
 
-# --- Preview ----------------------------------------------------------------------------------------
+# --- Preview ------------------------------------------------------------------
 
 
 def test_preview_is_a_whole_picture_at_any_moment(scene, tmp_path, monkeypatch):
@@ -554,7 +554,7 @@ def test_preview_is_a_whole_picture_at_any_moment(scene, tmp_path, monkeypatch):
     assert sorted(file.name for file in tmp_path.glob("a.*")) == ["a.exr", "a.png"]
 
 
-# --- Target error -----------------------------------------------------------------------------------
+# --- Target error -------------------------------------------------------------
 
 
 def test_relative_error_of_known_noise():
@@ -637,7 +637,7 @@ def test_target_error_stops_the_render(scene, tmp_path, capsys):
     assert read(tmp_path / "a.exr")[0]["relativeError"] <= 0.2
 
 
-# --- Memory -----------------------------------------------------------------------------------------
+# --- Memory -------------------------------------------------------------------
 
 MEMORY = """
 import sys, mis_integrators, mitsuba as mi

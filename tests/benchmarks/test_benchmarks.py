@@ -24,7 +24,7 @@ def points(*errors, off=()):
     return [Point(2.0**i, error, 0.2 if i in off else 0.0, 0.001) for i, error in enumerate(errors)]
 
 
-# --- Analysis -------------------------------------------------------------------------------------------
+# --- Analysis -----------------------------------------------------------------
 
 
 def test_front():
@@ -90,7 +90,7 @@ def test_method_keeps_its_style():
     assert len({(s.colour, s.marker) for s in many.values()}) == len(many)
 
 
-# --- Regressions ----------------------------------------------------------------------------------------
+# --- Regressions --------------------------------------------------------------
 
 
 def row(method, ratio, error=0.01, seeds=6):
@@ -199,7 +199,7 @@ def test_radius_for_a_number_of_photons(module):
     )
 
 
-# --- The commands ---------------------------------------------------------------------------------------
+# --- The commands -------------------------------------------------------------
 
 
 def test_bundled_scenes_are_as_frozen(module, monkeypatch, tmp_path, capsys):

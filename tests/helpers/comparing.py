@@ -36,7 +36,7 @@ WHOLE, BLOCK = 0.01, 0.03
 """Relative errors that a comparison must see, over the whole image and in a block."""
 
 
-# --- Distributions (no SciPy) -----------------------------------------------------------------------
+# --- Distributions (no SciPy) -------------------------------------------------
 
 
 def chi2_tail(x: float, freedom: int) -> float:
@@ -73,7 +73,7 @@ def sidak(false_alarm: float, tests: int) -> float:
     return -math.expm1(math.log1p(-false_alarm) / tests)
 
 
-# --- Batches ------------------------------------------------------------------------------------------
+# --- Batches ------------------------------------------------------------------
 
 
 def block_means(image: np.ndarray, blocks: int) -> np.ndarray:
@@ -199,7 +199,7 @@ def assert_same(a: Estimate, b: Estimate, whole=WHOLE, block=BLOCK, slack=1e-5):
     assert_powerful(a, b, whole, block)
 
 
-# --- Renders ------------------------------------------------------------------------------------------
+# --- Renders ------------------------------------------------------------------
 
 
 def render_batches(

@@ -78,7 +78,7 @@ def series(first, ratio, count):
     )
 
 
-# --- Point light in the middle of a diffuse sphere -----------------------------------------------------
+# --- Point light in the middle of a diffuse sphere ----------------------------
 
 
 @pytest.mark.thinned(4, 2)
@@ -164,7 +164,7 @@ def test_roulette_in_sphere(rgb, bdd, rr_depth):
     assert_value(scene, bdpm(bdd=bdd, rr_depth=rr_depth), series(0.8 / np.pi, 0.8, None))
 
 
-# --- Furnaces ---------------------------------------------------------------------------------------------
+# --- Furnaces -----------------------------------------------------------------
 
 
 @pytest.mark.thinned(4, 2)
@@ -226,7 +226,7 @@ def test_white_furnace(rgb, bdd, material):
     assert_value(scene, bdpm(bdd=bdd, rr_depth=20), 0.8)
 
 
-# --- Direct light and one bounce ----------------------------------------------------------------------------
+# --- Direct light and one bounce ----------------------------------------------
 
 
 def floor_from_above(half, size=16, reflectance=0.5, **entries):
@@ -281,7 +281,7 @@ def test_irradiance_of_area_light(rgb, shape):
     assert_value(scene, bdpm(bdd=0), 0.5 * 3 * sine2, block=0.02)
 
 
-# --- Caustics ---------------------------------------------------------------------------------------------------
+# --- Caustics -----------------------------------------------------------------
 
 
 def point_irradiance(height, x, y):
@@ -376,7 +376,7 @@ def test_light_through_mask(rgb, bdd):
     assert_value(scene, bdpm(bdd=bdd, max_depth=3), 0.5 / np.pi * 2 * 0.7)
 
 
-# --- What is not there ------------------------------------------------------------------------------------------
+# --- What is not there --------------------------------------------------------
 
 
 @pytest.mark.parametrize("bdd", [0, 1])

@@ -52,7 +52,7 @@ class Unidirectional:
         return PathSession(self.parameters, scene, scene.sensors()[sensor], seed, None)
 
 
-# --- What the choice rests on ----------------------------------------------------------------------------
+# --- What the choice rests on -------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -156,7 +156,7 @@ def test_prices(rgb):
     )
 
 
-# --- The choice ------------------------------------------------------------------------------------------
+# --- The choice ---------------------------------------------------------------
 
 
 def test_what_needs_no_photons(rgb):
@@ -354,7 +354,7 @@ def test_prediction_is_checked(rgb):
     assert 0.5 < predicted / measured < 2
 
 
-# --- The image -------------------------------------------------------------------------------------------
+# --- The image ----------------------------------------------------------------
 
 
 @pytest.mark.parametrize("variant_name", [RGB, MONO])

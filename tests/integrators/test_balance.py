@@ -38,7 +38,7 @@ def balance(**parameters):
     )
 
 
-# --- One weight function ------------------------------------------------------------------------------
+# --- One weight function ------------------------------------------------------
 
 
 def room(bsdf, light):
@@ -305,7 +305,7 @@ def test_weights_are_veachs(rgb, light, bsdf, beta):
         assert np.allclose(np.array(mine)[valid], truth, atol=2e-4)
 
 
-# --- Emitters -----------------------------------------------------------------------------------------
+# --- Emitters -----------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -364,7 +364,7 @@ def test_emission_ratio(rgb, emitter):
     assert (np.abs(found - expected) < 3e-3 * expected).mean() > 0.995
 
 
-# --- Renders ------------------------------------------------------------------------------------------
+# --- Renders ------------------------------------------------------------------
 
 RENDERS = [
     (RGB, "smooth0", "rectangle", 3, 1.0),
@@ -466,7 +466,7 @@ def test_agrees_with_one_strategy(rgb, strategies, beta):
     assert_same(*collect_until(*sides, whole=0.015, block=0.06, most=600), whole=0.015, block=0.06)
 
 
-# --- Plugin -------------------------------------------------------------------------------------------
+# --- Plugin -------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

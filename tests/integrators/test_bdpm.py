@@ -104,7 +104,7 @@ def last_words(error):
     return str(error).strip().splitlines()[-1]
 
 
-# --- Strategies and bias ---------------------------------------------------------------------------------
+# --- Strategies and bias ------------------------------------------------------
 
 
 @pytest.mark.parametrize("first, second", [(0, 1), (1, 2), (2, 3)])
@@ -188,7 +188,7 @@ def test_alpha_leaves_the_mean(rgb):
     )
 
 
-# --- Seeds ------------------------------------------------------------------------------------------------
+# --- Seeds --------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("bdd", [0, 1])
@@ -265,7 +265,7 @@ def test_error_falls_with_iterations(rgb):
     assert 1.6 < ratio < 10, ratio  # 24 seeds, 5 regions: a factor 2.5 is 4 sigma
 
 
-# --- Variance AOV -------------------------------------------------------------------------------------------
+# --- Variance AOV -------------------------------------------------------------
 
 
 @pytest.mark.parametrize("rfilter", ["box", pytest.param("gaussian", marks=pytest.mark.full)])
@@ -313,7 +313,7 @@ def test_variance_needs_two_iterations(rgb):
     )
 
 
-# --- Film -------------------------------------------------------------------------------------------------------
+# --- Film ---------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("rfilter", ["box", "gaussian"])
@@ -435,7 +435,7 @@ def test_hidden_emitters(rgb, hide, bdd):
     agree(bdpm(bdd=bdd, hide_emitters=hide), path(hide_emitters=hide), scene, blocks=2)
 
 
-# --- Limits --------------------------------------------------------------------------------------------------------
+# --- Limits -------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("scene", ["nothing", "no emitters", "black emitter"])
@@ -552,7 +552,7 @@ def test_rounding_up_is_said_once(rgb):
         logger.remove_appender(listener)
 
 
-# --- Buffers ----------------------------------------------------------------------------------------------------------
+# --- Buffers ------------------------------------------------------------------
 
 
 def with_capacity(scene, photons=None, vertices=None, **parameters):
@@ -638,7 +638,7 @@ def test_camera_pass_in_parts(rgb, monkeypatch, chunk):
     np.testing.assert_allclose(with_capacity(scene), whole, rtol=1e-3, atol=1e-6)
 
 
-# --- Surfaces that photons must not pass ---------------------------------------------------------------------------------
+# --- Surfaces that photons must not pass --------------------------------------
 
 
 def two_sided(*bsdfs):
@@ -887,7 +887,7 @@ def test_rare_photons_get_no_smallest_radius(rgb):
     assert session.radii["indirect"] == pytest.approx(0.16)
 
 
-# --- Camera paths of an iteration ------------------------------------------------------------------------
+# --- Camera paths of an iteration ---------------------------------------------
 
 
 def made_up_pilot(scene, direct_noise, shared=True):
@@ -1012,7 +1012,7 @@ def test_a_timed_render_chooses_its_camera_paths(rgb, monkeypatch):
     assert (counted.iterations_planned, counted.settings["camera_paths"]) == (4, 1)
 
 
-# --- Errors ---------------------------------------------------------------------------------------------------------------
+# --- Errors -------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -1172,7 +1172,7 @@ def test_missing_sensor(rgb):
         bdpm().render(box_scene(8), sensor=3, spp=1)
 
 
-# --- Variants ----------------------------------------------------------------------------------------------------------------
+# --- Variants -----------------------------------------------------------------
 
 
 def test_every_variant_renders(variant):
@@ -1270,7 +1270,7 @@ def test_alpha_at_the_last_depth(rgb, max_depth):
         assert abs(ours.mean() - theirs.mean()) < 0.01
 
 
-# --- Set-up ----------------------------------------------------------------------------------------------
+# --- Set-up -------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("changed", [False, True], ids=["kept", "changed"])

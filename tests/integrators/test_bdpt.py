@@ -60,7 +60,7 @@ def bdpt(**parameters):
     return mi.load_dict({"type": "bdpt", "max_depth": 4, "camera_paths": 8, **parameters})
 
 
-# --- One weight function ---------------------------------------------------------------------------------
+# --- One weight function ------------------------------------------------------
 
 
 def room(bsdf, light, sensor="perspective"):
@@ -409,7 +409,7 @@ def test_states_of_traced_subpaths(rgb, kind):
         assert np.mean(np.abs(ratio - 1) < 2e-3) > 0.98, np.sort(ratio)
 
 
-# --- Each technique alone --------------------------------------------------------------------------------
+# --- Each technique alone -----------------------------------------------------
 
 
 def technique_estimates(scene, integrator, batches, blocks=1):
@@ -546,7 +546,7 @@ def test_pyramid_adds_up(rgb):
     ]
 
 
-# --- Images -----------------------------------------------------------------------------------------------
+# --- Images -------------------------------------------------------------------
 
 # emitter, family, sensor, variant, filter
 DEFAULT = [
@@ -677,7 +677,7 @@ def test_shading_normals_seen_from_the_light(rgb, tilt):
         assert 6 * np.sqrt(estimates[other].error2[0].max()) < 0.1 * first.mean[0].max()
 
 
-# --- Film ----------------------------------------------------------------------------------------------------
+# --- Film ---------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("rfilter, border", [("gaussian", False), ("mitchell", True)])
@@ -838,7 +838,7 @@ def test_roulette_and_unlimited_depth_leave_the_mean(rgb):
         assert_same(*collect_until(batches, exact, 0.01, 0.03), 0.01, 0.03, 1e-4)
 
 
-# --- Seeds and buffers -----------------------------------------------------------------------------------
+# --- Seeds and buffers --------------------------------------------------------
 
 
 def render(scene, seed=0, spp=8, **parameters):
@@ -921,7 +921,7 @@ def test_variance_is_that_of_the_mean(rgb):
     assert estimated == pytest.approx(empirical, rel=0.2)
 
 
-# --- Parameters -----------------------------------------------------------------------------------------------
+# --- Parameters ---------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

@@ -52,7 +52,7 @@ def plugin(name, **parameters):
     return mi.load_dict({"type": name, "max_depth": 4, "camera_paths": 4, **parameters})
 
 
-# --- One weight function ---------------------------------------------------------------------------------
+# --- One weight function ------------------------------------------------------
 
 
 class ResampledPaths(JointPaths):
@@ -320,7 +320,7 @@ def test_guessed_weight_is_the_weight_where_nothing_is_guessed(rgb):
     assert 0.01 < np.mean(exact[first]) < 0.99 and set(vertices[first]) == {3}
 
 
-# --- Images ------------------------------------------------------------------------------------------------
+# --- Images -------------------------------------------------------------------
 
 
 def assert_value(integrator, scene, value, whole=0.01):
@@ -453,7 +453,7 @@ def test_bundled_scenes(rgb, scene):
     assert_same(*collect_until(a, b, 0.03, 0.08, most=1000), 0.03, 0.08)
 
 
-# --- Where resampling could fail ----------------------------------------------------------------------------
+# --- Where resampling could fail ----------------------------------------------
 
 
 def test_nothing_is_visible(rgb):
@@ -557,7 +557,7 @@ def test_dark_and_short(rgb, parameters):
     np.testing.assert_allclose(*[x.mean(axis=(0, 1)) for x in images], rtol=0.03)
 
 
-# --- Which camera vertices draw -----------------------------------------------------------------------------
+# --- Which camera vertices draw -----------------------------------------------
 
 
 def test_slight_vertices_are_thinned_out(rgb):
@@ -618,7 +618,7 @@ def test_slight_vertices_are_thinned_out(rgb):
     assert abs(mean - 1) < 5 * error and error < 0.1
 
 
-# --- Repeatability, memory, parameters ----------------------------------------------------------------------
+# --- Repeatability, memory, parameters ----------------------------------------
 
 
 def test_same_seed_same_image(rgb):
@@ -753,7 +753,7 @@ def test_pilot_sees_all_of_the_film(rgb, monkeypatch):
     assert apart < np.sqrt(-np.log(1e-6 / 2) / 2 * (1 / len(a) + 1 / len(b)))
 
 
-# --- How many light sub-paths -------------------------------------------------------------------------------
+# --- How many light sub-paths -------------------------------------------------
 
 
 def test_best_ratio_is_the_best():

@@ -45,7 +45,7 @@ at such a radius may take from shapes' edges."""
 DEPTH, MOST = 4, 480
 
 
-# --- Random scenes ------------------------------------------------------------------------------------
+# --- Random scenes ------------------------------------------------------------
 
 
 def compare(scene, plugin, whole):
@@ -141,7 +141,7 @@ def test_many_random_scenes(rgb, plugin):
     assert np.quantile(visible, 0.25) < 0.1
 
 
-# --- Random parameters --------------------------------------------------------------------------------
+# --- Random parameters --------------------------------------------------------
 
 PARAMETERS = """
 import json, random, sys
@@ -218,7 +218,7 @@ def test_many_random_parameters(seed):
     assert counts["rendered"] == 60
 
 
-# --- One process --------------------------------------------------------------------------------------
+# --- One process --------------------------------------------------------------
 
 
 def small_world(radiance=3.0):

@@ -96,7 +96,7 @@ def random_world(seed, K, states=None, n_F=None, N_B=None, spread=1.2, zeros=0.0
     )
 
 
-# ---------------------------------------------------------------- noise, and its minimum by brute force
+# --- noise, and its minimum by brute force ------------------------------------
 
 
 def residuals(world, weights):
@@ -190,7 +190,7 @@ def brute_force(world):
     return _unpack(world, x / size)
 
 
-# ---------------------------------------------------------------- the recursion on a world
+# --- the recursion on a world -------------------------------------------------
 
 
 def on_numpy(function, *arguments):

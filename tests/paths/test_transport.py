@@ -26,7 +26,7 @@ def _rgb(rgb):
     pass
 
 
-# --- Photon map -------------------------------------------------------------------------------------------
+# --- Photon map ---------------------------------------------------------------
 
 
 def test_kernels_do_not_know_where_numpy_keeps_numbers():
@@ -222,7 +222,7 @@ def test_map_finds_everything(seed, n, radius, offset):
     assert (number <= (distances < radius * (1 + 1e-4)).sum(axis=1)).all()
 
 
-# --- Packing ------------------------------------------------------------------------------------------------
+# --- Packing ------------------------------------------------------------------
 
 unit_vectors = (
     st.tuples(*[st.floats(-1, 1)] * 3)
@@ -263,7 +263,7 @@ def test_float_bits_round_trip(x):
     assert float(packing.bits_float(packing.float_bits(mi.Float(x)))[0]) == np.float32(x)
 
 
-# --- Random numbers ---------------------------------------------------------------------------------------------
+# --- Random numbers -----------------------------------------------------------
 
 
 def test_streams_are_uniform_and_differ():
@@ -289,7 +289,7 @@ def test_seeds_of_purposes_differ():
     assert len(words) == 20 * 50 * 3
 
 
-# --- Light sub-paths ----------------------------------------------------------------------------------------------
+# --- Light sub-paths ----------------------------------------------------------
 
 
 def emission(scene, count=1 << 18, seed=7):
@@ -491,7 +491,7 @@ def test_spectral_suns_are_chosen_by_their_light():
     assert chosen[1] == pytest.approx(chosen[0], rel=0.1)
 
 
-# --- Direct light ---------------------------------------------------------------------------------------------------
+# --- Direct light -------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -577,7 +577,7 @@ def test_weights_sum_to_one(a, b):
         assert weights[0] == pytest.approx(a * a / (a * a + b * b), rel=1e-3)
 
 
-# --- Environments ---------------------------------------------------------------------------------------------------------
+# --- Environments -------------------------------------------------------------
 
 
 def test_direction_cells():

@@ -88,7 +88,7 @@ def reference(g):
     return oracle.estimate()
 
 
-# --- One view ------------------------------------------------------------------------------------------------
+# --- One view -----------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -153,7 +153,7 @@ def test_transmittance(rgb, scale):
     assert abs(value.mean() - exact) < 5 * value.std() / np.sqrt(n) < 0.03 * exact  # 6e-7
 
 
-# --- Several views ---------------------------------------------------------------------------------------------
+# --- Several views ------------------------------------------------------------
 
 
 @pytest.mark.parametrize("shift", SHIFTS)
@@ -300,7 +300,7 @@ def test_views_without_overlap(rgb):
     )  # variances of `count` batches, of some four independent blocks
 
 
-# --- What can go wrong -----------------------------------------------------------------------------------------
+# --- What can go wrong --------------------------------------------------------
 
 
 def test_hostile_views(rgb):
@@ -483,7 +483,7 @@ def test_views_on_both_sides_of_a_surface(rgb):
     assert together.statistics["reached"] > 0.1 * together.statistics["tried"]
 
 
-# --- Films ------------------------------------------------------------------------------------------------------
+# --- Films --------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -566,7 +566,7 @@ def test_variance(rgb):
         )  # twelve iterations; the mean is over 1500 values of 40 renders each
 
 
-# --- Sessions ---------------------------------------------------------------------------------------------------
+# --- Sessions -----------------------------------------------------------------
 
 
 def test_seeds_and_parts(rgb, monkeypatch):
@@ -759,7 +759,7 @@ def test_little_light(rgb, depth, lit):
     ) == (lit and depth == 1)
 
 
-# --- Errors -----------------------------------------------------------------------------------------------------
+# --- Errors -------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -798,7 +798,7 @@ def test_scenes_refused(rgb):
     refused(["at least two"], multiview(variance=True), s=view((0, 0, 4)))
 
 
-# --- The command ------------------------------------------------------------------------------------------------
+# --- The command --------------------------------------------------------------
 
 
 def test_command(rgb, tmp_path, capsys):

@@ -101,7 +101,7 @@ def on_arrays(segment, make):
     )
 
 
-# --- Known answers ------------------------------------------------------------------------------------
+# --- Known answers ------------------------------------------------------------
 
 
 def test_stretches(case):
@@ -157,7 +157,7 @@ def test_copies(name, seed):
             )
 
 
-# --- What every shift obeys -------------------------------------------------------------------------------
+# --- What every shift obeys ---------------------------------------------------
 
 
 def interior_points(segment, count, margin=0.02):

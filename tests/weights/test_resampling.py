@@ -107,7 +107,7 @@ def moment(world, g=None):
     )
 
 
-# ---------------------------------------------------------------- exact worlds
+# --- exact worlds -------------------------------------------------------------
 
 
 def test_variance_is_exact(world):
@@ -182,7 +182,7 @@ def test_drjit_arrays(world, rgb):
         assert float(dr.sum(probability)[0]) == pytest.approx(1, abs=1e-6)
 
 
-# ---------------------------------------------------------------- limits
+# --- limits -------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("S", [1, 2, 5])
