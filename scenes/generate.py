@@ -79,9 +79,8 @@ def water(size=1.15, n=136):
     """Height field y(x, z) on [-size, size]^2, normals up: six plane waves, normals from the exact
     derivative."""
     rng = np.random.default_rng(7)
-    x, z = np.meshgrid(
-        np.linspace(-size, size, n), np.linspace(-size, size, n), indexing="xy"
-    )  # rows along z
+    # rows along z
+    x, z = np.meshgrid(np.linspace(-size, size, n), np.linspace(-size, size, n), indexing="xy")
     y, dx, dz = np.zeros_like(x), np.zeros_like(x), np.zeros_like(x)
     for i in range(6):
         wavelength = 0.95 * 0.80**i
@@ -163,14 +162,14 @@ def vase(n=56, m=64, height=0.40):
 
     revolve(np.array([[0.0, 0.0], [outer[0, 0], 0.0]]), np.array([0.0, 0.0]))  # foot, looks down
     revolve(outer, t)
+    # rim
     revolve(
         np.stack([np.linspace(outer[-1, 0], inner[0, 0], 2), [height, height]], -1),
         np.array([1.0, 1.0]),
-    )  # rim
+    )
     revolve(inner, inner_t)
-    revolve(
-        np.array([[inner[-1, 0], inner[-1, 1]], [0.0, inner[-1, 1]]]), np.array([0.06, 0.06])
-    )  # inner floor, looks up
+    # inner floor, looks up
+    revolve(np.array([[inner[-1, 0], inner[-1, 1]], [0.0, inner[-1, 1]]]), np.array([0.06, 0.06]))
     triangles, points = np.concatenate(faces), np.concatenate(vertices)
     a, b, c = (points[triangles[:, i]] for i in range(3))
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
@@ -337,9 +336,8 @@ def sky(width=256, height=128):
     up = np.clip(d[..., 1], 0, 1)
     image = mix([1.05, 1.05, 1.0], [0.30, 0.52, 1.0], np.sqrt(up))
     image += np.exp(-angle / 18)[..., None] * np.array([1.6, 1.35, 1.0])
-    ground = np.radians(2.5) * (
-        1.2 + np.sin(3 * phi + 0.5) + 0.5 * np.sin(8 * phi + 2)
-    )  # height of the hills
+    # height of the hills
+    ground = np.radians(2.5) * (1.2 + np.sin(3 * phi + 0.5) + 0.5 * np.sin(8 * phi + 2))
     below = np.clip((ground - d[..., 1]) / 0.03, 0, 1)[..., None]
     depth = np.clip(-d[..., 1] / 0.25, 0, 1) * np.ones_like(phi)
     image = mix([0.20, 0.30, 0.24], [0.26, 0.28, 0.12], depth) * below + image * (1 - below)

@@ -112,9 +112,8 @@ def write(name, text, size, depth, parts):
 def smoke(n=24):
     """Density in [0, 1] on an n^3 grid: a plume that rises, widens and breaks up; wisps, and empty
     space around it."""
-    z, y, x = np.meshgrid(
-        *[(np.arange(n) + 0.5) / n] * 3, indexing="ij"
-    )  # rows of a volume: z, then y, then x
+    # rows of a volume: z, then y, then x
+    z, y, x = np.meshgrid(*[(np.arange(n) + 0.5) / n] * 3, indexing="ij")
     rng = np.random.default_rng(5)
     turbulence = np.zeros((n, n, n))
     for octave in range(4):

@@ -65,9 +65,8 @@ def test_squared_error_is_free_of_the_references_noise():
     found = errors(render(0), references())
     assert found.mse == pytest.approx(products.mean())
     assert abs(found.mse - (OFFSET**2 + NOISE**2)) < allowed
-    assert (
-        allowed < 0.2 * REFERENCE_NOISE**2
-    )  # else the noise of the references, left in, would pass
+    # else the noise of the references, left in, would pass
+    assert allowed < 0.2 * REFERENCE_NOISE**2
 
 
 def test_relative_squared_error():

@@ -103,9 +103,8 @@ def test_image_metadata_and_preview(scene, tmp_path):
     assert mi.__version__ in header["versions"] and header["renderTime"] > 0
     preview = np.array(mi.Bitmap(str(tmp_path / "new" / "a.png")))
     assert preview.shape == (8, 12, 3) and preview.dtype == np.uint8
-    np.testing.assert_allclose(
-        preview[0, 0], [137, 188, 255], atol=1
-    )  # the sRGB curve at 0.25, 0.5 and 1
+    # the sRGB curve at 0.25, 0.5 and 1
+    np.testing.assert_allclose(preview[0, 0], [137, 188, 255], atol=1)
     assert sorted(file.name for file in (tmp_path / "new").iterdir()) == ["a.exr", "a.png"]
 
 
@@ -615,9 +614,8 @@ def test_interrupted_process(scene, tmp_path):
         env={**os.environ, "PYTHONUNBUFFERED": "1"},
     )
     try:
-        assert (
-            "iteration" in process.stderr.readline()
-        )  # the first line of progress: an iteration is done
+        # the first line of progress: an iteration is done
+        assert "iteration" in process.stderr.readline()
         process.send_signal(signal.SIGINT)
         assert process.wait(timeout=30) == 130
         assert "interrupted after" in process.stderr.read().splitlines()[-1]

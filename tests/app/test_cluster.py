@@ -162,9 +162,8 @@ def test_error_of_a_worker_leaves_nothing_half_summed(scene, client, monkeypatch
 
     expected = ask([4])[0]["total"]
     with pytest.raises(Exception):
-        ask(
-            [3, -1]
-        )  # numpy refuses a negative seed, or the sums a negative iteration, after iteration 3 was summed
+        # numpy refuses a negative seed, or the sums a negative iteration, after iteration 3 was summed
+        ask([3, -1])
     arrays, done, _ = ask([4])
     assert done == Iterations(0, (4,))
     np.testing.assert_allclose(arrays["total"], expected, rtol=1e-4, atol=1e-6)
@@ -315,9 +314,8 @@ def test_stopped_worker_costs_its_iterations_only(scene, client, impatient):
         os.kill(pids[victim], signal.SIGCONT)
     assert session.sums.done == Iterations(60)
     assert same(whole.image(), session.image())
-    iterate_for(
-        session, 20, lambda: not session._watch.silent
-    )  # a worker that is heard of again counts again
+    # a worker that is heard of again counts again
+    iterate_for(session, 20, lambda: not session._watch.silent)
     assert set(session._watch.present) == set(pids)
 
 
@@ -491,9 +489,8 @@ def test_scene_that_a_worker_cannot_open_is_tried_once(scene, client):
 
 def test_iteration_that_fails_is_tried_once_more_elsewhere(scene, client, monkeypatch):
     session = cluster.DistributedSession(client, request_for(scene, "path", 8).open(), False, 1)
-    numbers = iter(
-        [[0], [1, -1], [2]]
-    )  # the sums refuse a negative iteration, or numpy such a seed
+    # the sums refuse a negative iteration, or numpy such a seed
+    numbers = iter([[0], [1, -1], [2]])
     monkeypatch.setattr(session, "_take_numbers", lambda workers: next(numbers, []))
     sent, send = [], session._send
     monkeypatch.setattr(
@@ -652,9 +649,8 @@ def test_overdue_batches_are_handed_to_others_and_duplicates_dropped(fakes):
     assert [future.key.partition(" ")[2] for future in again] == ["[1]", "[2]", "[3]", "[4]"]
     for future, first in zip(again, client.futures[1:5]):
         assert future.workers != first.workers and not first.released
-    client.futures[1].finish(
-        sums_of(1)
-    )  # the first copy comes after all, and so does the second, at the same time
+    # the first copy comes after all, and so does the second, at the same time
+    client.futures[1].finish(sums_of(1))
     again[0].finish(sums_of(1))
     again[1].finish(sums_of(2))  # of this one only the second comes in time
     iterate_for(session, 10, lambda: len(session.sums.done) == 3)

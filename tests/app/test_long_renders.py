@@ -216,9 +216,8 @@ def test_killed_process_resumes(scene, tmp_path, plugin):
     assert process.returncode == -signal.SIGKILL and not (tmp_path / "killed.exr").exists(), (
         "it was over before it was killed"
     )
-    leftover = output._temporary(
-        file
-    )  # what writers leave that were killed, of this version and of an earlier one
+    # what writers leave that were killed, of this version and of an earlier one
+    leftover = output._temporary(file)
     leftover.rename(leftover.with_name(leftover.name.replace(f"-{os.getpid()}-", "-999999999-")))
     (tmp_path / ".killed.checkpoint.123.part").touch()
     final = run(arguments)
@@ -459,9 +458,8 @@ def test_full_disk_leaves_the_checkpoint_and_the_image_before(scene, tmp_path):
     )
     assert limited.returncode == 3
     complaints = [line for line in limited.stderr.splitlines() if line.startswith("mis-render")]
-    assert [line.count("cannot write") for line in complaints] == [1, 1], (
-        limited.stderr
-    )  # each once: the checkpoint, the image
+    # each once: the checkpoint, the image
+    assert [line.count("cannot write") for line in complaints] == [1, 1], limited.stderr
     assert "a.checkpoint: File too large" in complaints[0] and "a.exr" in complaints[1]
     assert [file.read_bytes() for file in files] == before
     assert not list(tmp_path.glob(".*.part"))
@@ -533,10 +531,11 @@ def test_preview_is_a_whole_picture_at_any_moment(scene, tmp_path, monkeypatch):
         def watched():
             if (tmp_path / "a.preview.exr").exists():
                 header, image = read(tmp_path / "a.preview.exr")
+                # channels are sorted: B, G, R
                 assert (
                     same(image[..., ::-1], session.image())
                     and (tmp_path / "a.preview.png").exists()
-                )  # channels are sorted: B, G, R
+                )
                 seen.append(header["iterations"])
             plain()
 
@@ -631,9 +630,8 @@ def test_target_error_stops_the_render(scene, tmp_path, capsys):
     )
     assert read(tmp_path / "a.exr")[0]["iterations"] == 10
     assert "(target 0.001 not reached)" in capsys.readouterr().err
-    assert (
-        render(scene, "-o", tmp_path / "a.exr", "--target-error", 0.2, "--quiet") == 0
-    )  # path, in passes
+    # path, in passes
+    assert render(scene, "-o", tmp_path / "a.exr", "--target-error", 0.2, "--quiet") == 0
     assert read(tmp_path / "a.exr")[0]["relativeError"] <= 0.2
 
 

@@ -154,9 +154,8 @@ def world(sensor, medium=None, **objects):
     if medium is not None:
         scene["medium"] = container(medium)
     scene.update(objects)
-    first = {
-        name: scene.pop(name) for name in ("fog",) if name in scene
-    }  # media that others refer to
+    # media that others refer to
+    first = {name: scene.pop(name) for name in ("fog",) if name in scene}
     return mi.load_dict(
         {"type": "scene"}
         | first

@@ -137,9 +137,8 @@ def test_point_in_sphere_in_every_variant(variant):
     ).mean(axis=(0, 1))
     assert image.shape == (3,)
     luminance = np.array([0.2126, 0.7152, 0.0722])
-    assert image @ luminance == pytest.approx(
-        direct @ luminance, rel=0.05
-    )  # 5 sigma: see test_spectral_colour in test_bdpm.py
+    # 5 sigma: see test_spectral_colour in test_bdpm.py
+    assert image @ luminance == pytest.approx(direct @ luminance, rel=0.05)
 
 
 @BDD
@@ -292,9 +291,8 @@ def block_average(function, half, blocks):
     """Averages of a function of (x, y) over the blocks of the image of `floor_from_above`."""
     n = 64
     grid = (np.arange(blocks * n) + 0.5) / (blocks * n) * 2 * half - half
-    x, y = np.meshgrid(
-        -grid, -grid
-    )  # the camera looks down: signs do not matter to symmetric functions
+    # the camera looks down: signs do not matter to symmetric functions
+    x, y = np.meshgrid(-grid, -grid)
     return function(x, y).reshape(blocks, n, blocks, n).mean(axis=(1, 3)).ravel()
 
 

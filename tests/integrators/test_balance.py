@@ -89,9 +89,8 @@ class JointPaths:
                 self.light, value, _ = self.lights.sample_direct(si, rng, self.valid)
                 self.valid &= dr.max(value) > 0
                 bs.wo = si.to_local(self.light.d)
-            towards = dr.normalize(
-                unpack_direction(pack_direction(si.to_world(bs.wo)))
-            )  # as photons remember it
+            # as photons remember it
+            towards = dr.normalize(unpack_direction(pack_direction(si.to_world(bs.wo))))
             if number < length - 1:
                 bs.wo = si.to_local(towards)
             dr.eval(ray, hit, si, bs, rng, self.valid)
@@ -120,9 +119,8 @@ class JointPaths:
             return sampled, sampled
         lamp = self.scene.ray_intersect(si.spawn_ray(self.light.d))
         self.valid &= lamp.emitter(self.scene) == self.light.emitter
-        lamp.p = (
-            self.light.p
-        )  # the ray starts a bit off the surface, and may even miss the lamp's edge
+        # the ray starts a bit off the surface, and may even miss the lamp's edge
+        lamp.p = self.light.p
         met = mi.DirectionSample3f(self.scene, lamp, mi.Interaction3f(si))
         return sampled, weights.direct_share(left[-1], mi.Interaction3f(si), met, self.valid)
 

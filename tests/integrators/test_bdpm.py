@@ -240,15 +240,13 @@ def test_seeds_and_iterations_are_uncorrelated(rgb):
     images = [render(scene, seed, 1).mean(axis=2) for seed in (0, 1, 2, 3)]
     images += [picture.mean(axis=2) for picture in pictures(session, 3)]
     noise = [(i - mean).ravel() for i in images[:3]] + [(i - mean).ravel() for i in images[4:]]
-    noise = [
-        np.clip(n, *np.quantile(n, [0.02, 0.98])) for n in noise
-    ]  # a caustic's fireflies would be all that counts
+    # a caustic's fireflies would be all that counts
+    noise = [np.clip(n, *np.quantile(n, [0.02, 0.98])) for n in noise]
     table = np.corrcoef(noise) - np.eye(len(noise))
     assert np.abs(table).max() < 0.2, table.round(2)
     assert not np.array_equal(images[0], images[1])
-    np.testing.assert_allclose(
-        images[3], images[4], rtol=1e-3, atol=1e-6
-    )  # seed 3 is the session's
+    # seed 3 is the session's
+    np.testing.assert_allclose(images[3], images[4], rtol=1e-3, atol=1e-6)
 
 
 def test_error_falls_with_iterations(rgb):
@@ -401,9 +399,8 @@ def test_alpha_channel_is_that_of_path(rgb):
             for i in (bdpm(hide_emitters=hide), path(hide_emitters=hide))
         ]
         assert images[0].shape == (24, 24, 4)
-        np.testing.assert_allclose(
-            images[0][..., 3], images[1][..., 3], atol=0.2
-        )  # 256 samples: 5 sigma is 0.16
+        # 256 samples: 5 sigma is 0.16
+        np.testing.assert_allclose(images[0][..., 3], images[1][..., 3], atol=0.2)
         assert np.abs(images[0][..., 3] - images[1][..., 3]).mean() < 0.02
         np.testing.assert_allclose(
             images[0].mean(axis=(0, 1)), images[1].mean(axis=(0, 1)), rtol=0.03
@@ -690,6 +687,7 @@ def test_no_light_leaks_through_a_wall(rgb, thickness, bdd):
 def test_no_light_leaks_around_a_corner(rgb):
     """A wall that the light only grazes from its front does not catch the photons of a bright floor
     beside it."""
+    # the wall's front looks away from the lamp
     scene = mi.load_dict(
         {
             "type": "scene",
@@ -711,7 +709,7 @@ def test_no_light_leaks_around_a_corner(rgb):
                 "film": film(16),
             },
         }
-    )  # the wall's front looks away from the lamp
+    )
     assert render(scene, bdd=0, initial_radius=0.3, spp=32).max() == 0
 
 
@@ -841,9 +839,8 @@ def test_a_camera_that_sees_one_point(rgb):
     a.add(150)
     b.add(16)
     assert smallest_visible(a.estimate(), b.estimate())[0] < 0.25, "test too weak"
-    assert not differences(
-        a.estimate(), b.estimate(), slack=0.05
-    )  # a disk around one point is as wrong as its light is curved
+    # a disk around one point is as wrong as its light is curved
+    assert not differences(a.estimate(), b.estimate(), slack=0.05)
     assert a.session.radii["indirect"] > 0.03
 
 

@@ -342,9 +342,8 @@ def test_weights_sum_to_one(rgb, bsdf, light, sensor, length, beta, eta):
     assert len(total) > 100
     assert np.mean(np.abs(total - 1) < 2e-3) > 0.995, np.sort(np.abs(total - 1))[-20:]
     smooth = [s for s, w in by_technique.items() if w.max() > 1e-3]
-    assert set(smooth) == set(by_technique) - (
-        {0} if light in ("point", "spot") else set()
-    )  # each of them counts somewhere
+    # each of them counts somewhere
+    assert set(smooth) == set(by_technique) - ({0} if light in ("point", "spot") else set())
 
 
 @pytest.mark.parametrize("kind", ["camera", "light"])

@@ -169,9 +169,8 @@ class ResampledPaths(JointPaths):
         self.light, self.brought = self.lights.emitted(
             last, self.light.emitter, place, self.light.n, self.light.uv, self.valid
         )
-        self.valid &= (dr.max(self.brought) > 0) & (
-            self.light.dist > 1e-2
-        )  # not of a vertex on the lamp itself
+        # not of a vertex on the lamp itself
+        self.valid &= (dr.max(self.brought) > 0) & (self.light.dist > 1e-2)
         camera, camera_slots, left, density, parent = self.camera_buffer(weights)
         light, light_slots = self.light_buffer(weights)
         delta = [np.array(v[-1]) for v in self.vertices]
@@ -291,9 +290,8 @@ def test_weights_sum_to_one(rgb, name, bsdf, light, sensor, length, parameters):
         np.sort(np.abs(total - 1))[-20:]
     )
     smooth = {s for s, w in by_technique.items() if w.max() > 1e-3}
-    assert smooth == set(by_technique) - (
-        {0} if light in ("point", "spot") else set()
-    )  # each of them counts somewhere
+    # each of them counts somewhere
+    assert smooth == set(by_technique) - ({0} if light in ("point", "spot") else set())
 
 
 def test_guessed_weight_is_the_weight_where_nothing_is_guessed(rgb):
@@ -487,9 +485,8 @@ def test_nothing_is_visible(rgb):
         session = plugin(name).session(scene, 0, 1, 0)
         session.iterate()
         session.iterate()
-        assert np.all(
-            (session.image() >= 0) & (session.image() < 1e-4)
-        )  # rays start a little beside their surface
+        # rays start a little beside their surface
+        assert np.all((session.image() >= 0) & (session.image() < 1e-4))
         assert all(np.isfinite(np.array(x)).all() for x in (session.records, session.shares))
 
 
@@ -629,10 +626,11 @@ def test_same_seed_same_image(rgb):
     means = [[picture.mean() for picture in pictures(session, 30)] for session in sessions]
     np.testing.assert_allclose(sessions[0].image(), sessions[1].image(), rtol=1e-4, atol=1e-6)
     same, other = np.array(means[0]), np.array(means[2])
+    # 1e-6 for 30 pairs
     assert (
         abs(np.corrcoef(same, other)[0, 1]) < 0.75
         and abs(np.corrcoef(same[1:], same[:-1])[0, 1]) < 0.75
-    )  # 1e-6 for 30 pairs
+    )
 
 
 @pytest.mark.parametrize("light_paths", [30, 300])
@@ -844,9 +842,8 @@ def test_light_tracing_does_not_follow_the_parts(rgb, monkeypatch):
         for session in sessions:
             session.start()
         chosen.append(np.log([session.light_tracing for session in sessions]))
-    assert (
-        session.chunks == 3 and abs(np.mean(chosen[0]) - np.mean(chosen[1])) < 0.3
-    )  # log(sqrt(3)) = 0.55
+    # log(sqrt(3)) = 0.55
+    assert session.chunks == 3 and abs(np.mean(chosen[0]) - np.mean(chosen[1])) < 0.3
 
 
 @pytest.mark.parametrize("ratio", [0.125, 8])

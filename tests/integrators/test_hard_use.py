@@ -199,9 +199,8 @@ def random_parameters(seed, tries, renders, timeout):
         env={**os.environ, "PYTHONPATH": str(ROOT)},
     )
     assert result.returncode == 0, result.stderr[-3000:]
-    return json.loads(
-        result.stdout[result.stdout.rindex("{") :]
-    )  # Mitsuba's warnings end where their colour does
+    # Mitsuba's warnings end where their colour does
+    return json.loads(result.stdout[result.stdout.rindex("{") :])
 
 
 def test_random_parameters():

@@ -108,11 +108,12 @@ def residuals(world, weights):
     times what is gathered at z_i, averaged over light paths.
     """
     K, measure, f = world.K, world.measure, world.f
+    # per level: T, P, f_0 ... f_j dmu_1 ... dmu_{j+1}
     throughput, chance, flux = (
         [np.array(1.0)],
         [np.array(1.0)],
         [np.array(1.0)],
-    )  # per level: T, P, f_0 ... f_j dmu_1 ... dmu_{j+1}
+    )
     for j in range(K - 1):
         throughput.append(
             throughput[j][..., None] * world.albedo(j)[..., None] * np.ones_like(f[j])
