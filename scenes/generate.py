@@ -203,10 +203,10 @@ def tiles(
             vertices += [[x, y, z] for (x, y), z in zip(top, top_z)]
             faces += [[base + 4, base + 5, base + 6], [base + 4, base + 6, base + 7]]
             for k in range(4):
-                l = (k + 1) % 4
+                after = (k + 1) % 4
                 faces += [
-                    [base + k, base + l, base + 4 + l],
-                    [base + k, base + 4 + l, base + 4 + k],
+                    [base + k, base + after, base + 4 + after],
+                    [base + k, base + 4 + after, base + 4 + k],
                 ]
     write_ply(name, np.array(vertices), np.array(faces))
 
@@ -226,13 +226,11 @@ def noise(n, cells, octaves, seed, stretch=(1, 1)):
         iy, ix = py.astype(int), px.astype(int)
         fy, fx = (f * f * (3 - 2 * f) for f in (py - iy, px - ix))
         fy, fx = fy[:, None], fx[None, :]
-
-        def at(dy, dx):
-            return lattice[np.ix_((iy + dy) % cy, (ix + dx) % cx)]
-
+        rows, columns = (iy, (iy + 1) % cy), (ix, (ix + 1) % cx)
+        at = [[lattice[np.ix_(row, column)] for column in columns] for row in rows]
         total += 0.5**o * (
-            (at(0, 0) * (1 - fx) + at(0, 1) * fx) * (1 - fy)
-            + (at(1, 0) * (1 - fx) + at(1, 1) * fx) * fy
+            (at[0][0] * (1 - fx) + at[0][1] * fx) * (1 - fy)
+            + (at[1][0] * (1 - fx) + at[1][1] * fx) * fy
         )
         weight += 0.5**o
     return total / weight

@@ -224,7 +224,7 @@ def set_up(tmp_path):
     command(
         tools,
         "apt-cache",
-        "echo libllvm16; echo libllvm17t64; echo libllvm19; echo libllvm19-dev; echo libllvm22; echo libllvm23; echo libllvm100",
+        "for name in 16 17t64 19 19-dev 22 23 100; do echo libllvm$name; done",
     )
     python = command(
         tools,
@@ -311,7 +311,9 @@ def test_set_up_waits_for_another_update(set_up, tmp_path):
     command(
         set_up.tools,
         "apt-get",
-        f'[ -e {tmp_path}/waited ] || {{ echo "E: Could not get lock x." >&2; echo "E: no" >&2; exit 100; }}; touch {tmp_path}/installed',
+        f"[ -e {tmp_path}/waited ] || "
+        '{ echo "E: Could not get lock x." >&2; echo "E: no" >&2; exit 100; }; '
+        f"touch {tmp_path}/installed",
     )
     result, _ = set_up()
     assert result.returncode == 0, result.stderr
@@ -362,7 +364,8 @@ def test_plugins_are_there_whatever_is_imported_first(code):
 
 def test_scalar_variant_says_what_the_plugins_need():
     result = run_python(
-        "import mis_integrators, mitsuba as mi; mi.set_variant('scalar_rgb')\nmi.load_dict({'type': 'bdpm'})"
+        "import mis_integrators, mitsuba as mi; mi.set_variant('scalar_rgb')\n"
+        "mi.load_dict({'type': 'bdpm'})"
     )
     assert "llvm_ad_*" in result.stderr.splitlines()[-1]
 
@@ -375,7 +378,8 @@ def test_scalar_variant_says_what_the_plugins_need():
 )
 def test_newer_version_is_one_line(name, version):
     result = run_python(
-        f"import drjit, mitsuba; {name}.__version__ = '{version}'\nimport mis_integrators, mis_integrators.app.loading"
+        f"import drjit, mitsuba; {name}.__version__ = '{version}'\n"
+        "import mis_integrators, mis_integrators.app.loading"
     )
     assert result.returncode == 0 and result.stderr.count("\n") == 1
     assert (
@@ -385,7 +389,11 @@ def test_newer_version_is_one_line(name, version):
 
 
 def test_warning_of_a_newer_version_can_be_filtered():
-    code = "import warnings; warnings.filterwarnings('ignore', module='mis_integrators')\nimport mitsuba; mitsuba.__version__ = '3.10.0'\nimport mis_integrators"
+    code = (
+        "import warnings; warnings.filterwarnings('ignore', module='mis_integrators')\n"
+        "import mitsuba; mitsuba.__version__ = '3.10.0'\n"
+        "import mis_integrators"
+    )
     result = run_python(code)
     assert (result.returncode, result.stdout, result.stderr) == (0, "", "")
 

@@ -75,11 +75,11 @@ def distance(weights, expected, relative=True, world=None):
     """Largest difference, relative to 1 + |w|, where light makes the weight matter."""
     return max(
         np.max(
-            np.abs(weights[l, i] - w)
+            np.abs(weights[family, i] - w)
             / (1 + np.abs(w) * relative)
-            * (world is None or world.light(l) > 0)
+            * (world is None or world.light(family) > 0)
         )
-        for (l, i), w in expected.items()
+        for (family, i), w in expected.items()
     )
 
 
@@ -132,7 +132,7 @@ def test_recursion_in_single_precision(case):
 
 
 def test_single_strategies(case):
-    world, weights, J, singles = case
+    world, _, J, singles = case
     for k in range(world.K):
         noise = worlds.noise(world, worlds.single(world, k))
         # sums of a hundred positive terms
@@ -299,7 +299,7 @@ def test_few_photons(K):
     total = sum(1 / k for k in kappa)
     # first order in n
     assert all(np.allclose(weights[K, i], 1 / k / total, atol=1e-6) for i, k in enumerate(kappa))
-    assert all(np.allclose(weights[l, l - 1], 1, atol=1e-6) for l in range(2, K))
+    assert all(np.allclose(weights[family, family - 1], 1, atol=1e-6) for family in range(2, K))
 
 
 # --- any input ----------------------------------------------------------------
@@ -338,14 +338,16 @@ def test_anything_gives_weights(world, noise, local):
     """Also with integrals that are wrong by any factor: the recursion has no singular place."""
     for dtype in (np.float32, np.float64):
         factor = iter(noise)
+
+        def off(x, factor=factor, dtype=dtype):
+            return (x * next(factor)).astype(dtype)
+
         with np.errstate(over="ignore", under="ignore"):
-            weights, e = worlds.recurse(
-                world, local, dtype, estimate=lambda x: (x * next(factor)).astype(dtype)
-            )
+            weights, e = worlds.recurse(world, local, dtype, estimate=off)
         assert all(np.all((x > 0) & (x <= 1)) for x in e)
         assert all(np.all(np.isfinite(w)) for w in weights.values())
-        for l in range(2, world.K + 1):
-            family = [weights[l, i].astype(np.float64) for i in range(l)]
+        for count in range(2, world.K + 1):
+            family = [weights[count, i].astype(np.float64) for i in range(count)]
             size = 1 + sum(np.abs(w) for w in family)
             # at most five terms
             assert np.all(np.abs(sum(family) - 1) < 10 * np.finfo(dtype).eps * size)
@@ -367,9 +369,9 @@ def test_no_weight_for_what_cannot_be(dtype):
         # nor does a luminance that the weights take for zero change that
         world.L0 = [0 * x for x in world.L0]
         weights, _ = worlds.recurse(world, dtype=dtype)
-        for l, i in world.families():
+        for family, i in world.families():
             for j in range(i):  # z_{j+1} unreachable
-                assert np.all(weights[l, i][(slice(None),) * j + (0,)] == 0)
+                assert np.all(weights[family, i][(slice(None),) * j + (0,)] == 0)
 
 
 def test_responses():

@@ -189,7 +189,7 @@ def test_largest_seed_is_kept_with_the_image(scene, tmp_path):
 def test_failed_write_leaves_the_old_file(tmp_path):
     file = tmp_path / "a.exr"
     output.write_exr(file, np.ones((2, 3, 1)), ["Y"], {})
-    with pytest.raises(Exception):
+    with pytest.raises(Exception, match="object"):
         output.write_exr(file, np.zeros((2, 3, 1)), ["Y"], {"name": object()})
     np.testing.assert_array_equal(read(file)[1]["Y"], 1)
     assert list(tmp_path.iterdir()) == [file]
@@ -440,7 +440,8 @@ def test_error_in_scene_or_parameter_is_one_line(scene, tmp_path, capsys, argume
     [
         "",
         "<scene",
-        "<scene version='3.0.0'><shape type='obj'><string name='filename' value='none.obj'/></shape></scene>",
+        "<scene version='3.0.0'><shape type='obj'><string name='filename' value='none.obj'/>"
+        "</shape></scene>",
         "<scene version='3.0.0'/>",
         "<bsdf version='3.0.0' type='diffuse'/>",
     ],

@@ -476,7 +476,10 @@ def test_other_sources_are_another_render(scene, tmp_path, monkeypatch, capsys):
 
 def test_fingerprint_is_of_every_source(tmp_path):
     """It changes with any byte of any module, and with a module's name."""
-    program = "import sys; sys.path.insert(0, sys.argv[1]); from mis_integrators import fingerprint; print(fingerprint.of_package())"
+    program = (
+        "import sys; sys.path.insert(0, sys.argv[1])\n"
+        "from mis_integrators.app import fingerprint; print(fingerprint.of_package())"
+    )
     import shutil
 
     def fingerprint_of(folder):

@@ -87,7 +87,8 @@ def test_scene_that_only_mitsuba_takes_has_its_digests(tmp_path, rgb, comment):
     file.write_text(f"""<scene version="3.0.0">{comment}<default name="picture" value="co"/>
         <bsdf type="diffuse"><spectrum name="reflectance" value="{spectrum}"/></bsdf>
         <bsdf type="diffuse"><texture type="bitmap" name="reflectance"
-            ><string name = "filename" value='{tmp_path}/it&apos;s &amp; $picture.bmp'/></texture></bsdf></scene>""")
+            ><string name = "filename" value='{tmp_path}/it&apos;s &amp; $picture.bmp'/></texture>
+        </bsdf></scene>""")
     mi.file_resolver().prepend(str(tmp_path))
     digests = fingerprint.scene_digests(file, {})
     assert sorted(digests) == sorted([f"{tmp_path}/it's & co.bmp", "scene.xml"])
@@ -640,14 +641,15 @@ def test_target_error_stops_the_render(scene, tmp_path, capsys):
 MEMORY = """
 import sys, mis_integrators, mitsuba as mi
 mi.set_variant("llvm_ad_rgb")
-from mis_integrators import loading
+from mis_integrators.app import loading
 from mis_integrators.core.session import make_session
 from pathlib import Path
 loaded = loading.load(Path(sys.argv[1]), {"size": "32"}, sys.argv[2], {})
 session = make_session(loaded.integrator, loaded.scene, loaded.scene.sensors()[0], 0, 0, fine=True)
 session.keep_variance()
 def resident():
-    return int(next(line for line in open("/proc/self/status") if line.startswith("VmRSS")).split()[1]) / 1024
+    line = next(line for line in open("/proc/self/status") if line.startswith("VmRSS"))
+    return int(line.split()[1]) / 1024
 for count in (30, 130):
     while session.iterations < count:
         session.iterate()

@@ -261,10 +261,14 @@ def test_defaults_name_registered_plugins_only(module):
     assert methods.registered(methods.COMPARED)[0].label == methods.BASE
 
 
-TINY = """<scene version="3.0.0"><integrator type="path"><integer name="max_depth" value="4"/></integrator>
-    <sensor type="perspective"><transform name="to_world"><lookat origin="0,0,4" target="0,0,0" up="0,1,0"/></transform>
-    <film type="hdrfilm"><integer name="width" value="48"/><integer name="height" value="40"/></film></sensor>
-    <shape type="sphere"/><emitter type="point"><point name="position" x="1" y="2" z="4"/></emitter></scene>"""
+TINY = """<scene version="3.0.0">
+    <integrator type="path"><integer name="max_depth" value="4"/></integrator>
+    <sensor type="perspective">
+    <transform name="to_world"><lookat origin="0,0,4" target="0,0,0" up="0,1,0"/></transform>
+    <film type="hdrfilm">
+    <integer name="width" value="48"/><integer name="height" value="40"/></film></sensor>
+    <shape type="sphere"/>
+    <emitter type="point"><point name="position" x="1" y="2" z="4"/></emitter></scene>"""
 
 
 def test_page_of_one_small_scene(module, tmp_path):

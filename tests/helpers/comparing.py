@@ -177,7 +177,8 @@ def differences(a: Estimate, b: Estimate, false_alarm=FALSE_ALARM, slack=1e-5) -
             error[region, channel], 1e-30
         )
         found.append(
-            f"{place}, channel {channel}: {a.mean[region, channel]:.5g} against {b.mean[region, channel]:.5g} "
+            f"{place}, channel {channel}: "
+            f"{a.mean[region, channel]:.5g} against {b.mean[region, channel]:.5g} "
             f"(ratio {ratio:.4f}, {sigmas:.1f} standard errors)"
         )
     return found

@@ -619,7 +619,7 @@ def test_vertices_that_overflow_in_the_pilot_are_not_lost(rgb, monkeypatch):
     for room in (None, 11):
         session = bdpm(bdd=1, initial_radius=0.0).session(scene, seed=1, spp=4)
         if room:
-            monkeypatch.setattr(session, "_vertex_room", lambda paths: room)
+            monkeypatch.setattr(session, "_vertex_room", lambda paths, room=room: room)
         session.start()
         radii.append(session.radii)
     assert radii[0].keys() == radii[1].keys() == {"caustic", "indirect"}

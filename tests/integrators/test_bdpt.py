@@ -5,6 +5,8 @@ Comparisons of renders as in `test_against_path`: false-alarm rate 1e-6 each, an
 % in the image and of 3 or 8 % in a block is seen with a probability of 0.95.
 """
 
+from itertools import pairwise
+
 from mis_integrators.core.random import next_2d, streams
 from mis_integrators.core.traits import SceneTraits
 from mis_integrators.integrators.pyramid import technique_names
@@ -156,7 +158,7 @@ class JointPaths:
 
     def densities(self, number):
         """(p_camera, p_light) at a vertex."""
-        _, si, _, to_camera, to_light, _ = self.vertices[number]
+        *_, to_camera, to_light, _ = self.vertices[number]
         _, p_camera, p_light = self.junction(number).between(to_camera, to_light, self.valid)
         return p_camera, p_light
 
@@ -318,7 +320,6 @@ class JointPaths:
 
     def joined(self, camera, light, z):
         a, b = self.record(z, "camera", camera[z]), self.record(z + 1, "light", light[z + 1])
-        _, si, _, _, to_light, _ = self.vertices[z]
         return join(self.traits, a, b, [], self.valid), a, b
 
 
@@ -823,7 +824,7 @@ def test_max_depth(rgb):
         )
         np.testing.assert_allclose(mine, truth, rtol=0.02, atol=1e-6)
         means.append(truth[0, 0])
-    assert means[0] == 0 and all(b > 1.03 * a for a, b in zip(means, means[1:4]))
+    assert means[0] == 0 and all(b > 1.03 * a for a, b in pairwise(means[:4]))
 
 
 def test_roulette_and_unlimited_depth_leave_the_mean(rgb):

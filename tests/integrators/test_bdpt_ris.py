@@ -100,6 +100,7 @@ class ResampledPaths(JointPaths):
         """`(buffer, slot of each vertex, what `leave` says after the last one)`."""
         buffer = new_vertices(self.traits, self.capacity, STEP)
         left, parent, slots = not_left(self.COUNT), dr.full(mi.UInt32, NO_PARENT, self.COUNT), []
+        density = mi.Float(0)
         for number in range(self.length):
             _, si, _, to_camera, to_light, delta = self.vertices[number]
             p_camera, p_light = self.densities(number)

@@ -280,7 +280,7 @@ def test_primary_sample_deep_inside():
     thin, thick = Sections([0.0], [1.0], [2.0]), Sections([0.0], [1.0], [200.0])
     t = np.array([0.3, 0.999])
     # u'max = 1 in double precision
-    expected = [-np.log1p(-(-np.expm1(-2 * x)) / (-np.expm1(-2.0))) / 200 for x in t]
+    expected = [-np.log1p(-np.expm1(-2 * x) / np.expm1(-2.0)) / 200 for x in t]
     assert np.allclose(shifts.primary_sample(thin, thick, t).t, expected, rtol=1e-9)
 
 
