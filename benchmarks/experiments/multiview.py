@@ -11,21 +11,22 @@ from __future__ import annotations
 
 import argparse
 import time
-from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree
 
-from mis_integrators.analysis.metrics import RELATIVE_OFFSET
 from mis_integrators.app import loading
 from mis_integrators.core.session import PATHS_PER_PASS
-from mis_integrators.volume.shifts import SHIFTS, Sections, majorant_at, optical_depth
+from mis_integrators.volume.shifts import SHIFTS
 from mis_integrators.volume.views import views_of
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from reports import Row, save, show, tell
-from scene_files import BUNDLED
+
+from common.races import Race
+from common.rows import Row, save, show, tell
+from common.scene_files import BUNDLED
+from report.figures import draw_densities
 
 SCENES = sorted((BUNDLED / "multiview").glob("*.xml"))
 SLICE_SECONDS = 0.3
@@ -148,37 +149,6 @@ def load(path: Path, scale: float, count: int | None = None):
     return mi.load_string(ElementTree.tostring(root, encoding="unicode"), **size), parameters
 
 
-@dataclass
-class Race:
-    """What came of renders of all views in equal time: per method and seed the views side by side
-    (H, W, 3) and `(seconds, samples a pixel)`."""
-
-    views: int
-    images: dict[str, list[np.ndarray]]
-    used: dict[str, list[tuple[float, int]]]
-
-    @property
-    def mean(self) -> np.ndarray:
-        """Mean of the renders by `volpath`."""
-        return np.mean(self.images["volpath"], axis=0)
-
-    def noise(self, name: str) -> np.ndarray:
-        """Relative variance of one render (H, W, 3)."""
-        return np.var(self.images[name], axis=0, ddof=1) / (self.mean**2 + RELATIVE_OFFSET)
-
-    def seconds(self, name: str) -> float:
-        """Seconds that a render took: iterations overrun a little."""
-        return float(np.mean([s for s, _ in self.used[name]]))
-
-    def samples(self, name: str) -> int:
-        """Camera paths a pixel."""
-        return round(np.mean([n for _, n in self.used[name]]))
-
-    def cost(self, name: str) -> float:
-        """Relative variance x seconds."""
-        return self.seconds(name) * float(self.noise(name).mean())
-
-
 def race(
     scene, parameters: dict, methods: dict[str, dict], label: str, options: argparse.Namespace
 ) -> Race:
@@ -276,45 +246,3 @@ def invalid_shifts(path: Path, options: argparse.Namespace) -> list[Row]:
             }
         )
     return rows
-
-
-# --- Figure 3 -----------------------------------------------------------------
-
-
-def draw_densities(path: Path) -> None:
-    """Densities of interactions shifted from a segment on [0, 9] to one on [0, 3], next to the
-    target's own: tentative, null and real."""
-    import matplotlib.pyplot as plt
-
-    target = Sections([0.0], [3.0], [2.0])
-
-    def real(t):  # extinction on the target
-        return 1.0 + 0.8 * np.sin(2.5 * t)
-
-    grid = np.linspace(1e-4, 3 - 1e-4, 600)
-    own = 2.0 * np.exp(-optical_depth(target, grid))
-    rng = np.random.default_rng(0)
-    figure, axes = plt.subplots(1, 3, figsize=(12, 3.6), sharey=True)
-    for axis, majorant in zip(axes, (0.2, 0.7, 2.0)):
-        base = Sections([0.0, 4.5], [4.5, 9.0], [majorant * 1.5, majorant * 0.5])
-        axis.plot(grid, own, "k", label="tentative")
-        axis.plot(grid, own * (1 - real(grid) / 2), "k--", label="null")
-        axis.plot(grid, own * real(grid) / 2, "k:", label="real")
-        for name in ("raw_depth", "majorant_optical_depth", "primary_sample"):
-            # Density of one interaction at t' if the base places the first one: p(t) / |S'|, p the
-            # free flight of the base.
-            t = np.sort(rng.uniform(0, 9, 4000))
-            shifted = SHIFTS[name](base, target, t)
-            density = majorant_at(base, t) * np.exp(-optical_depth(base, t)) / shifted.jacobian
-            axis.plot(shifted.t, density, label=name.replace("_", " "))
-        axis.set(
-            title=f"base majorant {1.5 * majorant:.2g}, then {0.5 * majorant:.2g} [1/m]",
-            xlabel="t' [m]",
-            ylim=(0, 2.6),
-        )
-    axes[0].set_ylabel("density [1/m]")
-    axes[-1].legend(fontsize=7)
-    figure.tight_layout()
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=130)
-    plt.close(figure)

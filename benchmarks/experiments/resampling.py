@@ -6,18 +6,20 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from mis_integrators.analysis.charts import Line
 from mis_integrators.analysis.confidence import ratio_interval
 from mis_integrators.analysis.metrics import References, errors
 from mis_integrators.app import loading
 
 import numpy as np
-from methods import Method, SessionMaker, parse_method
-from references import colours, find_references
-from reports import Row, console, save, show, tell
-from scene_files import OpenScene, open_scene, scaled_size
-from sweeps import Sweep
-from turns import Contender, take_turns
+
+from common.methods import Method, SessionMaker, parse_method
+from common.references import colours, find_references
+from common.rows import Row, console, save, show, tell
+from common.scene_files import OpenScene, open_scene, scaled_size
+from common.turns import Contender, take_turns
+from experiments.sweeps import Sweep
+from report import sections
+from report.page import Page
 
 SWEEPS = (
     Sweep("light_paths", "light_paths", (50, 100, 200, 400, 800), True, "light sub-paths, M"),
@@ -38,9 +40,7 @@ COLUMNS = ("sweep", "value", "method", "iterations", *MEASURES, "relMSE ratio")
 
 def run(options: argparse.Namespace) -> None:
     """The sub-command ``resampling``."""
-    import pages
-
-    page = pages.Page("Resampled connections", options.out / "resampling.html")
+    page = Page("Resampled connections", options.out / "resampling.html")
     page.add(section(options.scenes, options))
     page.write()
     console.print(f"page: {page.path}")
@@ -48,8 +48,6 @@ def run(options: argparse.Namespace) -> None:
 
 def section(scenes: list[Path], options: argparse.Namespace) -> str:
     """The charts of all scenes; the table, CSV and JSON on the way."""
-    import pages
-
     rows: list[Row] = []
     for path in scenes:
         opened = open_scene(path, scaled_size(path, options.resampling_scale))
@@ -57,7 +55,8 @@ def section(scenes: list[Path], options: argparse.Namespace) -> str:
         show(f"{opened.name}: ratios to {BASE}, {options.draw_time:g} s each", found, COLUMNS)
         rows += found
         save(options.out, "resampling", rows, vars(options))
-    return pages.resampling(rows, options.out)
+    parameters = {sweep.name: sweep.what for sweep in SWEEPS}
+    return sections.resampling(rows, METHODS, MEASURES, parameters, options.out)
 
 
 def sweep_scene(
@@ -150,19 +149,4 @@ def row(
             f"{name} ratio low": ratio.low,
             f"{name} ratio high": ratio.high,
         }
-    return found
-
-
-def lines(rows: list[Row], sweep: Sweep, measure: str) -> dict[str, Line]:
-    """A line for each method but the base, from the rows of one scene."""
-    found = {}
-    for label in METHODS[1:]:
-        mine = [r for r in rows if r["sweep"] == sweep.name and r["method"] == label]
-        if mine:
-            found[label] = Line(
-                *(
-                    [r[key] for r in mine]
-                    for key in ("value", measure, f"{measure} low", f"{measure} high")
-                )
-            )
     return found

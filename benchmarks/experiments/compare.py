@@ -3,23 +3,21 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
 
 from mis_integrators.analysis.confidence import log_ratio_error, mean_interval, ratio_interval
 from mis_integrators.analysis.metrics import Errors, decompose, efficiency, errors
-from mis_integrators.analysis.stability import CLOSE
 
 import numpy as np
-import regressions
-from measuring import Measured, Measurement, measure
-from references import find_references
-from reports import Row, console, save, show, tell
-from scene_files import open_scene, scaled_size
 
-LATE = 1.15
-"""Times the usual seconds, beyond which a render is not one of equal time."""
+from common.measuring import Measured, Measurement, measure
+from common.references import find_references
+from common.rows import Row, console, save, show, tell
+from common.scene_files import open_scene, scaled_size
+from report import regressions, sections
+from report.page import Page
+
 COLUMNS = (
     "method",
     "iterations",
@@ -38,12 +36,10 @@ COLUMNS = (
 
 def run(options: argparse.Namespace) -> None:
     """The sub-command ``compare``."""
-    import pages
-
     rows: list[Row] = []
     failures: dict[str, dict[str, str]] = {}
     pictures: list[str] = []
-    page = pages.Page("Comparison", options.out / "compare.html")
+    page = Page("Comparison", options.out / "compare.html")
     for path in options.scenes:
         measurement = measure_scene(path, options, [])
         found = compare(measurement)
@@ -53,10 +49,10 @@ def run(options: argparse.Namespace) -> None:
         name = measurement.opened.name
         failures[name] = measurement.failures
         pictures.append(
-            f'<h2 id="{name}">{name}</h2>' + pages.pictures(measurement, found, options.out)
+            f'<h2 id="{name}">{name}</h2>' + sections.pictures(measurement, found, options.out)
         )
         page.sections = [
-            pages.summary(rows, failures, f"({measurement.asked} each, {options.seeds} seeds)"),
+            sections.summary(rows, failures, f"({measurement.asked} each, {options.seeds} seeds)"),
             *pictures,
         ]
         page.write()
@@ -90,11 +86,9 @@ def show_comparison(rows: list[Row], measurement: Measurement, options: argparse
         {**row, **{name: _with_interval(row, name) for name in ("relMSE ratio", "cost ratio")}}
         for row in rows
     ]
-    show(
-        f"{measurement.opened.name}: {much}, {options.seeds} seeds, ratios to {measurement.base.method.label}",
-        shown,
-        COLUMNS,
-    )
+    base = measurement.base.method.label
+    title = f"{measurement.opened.name}: {much}, {options.seeds} seeds, ratios to {base}"
+    show(title, shown, COLUMNS)
     for label, reason in measurement.failures.items():
         console.print(f"{label} cannot render {measurement.opened.name}: {reason}")
 
@@ -179,55 +173,6 @@ def _row(measured: Measured, mine: dict, base: dict, measurement: Measurement) -
         "settings": chosen(measured.runs[-1].settings),
         "references": measurement.references.origin,
     }
-
-
-def told_apart(row: Row, better: Row) -> bool:
-    """Whether a method's error (relMSE without the worst 0.1 %) is beyond the noise above that of a
-    better one: by pairs of seeds, 95 %."""
-    mine, other = (
-        [float(value) for value in one["trimmed by seed"].split()] for one in (row, better)
-    )
-    return ratio_interval(mine, other).low > 1
-
-
-def too_late(row: Row, rows: Sequence[Row]) -> bool:
-    """Whether the single iteration of a method took longer than others' renders of the scene: its
-    error is not one at equal time."""
-    return row["iterations"] <= 1 and row["seconds"] > LATE * float(
-        np.median([other["seconds"] for other in rows])
-    )
-
-
-def winner(rows: Sequence[Row]) -> Row:
-    """The least error of those of one scene that kept to the time."""
-    return min(
-        (row for row in rows if not too_late(row, rows)), key=lambda row: row["trimmed ratio"]
-    )
-
-
-def winners(rows: list[Row]) -> list[Row]:
-    """One row a scene: its least error, in ratios to the base, and the methods that are about as
-    good or cannot be told apart."""
-    found: list[Row] = []
-    for scene in dict.fromkeys(row["scene"] for row in rows):
-        mine = [row for row in rows if row["scene"] == scene]
-        best = winner(mine)
-        close = [
-            row["method"]
-            for row in mine
-            if row is not best
-            and not too_late(row, mine)
-            and (row["trimmed ratio"] <= CLOSE * best["trimmed ratio"] or not told_apart(row, best))
-        ]
-        found.append(
-            {
-                "scene": scene,
-                "best": best["method"],
-                "error over path's": best["trimmed ratio"],
-                "about as good": ", ".join(close) or "-",
-            }
-        )
-    return found
 
 
 def chosen(settings: dict) -> str:

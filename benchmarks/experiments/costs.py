@@ -19,8 +19,9 @@ from mis_integrators.paths.path_length_statistics import mean_segments
 
 import mitsuba as mi
 import numpy as np
-from reports import show, tell
-from scene_files import open_scene, scaled_size
+
+from common.rows import show, tell
+from common.scene_files import open_scene, scaled_size
 
 METHODS = (("path", {}), *PHOTON_MAPPERS)
 CONNECTED, LIGHT_TRACING = ("pcbpt", "bdpt_ris"), (0.5, 2.0)

@@ -12,9 +12,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import mitsuba as mi
-from methods import Method, registered
-from scene_files import OpenScene
-from smoke import smoke_views
+
+from common.methods import Method, registered
+from common.scene_files import OpenScene
+from experiments.smoke import smoke_views
 
 
 def room(
@@ -31,23 +32,14 @@ def room(
     for a lamp close below the ceiling that faces down, else its distance from the ceiling that it
     faces; `scale`: factor of all lengths. The lamp's power is always the same.
     """
-    title = "_".join(
-        [
-            "room",
-            *(
-                f"{name}_{value:g}"
-                for name, value in sorted(
-                    dict(
-                        roughness=roughness,
-                        light_size=light_size,
-                        light_distance=light_distance or 0,
-                        max_depth=max_depth,
-                        scale=scale,
-                    ).items()
-                )
-            ),
-        ]
-    )
+    parameters = {
+        "light_distance": light_distance or 0,
+        "light_size": light_size,
+        "max_depth": max_depth,
+        "roughness": roughness,
+        "scale": scale,
+    }
+    title = "_".join(["room", *(f"{name}_{value:g}" for name, value in parameters.items())])
     to_scale = mi.ScalarTransform4f().scale(scale)
 
     def placed(kind, transform, bsdf, **more):

@@ -7,10 +7,10 @@ import json
 import sys
 from pathlib import Path
 
-from reports import console
-from scene_files import bundled, digests
+from common.rows import console
+from common.scene_files import bundled, digests
 
-RECORD = Path(__file__).resolve().parent / "history" / "scenes.json"
+RECORD = Path(__file__).resolve().parents[1] / "history" / "scenes.json"
 
 
 def freeze(options: argparse.Namespace) -> None:

@@ -7,41 +7,42 @@ import argparse
 from collections.abc import Sequence
 
 from mis_integrators.analysis.metrics import References
-from mis_integrators.analysis.stability import Point, breaks, choose, judge
+from mis_integrators.analysis.stability import breaks, choose, judge
 from mis_integrators.app import loading
 
 import mitsuba as mi
-from methods import Method, SessionMaker, parse_method
-from references import colours, find_references
-from reports import Row, console, save, show, tell
-from scene_files import OpenScene
-from sweeps import SWEEPS, Sweep
-from turns import Contender, take_turns
 
-Points = dict[str, list[Point]]
-"""A method's points, by its label, at the sweep's values."""
+from common.methods import Method, SessionMaker, parse_method
+from common.references import colours, find_references
+from common.rows import Row, console, save, show, tell
+from common.scene_files import OpenScene
+from common.swept import Points, Swept
+from common.turns import Contender, take_turns
+from experiments.sweeps import SWEEPS, Sweep
+from report import sections
+from report.page import Page
+from report.tables import as_markdown
 
 
 def run(options: argparse.Namespace) -> None:
     """The sub-command ``stability``."""
-    import pages
-
-    page = pages.Page("Stability", options.out / "stability.html")
-    results = sweep_all(options)
-    page.add(pages.stability(results, page.folder, options.integrators))
+    page = Page("Stability", options.out / "stability.html")
+    results, choices = sweep_all(options)
+    page.add(sections.stability(results, choices, page.folder, options.integrators))
     page.write()
     console.print(f"page: {page.path}")
 
 
-def sweep_all(options: argparse.Namespace) -> list[tuple[Sweep, Points]]:
-    """All sweeps that the options name; tables, CSV and JSON on the way."""
+def sweep_all(options: argparse.Namespace) -> tuple[list[Swept], list[Row]]:
+    """All sweeps that the options name, and which method to choose where; tables, CSV and JSON on
+    the way."""
     rows: list[Row] = []
     choices: list[Row] = []
     results = []
     for sweep in SWEEPS:
         if sweep.name in options.sweeps:
             points = measure_sweep(sweep, sweep.methods(options.integrators), options)
-            results.append((sweep, points))
+            results.append(Swept(sweep.name, sweep.what, points))
             rows += point_rows(sweep, points)
             choices += choice_rows(sweep, points)
             save(options.out, "stability", rows, vars(options))
@@ -49,7 +50,7 @@ def sweep_all(options: argparse.Namespace) -> list[tuple[Sweep, Points]]:
     show("Which method where", choices)
     options.out.mkdir(parents=True, exist_ok=True)
     (options.out / "which_method.md").write_text(as_markdown(choices))
-    return results
+    return results, choices
 
 
 def measure_sweep(sweep: Sweep, methods: Sequence[Method], options: argparse.Namespace) -> Points:
@@ -82,7 +83,8 @@ def measure_sweep(sweep: Sweep, methods: Sequence[Method], options: argparse.Nam
                 continue
             contender.setting_up = 0.0
             contenders.append(contender)
-        take_turns(contenders, seconds, lambda text: tell(f"{sweep.name} = {value:g}: {text}"))
+        at = f"{sweep.name} = {value:g}"
+        take_turns(contenders, seconds, lambda text, at=at: tell(f"{at}: {text}"))
         for contender in contenders:
             points.setdefault(contender.label, []).append(
                 judge(value, colours(contender.session), references)
@@ -161,20 +163,3 @@ def choice_rows(sweep: Sweep, points: Points) -> list[Row]:
         if points
         else []
     )
-
-
-def as_markdown(rows: list[Row]) -> str:
-    """A Markdown table."""
-    if not rows:
-        return ""
-    names = list(rows[0])
-    body = [
-        "| "
-        + " | ".join(
-            f"{row[name]:.3g}" if isinstance(row[name], (int, float)) else f"{row[name]}"
-            for name in names
-        )
-        + " |"
-        for row in rows
-    ]
-    return "\n".join(["| " + " | ".join(names) + " |", "|" + "---|" * len(names), *body]) + "\n"

@@ -16,8 +16,9 @@ from mis_integrators.core.traits import has_media
 
 import numpy as np
 import OpenEXR
-from methods import Method, SessionMaker, parse_method
-from scene_files import OpenScene, fingerprint
+
+from common.methods import Method, SessionMaker, parse_method
+from common.scene_files import OpenScene, fingerprint
 
 COLOURS = ("R", "G", "B")
 

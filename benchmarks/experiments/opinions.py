@@ -9,12 +9,13 @@ import math
 from mis_integrators.analysis.metrics import BLOCKS, References, block_means
 
 import numpy as np
-import stability
-from measuring import measure
-from methods import Method, registered
-from references import are_there, find_references, recipe
-from reports import Row, console, save, show, tell
-from scene_files import OpenScene, open_scene, scaled_size
+
+from common.measuring import measure
+from common.methods import Method, registered
+from common.references import are_there, find_references, recipe
+from common.rows import Row, console, save, show, tell
+from common.scene_files import OpenScene, open_scene, scaled_size
+from experiments import stability
 
 ALLOWED, STANDARD_ERRORS = 0.03, 4.0
 """Methods disagree where their block means differ by more than this share of the mean in the median

@@ -7,7 +7,8 @@ import inspect
 
 import mitsuba as mi
 import numpy as np
-from scene_files import OpenScene
+
+from common.scene_files import OpenScene
 
 VIEWS = 4
 CELLS = 12

@@ -17,8 +17,9 @@ from mis_integrators.app import cluster
 from mis_integrators.app.request import Request
 
 import drjit as dr
-from reports import Row, save, show, tell
-from scene_files import scaled_size
+
+from common.rows import Row, save, show, tell
+from common.scene_files import scaled_size
 
 BATCHES_BEFORE = 6
 """Batches of each worker before the clock starts: the first ones compile, and find out how long

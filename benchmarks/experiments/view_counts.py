@@ -8,9 +8,13 @@ from pathlib import Path
 
 from mis_integrators.volume.views import views_of
 
-from multiview import Race, draw_densities, load, race
-from reports import Row, save, show
-from scene_files import BUNDLED
+from common.races import Race
+from common.rows import Row, save, show
+from common.scene_files import BUNDLED
+from experiments.multiview import load, race
+from report import sections
+from report.figures import draw_densities
+from report.page import Page
 
 SCENES = [
     BUNDLED / "multiview" / f"{name}.xml" for name in ("smoke_orbit", "light_field", "fly_through")
@@ -24,9 +28,7 @@ would do."""
 
 def run(options: argparse.Namespace) -> None:
     """The sub-command ``views``."""
-    import pages
-
-    page = pages.Page("Many views", options.out / "views.html")
+    page = Page("Many views", options.out / "views.html")
     page.add(section(options, options.out))
     page.write()
     print(f"page: {page.path}")
@@ -36,8 +38,6 @@ def section(options: argparse.Namespace, folder: Path) -> str:
     """The section of a page: charts, pictures of some views, the table; CSV and JSON on the way.
     `options`: `view_scenes`, `view_counts`, `view_time`, `view_seeds`, `view_scale`,
     `view_weights`."""
-    import pages
-
     rows: list[Row] = []
     races: dict[str, Race] = {}
     for path in options.view_scenes:
@@ -56,12 +56,10 @@ def section(options: argparse.Namespace, folder: Path) -> str:
             rows += [_row(path.stem, name, found) for name in methods]
             races[path.stem] = found
             save(options.out, "view_counts", rows, vars(options))
-    show(
-        "Relative variance x time of volpath_multiview over that of volpath, by the number of views",
-        rows,
-    )
+    title = "Relative variance x time of volpath_multiview over that of volpath"
+    show(f"{title}, by the number of views", rows)
     draw_densities(folder / "multiview_densities.png")
-    return pages.view_counts(rows, races, folder)
+    return sections.view_counts(rows, races, folder)
 
 
 def _row(scene: str, name: str, found: Race) -> Row:

@@ -10,9 +10,9 @@ from pathlib import Path
 
 from mis_integrators.analysis.confidence import t_quantile, t_two_sided
 
-from reports import Row, console, document, show
+from common.rows import Row, console, document, show
 
-HISTORY = Path(__file__).resolve().parent / "history"
+HISTORY = Path(__file__).resolve().parents[1] / "history"
 FALSE_ALARM = 0.05
 """Expected share of false ones among the changes named; for two runs of one program, the
 probability that any is named."""
@@ -45,17 +45,16 @@ def report(rows: Sequence[Row], baseline: Path) -> list[Row]:
     changes, compared = find_changes(rows, kept["rows"])
     machine = kept["machine"]
     console.print(
-        f"baseline: {machine['mis_integrators']} at {machine.get('commit')}, {machine['processor']}, {machine['threads']} threads"
+        f"baseline: {machine['mis_integrators']} at {machine.get('commit')}, "
+        f"{machine['processor']}, {machine['threads']} threads"
     )
     if not compared:
         console.print(
             "no figures in common (scene, size, method, time, several seeds): nothing compared"
         )
     elif changes:
-        show(
-            f"Changed beyond the noise ({compared} figures compared, false discovery rate {FALSE_ALARM:g})",
-            changes,
-        )
+        how = f"{compared} figures compared, false discovery rate {FALSE_ALARM:g}"
+        show(f"Changed beyond the noise ({how})", changes)
     else:
         console.print(f"nothing changed beyond the noise ({compared} figures compared)")
     return changes

@@ -12,16 +12,18 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import dataclass, replace
+from itertools import chain
 
 from mis_integrators.analysis.metrics import TRIMMED_SHARE, References, relative_squared_errors
 
 import numpy as np
-from compare import chosen
-from methods import Method, SessionMaker
-from references import colours, find_references
-from reports import Row, save, show, tell
-from scene_files import OpenScene, open_scene, scaled_size
-from turns import Contender, take_turns
+
+from common.methods import Method, SessionMaker
+from common.references import colours, find_references
+from common.rows import Row, save, show, tell
+from common.scene_files import OpenScene, open_scene, scaled_size
+from common.turns import Contender, take_turns
+from experiments.compare import chosen
 
 STEP = 2**0.5
 ONE_PATH = {"variance": True, "camera_paths": 1}
@@ -69,7 +71,8 @@ def run(options: argparse.Namespace) -> None:
                 "bdd": bdd,
                 "references": references.origin,
             }
-            sweeps += [{**place, **vars(law)} for law in fixed + sum(automatic.values(), [])]
+            every = chain(fixed, *automatic.values())
+            sweeps += [{**place, **vars(law)} for law in every]
             if fixed:
                 found = [
                     {**place, **judge(seconds, law, fixed)}
@@ -82,10 +85,8 @@ def run(options: argparse.Namespace) -> None:
                     for seconds in options.time
                 ]
                 show("Automatic radius against the best of a sweep, each pilot", rows, COLUMNS)
-                show(
-                    "Automatic radius against the best of a sweep: geometric mean and worst of the pilots",
-                    summary,
-                )
+                title = "Automatic radius against the best of a sweep"
+                show(f"{title}: geometric mean and worst of the pilots", summary)
                 for name, table in (
                     ("radius", rows),
                     ("radius_pilots", summary),
@@ -162,7 +163,7 @@ def sweep(
         Contender.begin(maker.method.label, maker.make, seed=0)
         for maker in sweep_around(centre, radii, bdd, opened, rendering)
     ]
-    together = [*sum(chosen_for_free.values(), []), *fixed]
+    together = [*chain.from_iterable(chosen_for_free.values()), *fixed]
     take_turns(together, rendering, tell)
     take_turns(together, 0, tell, FEWEST_ITERATIONS)
     automatic = {

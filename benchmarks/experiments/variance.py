@@ -13,9 +13,13 @@ from mis_integrators.app import loading
 from mis_integrators.core.traits import scene_bounds
 
 import numpy as np
-from methods import Method
-from reports import Row, console, save, show, tell
-from scene_files import OpenScene, open_scene, scaled_size
+
+from common.methods import Method
+from common.rows import Row, console, save, show, tell
+from common.scene_files import OpenScene, open_scene, scaled_size
+from report import sections
+from report.figures import draw_variance_maps
+from report.page import Page
 
 COLUMNS = (
     "scene",
@@ -33,10 +37,8 @@ COLUMNS = (
 
 def run(options: argparse.Namespace) -> None:
     """The sub-command ``variance``."""
-    import pages
-
     rows: list[Row] = []
-    page = pages.Page("Variance of one iteration", options.out / "variance.html")
+    page = Page("Variance of one iteration", options.out / "variance.html")
     for path in options.scenes:
         opened = open_scene(path, scaled_size(path, options.scale))
         for camera_paths in options.camera_paths:
@@ -44,7 +46,7 @@ def run(options: argparse.Namespace) -> None:
             show(f"{opened.name}: one iteration, N_B = {camera_paths}", found, COLUMNS)
             rows += found
             save(options.out, "variance", rows, vars(options))
-            page.add(pages.variance(opened.name, picture_of(opened, camera_paths, options)))
+            page.add(sections.variance(opened.name, picture_of(opened, camera_paths, options)))
     for camera_paths in options.camera_paths:
         summarise([row for row in rows if row["N_B"] == camera_paths], camera_paths)
     page.write()
@@ -113,12 +115,12 @@ def compare(opened: OpenScene, camera_paths: int, options: argparse.Namespace) -
                 "blocks worse": share_worse(mine, best),
             }
         )
-    from mis_integrators.analysis import charts
-
-    notes = [f"{row['ratio to best single']:.2f} x best single" for row in rows]
-    charts.save(
-        charts.variance_maps([method.label for method in methods], images, maps, notes),
+    draw_variance_maps(
         picture_of(opened, camera_paths, options),
+        [method.label for method in methods],
+        images,
+        maps,
+        [row["ratio to best single"] for row in rows],
     )
     return rows
 

@@ -11,7 +11,8 @@ from mis_integrators.core.session import Session
 
 import drjit as dr
 import numpy as np
-from references import colours
+
+from common.references import colours
 
 SLICE_SECONDS = 0.5
 

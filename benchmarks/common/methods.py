@@ -12,7 +12,8 @@ from mis_integrators.app import loading
 from mis_integrators.core.session import MitsubaSession, Session
 
 import mitsuba as mi
-from scene_files import OpenScene
+
+from common.scene_files import OpenScene
 
 PASS_SECONDS = 0.2
 """What one pass of one of Mitsuba's own integrators should take: short, but long beside its

@@ -4,13 +4,15 @@ share of the weights that other views bring."""
 from __future__ import annotations
 
 import argparse
+from itertools import pairwise
 
-from mis_integrators.analysis import charts
 from mis_integrators.analysis.metrics import RELATIVE_OFFSET
 
 import numpy as np
-from multiview import Together, load
-from reports import Row, console, save, show, tell
+
+from common.rows import Row, console, save, show, tell
+from experiments.multiview import Together, load
+from report.figures import draw_by_share
 
 ESTIMATORS = ("weighted sum", "mis", "mwis")
 """The sum of weighted samples over their expected number; that with the fluctuation of the weights
@@ -33,8 +35,9 @@ def run(options: argparse.Namespace) -> None:
             ]
             for name in ESTIMATORS
         }
-        charts.save(charts.by_share(curves), options.out / f"view_weights_{path.stem}.png")
-        console.print(f"chart: {options.out / f'view_weights_{path.stem}.png'}")
+        chart = options.out / f"view_weights_{path.stem}.png"
+        draw_by_share(chart, curves)
+        console.print(f"chart: {chart}")
 
 
 def measure(path, options: argparse.Namespace) -> list[Row]:
@@ -56,7 +59,7 @@ def measure(path, options: argparse.Namespace) -> list[Row]:
     found = {name: np.stack(stack) for name, stack in images.items()}
     edges = np.quantile(others, np.linspace(0, 1, options.groups + 1))
     rows = []
-    for low, high in zip(edges, edges[1:]):
+    for low, high in pairwise(edges):
         group = (others >= low) & ((others < high) | (high == edges[-1]))
         row: Row = {
             "scene": path.stem,

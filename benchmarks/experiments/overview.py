@@ -6,15 +6,14 @@ from __future__ import annotations
 import argparse
 import time
 
-import compare
-import converge
-import resampling
-import stability
-import variance
-import view_counts
-from reports import Row, console, save, show
-from scene_files import open_scene, scaled_size
-from sweeps import SWEEPS
+from common.rows import Row, console, save, show
+from common.scene_files import open_scene, scaled_size
+from common.winners import winners
+from experiments import compare, converge, resampling, stability, variance, view_counts
+from experiments.sweeps import SWEEPS
+from report import sections
+from report.page import Page
+from report.tables import as_markdown
 
 COMPILING_SECONDS = 2.5
 """Rough guess of what kernels and set-up cost for a method and scene on an idle machine; only the
@@ -27,23 +26,23 @@ VARIANCE_SECONDS = 12.0
 
 def run(options: argparse.Namespace) -> None:
     """The sub-command ``page``."""
-    import pages
-
     start = time.perf_counter()
     options.time = options.time or planned_time(options)
     expected = overhead(options) + rendering(options, options.time)
     console.print(
-        f"{len(options.scenes)} scenes, {len(options.integrators)} methods, {options.seeds} seeds, {options.time:.1f} s each: about "
-        f"{expected / 60:.0f} minutes, references not counted",
+        f"{len(options.scenes)} scenes, {len(options.integrators)} methods, "
+        f"{options.seeds} seeds, {options.time:.1f} s each: "
+        f"about {expected / 60:.0f} minutes, references not counted",
         highlight=False,
     )
     console.print(
-        f"(rendering {rendering(options, options.time) / 60:.0f}, compiling, variance maps and sweeps {overhead(options) / 60:.0f})"
+        f"(rendering {rendering(options, options.time) / 60:.0f}, "
+        f"compiling, variance maps and sweeps {overhead(options) / 60:.0f})"
     )
 
     rows: list[Row] = []
     failures: dict[str, dict[str, str]] = {}
-    page = pages.Page("Speed against accuracy", options.out / "index.html")
+    page = Page("Speed against accuracy", options.out / "index.html")
     scenes: list[str] = []
     points: list[Row] = []
     slopes: list[Row] = []
@@ -75,28 +74,33 @@ def run(options: argparse.Namespace) -> None:
             save(options.out, kind, kept, vars(options))
         scenes.append(
             f'<h2 id="{name}">{name}</h2>'
-            + pages.pictures(measurement, found, options.out)
-            + pages.convergence(measurement, curve, fitted, options.out)
-            + pages.variance(name, variance.picture_of(small, 1, options))
+            + sections.pictures(measurement, found, options.out)
+            + sections.convergence(measurement, curve, fitted, options.out)
+            + sections.variance(name, variance.picture_of(small, 1, options))
         )
-        write(page, pages, rows, failures, scenes, "", options)
+        write(page, rows, failures, scenes, "", options)
     show("Variance of one iteration, best single strategy = 1", varied, variance.COLUMNS)
-    sweeps = (
-        pages.stability(stability.sweep_all(options), options.out, options.integrators)
-        if options.sweeps
-        else ""
-    )
+    sweeps = ""
+    if options.sweeps:
+        results, choices = stability.sweep_all(options)
+        sweeps = sections.stability(results, choices, options.out, options.integrators)
     if options.view_scenes:
         sweeps = view_counts.section(options, options.out) + sweeps
     sweeps += resampling.section(options.resampled, options) if options.resampled else ""
-    write(
-        page, pages, rows, failures, scenes, pages.choices(compare.winners(rows)) + sweeps, options
-    )
-    (options.out / "which_scene.md").write_text(stability.as_markdown(compare.winners(rows)))
+    best = winners(rows)
+    write(page, rows, failures, scenes, sections.choices(best) + sweeps, options)
+    (options.out / "which_scene.md").write_text(as_markdown(best))
     console.print(f"page: {page.path} after {(time.perf_counter() - start) / 60:.1f} minutes")
 
 
-def write(page, pages, rows, failures, scenes, sweeps: str, options: argparse.Namespace) -> None:
+def write(
+    page: Page,
+    rows: list[Row],
+    failures: dict[str, dict[str, str]],
+    scenes: list[str],
+    sweeps: str,
+    options: argparse.Namespace,
+) -> None:
     """The page as far as it has come."""
     much = (
         f"at {options.spp} samples per pixel"
@@ -114,7 +118,7 @@ def write(page, pages, rows, failures, scenes, sweeps: str, options: argparse.Na
     ]
     links = "".join(f'<a href="#{part}">{name}</a>' for part, name in parts)
     page.sections = [
-        pages.summary(rows, failures, f"{much}, {options.seeds} seeds"),
+        sections.summary(rows, failures, f"{much}, {options.seeds} seeds"),
         f"<nav>{links}</nav>",
         *scenes,
         sweeps,

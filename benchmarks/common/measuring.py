@@ -10,9 +10,10 @@ from mis_integrators.analysis.metrics import References, flip
 from mis_integrators.app import loading
 
 import numpy as np
-from methods import Method, SessionMaker, base_of
-from scene_files import OpenScene
-from turns import Contender, Snapshot, take_turns
+
+from common.methods import Method, SessionMaker, base_of
+from common.scene_files import OpenScene
+from common.turns import Contender, Snapshot, take_turns
 
 
 @dataclass
@@ -110,7 +111,7 @@ def measure(
         take_turns(
             contenders,
             seconds,
-            lambda text: tell(f"{opened.name}, seed {seed + 1} of {seeds}: {text}"),
+            lambda text, seed=seed: tell(f"{opened.name}, seed {seed + 1} of {seeds}: {text}"),
             spp,
         )
         for measured, contender in zip(found, contenders):

@@ -11,7 +11,7 @@ from mis_integrators.app import loading
 
 import mitsuba as mi
 
-BUNDLED = Path(__file__).resolve().parent.parent / "scenes"
+BUNDLED = Path(__file__).resolve().parents[2] / "scenes"
 
 
 @dataclass

@@ -11,11 +11,12 @@ from mis_integrators.photons.gather import mean_photon_count
 
 import drjit as dr
 import mitsuba as mi
-from memory import PeakMemory
-from methods import Method, SessionMaker
-from reports import Row, save, show, tell
-from scene_files import OpenScene, open_scene
-from turns import Contender, take_turns
+
+from common.memory import PeakMemory
+from common.methods import Method, SessionMaker
+from common.rows import Row, save, show, tell
+from common.scene_files import OpenScene, open_scene
+from common.turns import Contender, take_turns
 
 WARM_UP = 3
 SIZE_OF_SWEEP = 256

@@ -10,9 +10,12 @@ from mis_integrators.analysis.fronts import pareto_front
 from mis_integrators.analysis.metrics import decompose, errors
 
 import numpy as np
-from compare import measure_scene
-from measuring import Measured, Measurement
-from reports import Row, console, save, show
+
+from common.measuring import Measured, Measurement
+from common.rows import Row, console, save, show
+from experiments.compare import measure_scene
+from report import sections
+from report.page import Page
 
 COLUMNS = (
     "method",
@@ -27,24 +30,20 @@ COLUMNS = (
 
 def run(options: argparse.Namespace) -> None:
     """The sub-command ``converge``."""
-    import pages
-
     points: list[Row] = []
     slopes: list[Row] = []
-    page = pages.Page("Error against time", options.out / "converge.html")
+    page = Page("Error against time", options.out / "converge.html")
     for path in options.scenes:
         measurement = measure_scene(path, options, marks(options.time, options.snapshots))
         found = converge(measurement)
         fitted = fit_slopes(measurement, found)
-        show(
-            f"{measurement.opened.name}: relMSE is proportional to samples, i.e. time without set-up, to the power of the slope",
-            fitted,
-            COLUMNS,
-        )
+        name = measurement.opened.name
+        title = f"{name}: relMSE is proportional to samples, i.e. time without set-up, to the power"
+        show(f"{title} of the slope", fitted, COLUMNS)
         points, slopes = points + found, slopes + fitted
         save(options.out, "converge", points, vars(options))
         save(options.out, "slopes", slopes, vars(options))
-        page.add(pages.convergence(measurement, found, fitted, page.folder))
+        page.add(sections.convergence(measurement, found, fitted, page.folder))
     page.write()
     console.print(f"page: {page.path}")
 
