@@ -464,6 +464,20 @@ def test_files_that_are_no_modules_are_declared():
     assert data and data <= named
 
 
+@pytest.mark.parametrize("command", [("check",), ("format", "--check")], ids=" ".join)
+def test_style_and_layout_are_ruffs(command):
+    """Of the whole repository, as pyproject.toml asks for."""
+    pytest.importorskip("ruff", reason="ruff is not installed: pip install 'mis-integrators[lint]'")
+    result = subprocess.run(
+        [sys.executable, "-m", "ruff", *command, "--no-cache"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert result.returncode == 0, result.stdout
+
+
 def test_type_hints_are_right(tmp_path):
     """Those of the modules that pyproject.toml lists."""
     pytest.importorskip("mypy", reason="mypy is not installed: pip install 'mis-integrators[lint]'")
