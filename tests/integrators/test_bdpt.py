@@ -349,7 +349,7 @@ def test_weights_sum_to_one(rgb, bsdf, light, sensor, length, beta, eta):
 
 @pytest.mark.parametrize("kind", ["camera", "light"])
 def test_states_of_traced_subpaths(rgb, kind):
-    """Kept vertices carry what the hooks of `transport.subpaths` say, recomputed from the vertices
+    """Kept vertices carry what the hooks of `paths.subpaths` say, recomputed from the vertices
     before them, in a scene without delta functions and with all kinds of junctions."""
     scene, beta = room("rough", "area"), 2
     traits, lights, sensor = SceneTraits(scene), Lights(scene), scene.sensors()[0]

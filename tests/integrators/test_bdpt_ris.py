@@ -650,7 +650,7 @@ def test_iterations_in_any_order(rgb, light_paths):
 
 def test_replays_are_what_was_recorded(monkeypatch):
     """The pass that makes the pmfs has a size that Dr.Jit, left alone, would take for a multiple of
-    its virtual calls' data, and get wrong (`transport.recording.lanes`): 192 cache points times 520
+    its virtual calls' data, and get wrong (`core.recording.lanes`): 192 cache points times 520
     light vertices."""
     mi.set_variant(MONO)
     from mis_integrators.integrators import resampled
