@@ -1,7 +1,7 @@
 # make render   set everything up, then render a bundled scene into out/
 # make test     set everything up, then run the tests
 # make bench    set everything up, then compare all methods on all bundled scenes: out/bench/index.html (half an hour)
-# make lint     set everything up, then check the type hints
+# make lint     set everything up, then check style, layout and type hints
 # make gallery  set everything up, then render the pictures of docs/ (minutes)
 
 PYTHON ?= python3
@@ -19,6 +19,8 @@ test: $(VENV)/installed-test
 	$(VENV)/bin/python -m pytest -n 2
 
 lint: $(VENV)/installed-test
+	$(VENV)/bin/python -m ruff check
+	$(VENV)/bin/python -m ruff format --check
 	$(VENV)/bin/python -m mypy
 
 gallery: $(VENV)/installed

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 
 import mis_integrators  # noqa: F401  (makes LLVM known and registers the plugins)
@@ -13,25 +14,27 @@ import mitsuba as mi
 
 mi.set_variant("llvm_ad_rgb")
 
-import compare  # noqa: E402
-import converge  # noqa: E402
-import costs  # noqa: E402
-import freezing  # noqa: E402
-import multiview  # noqa: E402
-import opinions  # noqa: E402
-import overview  # noqa: E402
-import radius  # noqa: E402
-import references  # noqa: E402
-import resampling  # noqa: E402
-import scaling  # noqa: E402
-import stability  # noqa: E402
-import throughput  # noqa: E402
-import variance  # noqa: E402
-import view_counts  # noqa: E402
-import view_weights  # noqa: E402
-from methods import COMPARED, VARIED, Method, parse_method, registered  # noqa: E402
-from scene_files import BUNDLED, bundled  # noqa: E402
-from sweeps import SWEEPS  # noqa: E402
+from common import references  # noqa: E402
+from common.methods import COMPARED, VARIED, Method, parse_method, registered  # noqa: E402
+from common.scene_files import BUNDLED, bundled  # noqa: E402
+from experiments import (  # noqa: E402
+    compare,
+    converge,
+    costs,
+    freezing,
+    multiview,
+    opinions,
+    overview,
+    radius,
+    resampling,
+    scaling,
+    stability,
+    throughput,
+    variance,
+    view_counts,
+    view_weights,
+)
+from experiments.sweeps import SWEEPS  # noqa: E402
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -103,7 +106,7 @@ def _parser() -> argparse.ArgumentParser:
         type=_method,
         default=registered(VARIED),
         metavar="PLUGIN[:...]",
-        help=f"methods of the variance maps (default: {' '.join(method.label for method in registered(VARIED))})",
+        help=f"methods of the variance maps (default: {_labels(registered(VARIED))})",
     )
     command.add_argument(
         "--variance-scale",
@@ -138,7 +141,8 @@ def _parser() -> argparse.ArgumentParser:
         "--baseline",
         type=_file,
         metavar="FILE",
-        help="figures of an earlier run (compare.json or benchmarks/history/*.json): print what became slower or noisier",
+        help="figures of an earlier run (compare.json or benchmarks/history/*.json): print what "
+        "became slower or noisier",
     )
     command.add_argument(
         "--record", action="store_true", help="keep the figures in benchmarks/history"
@@ -332,6 +336,10 @@ def _method(text: str) -> Method:
     return method
 
 
+def _labels(methods: Sequence[Method]) -> str:
+    return " ".join(method.label for method in methods)
+
+
 def _file(text: str) -> Path:
     if not Path(text).is_file():
         raise argparse.ArgumentTypeError(f"there is no file {text}")
@@ -380,7 +388,7 @@ def _chooses(command: argparse.ArgumentParser, labels: tuple[str, ...], what: st
         type=_method,
         metavar="PLUGIN[:name=value,...]",
         default=methods,
-        help=f"methods, {what} (default: {' '.join(method.label for method in methods)})",
+        help=f"methods, {what} (default: {_labels(methods)})",
     )
 
 

@@ -21,7 +21,7 @@ MESHES = HERE / "meshes"
 TEXTURES = HERE / "textures"
 
 
-# ---------------------------------------------------------------------------------------------------------- writing
+# --- writing ------------------------------------------------------------------
 
 
 def write_ply(name, vertices, faces, normals=None, uv=None):
@@ -72,16 +72,15 @@ def grid_faces(rows, columns):
     return np.concatenate([np.stack([a, c, d], 1), np.stack([a, d, b], 1)])
 
 
-# ------------------------------------------------------------------------------------------------------------ meshes
+# --- meshes -------------------------------------------------------------------
 
 
 def water(size=1.15, n=136):
     """Height field y(x, z) on [-size, size]^2, normals up: six plane waves, normals from the exact
     derivative."""
     rng = np.random.default_rng(7)
-    x, z = np.meshgrid(
-        np.linspace(-size, size, n), np.linspace(-size, size, n), indexing="xy"
-    )  # rows along z
+    # rows along z
+    x, z = np.meshgrid(np.linspace(-size, size, n), np.linspace(-size, size, n), indexing="xy")
     y, dx, dz = np.zeros_like(x), np.zeros_like(x), np.zeros_like(x)
     for i in range(6):
         wavelength = 0.95 * 0.80**i
@@ -163,14 +162,14 @@ def vase(n=56, m=64, height=0.40):
 
     revolve(np.array([[0.0, 0.0], [outer[0, 0], 0.0]]), np.array([0.0, 0.0]))  # foot, looks down
     revolve(outer, t)
+    # rim
     revolve(
         np.stack([np.linspace(outer[-1, 0], inner[0, 0], 2), [height, height]], -1),
         np.array([1.0, 1.0]),
-    )  # rim
+    )
     revolve(inner, inner_t)
-    revolve(
-        np.array([[inner[-1, 0], inner[-1, 1]], [0.0, inner[-1, 1]]]), np.array([0.06, 0.06])
-    )  # inner floor, looks up
+    # inner floor, looks up
+    revolve(np.array([[inner[-1, 0], inner[-1, 1]], [0.0, inner[-1, 1]]]), np.array([0.06, 0.06]))
     triangles, points = np.concatenate(faces), np.concatenate(vertices)
     a, b, c = (points[triangles[:, i]] for i in range(3))
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
@@ -204,15 +203,15 @@ def tiles(
             vertices += [[x, y, z] for (x, y), z in zip(top, top_z)]
             faces += [[base + 4, base + 5, base + 6], [base + 4, base + 6, base + 7]]
             for k in range(4):
-                l = (k + 1) % 4
+                after = (k + 1) % 4
                 faces += [
-                    [base + k, base + l, base + 4 + l],
-                    [base + k, base + 4 + l, base + 4 + k],
+                    [base + k, base + after, base + 4 + after],
+                    [base + k, base + 4 + after, base + 4 + k],
                 ]
     write_ply(name, np.array(vertices), np.array(faces))
 
 
-# ---------------------------------------------------------------------------------------------------------- textures
+# --- textures -----------------------------------------------------------------
 
 
 def noise(n, cells, octaves, seed, stretch=(1, 1)):
@@ -227,13 +226,11 @@ def noise(n, cells, octaves, seed, stretch=(1, 1)):
         iy, ix = py.astype(int), px.astype(int)
         fy, fx = (f * f * (3 - 2 * f) for f in (py - iy, px - ix))
         fy, fx = fy[:, None], fx[None, :]
-
-        def at(dy, dx):
-            return lattice[np.ix_((iy + dy) % cy, (ix + dx) % cx)]
-
+        rows, columns = (iy, (iy + 1) % cy), (ix, (ix + 1) % cx)
+        at = [[lattice[np.ix_(row, column)] for column in columns] for row in rows]
         total += 0.5**o * (
-            (at(0, 0) * (1 - fx) + at(0, 1) * fx) * (1 - fy)
-            + (at(1, 0) * (1 - fx) + at(1, 1) * fx) * fy
+            (at[0][0] * (1 - fx) + at[0][1] * fx) * (1 - fy)
+            + (at[1][0] * (1 - fx) + at[1][1] * fx) * fy
         )
         weight += 0.5**o
     return total / weight
@@ -310,7 +307,7 @@ def patina(n=128):
     write_png("bumps.png", noise(n, 8, 4, 32))
 
 
-# --------------------------------------------------------------------------------------------------------------- sky
+# --- sky ----------------------------------------------------------------------
 
 
 def sky(width=256, height=128):
@@ -337,9 +334,8 @@ def sky(width=256, height=128):
     up = np.clip(d[..., 1], 0, 1)
     image = mix([1.05, 1.05, 1.0], [0.30, 0.52, 1.0], np.sqrt(up))
     image += np.exp(-angle / 18)[..., None] * np.array([1.6, 1.35, 1.0])
-    ground = np.radians(2.5) * (
-        1.2 + np.sin(3 * phi + 0.5) + 0.5 * np.sin(8 * phi + 2)
-    )  # height of the hills
+    # height of the hills
+    ground = np.radians(2.5) * (1.2 + np.sin(3 * phi + 0.5) + 0.5 * np.sin(8 * phi + 2))
     below = np.clip((ground - d[..., 1]) / 0.03, 0, 1)[..., None]
     depth = np.clip(-d[..., 1] / 0.25, 0, 1) * np.ones_like(phi)
     image = mix([0.20, 0.30, 0.24], [0.26, 0.28, 0.12], depth) * below + image * (1 - below)

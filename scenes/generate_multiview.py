@@ -14,7 +14,8 @@ HERE = Path(__file__).resolve().parent / "multiview"
 HEADER = """<?xml version="1.0" encoding="utf-8"?>
 <!--
 {text}
-  Written by scenes/generate.py. The film holds the views side by side; resx is the width of all of them.
+  Written by scenes/generate.py. The film holds the views side by side; \
+resx is the width of all of them.
 -->
 <scene version="3.0.0">
   <default name="integrator" value="volpath_multiview"/>
@@ -54,7 +55,8 @@ FLOOR = """  <shape type="rectangle" id="floor">
 """
 
 LAMP = """  <shape type="rectangle" id="lamp">
-    <transform name="to_world"><scale value="{size}"/><lookat origin="{origin}" target="{target}" up="0, 0, 1"/></transform>
+    <transform name="to_world"><scale value="{size}"/>\
+<lookat origin="{origin}" target="{target}" up="0, 0, 1"/></transform>
     <emitter type="area"><rgb name="radiance" value="{radiance}"/></emitter>
   </shape>
 """
@@ -84,10 +86,11 @@ def numbers(values):
 
 
 def camera(name, origin, target, fov, inner="", indent="    "):
+    look = f'<lookat origin="{numbers(origin)}" target="{numbers(target)}" up="0, 1, 0"/>'
     lines = [
         f'<sensor type="perspective" id="{name}">',
         f'  <float name="fov" value="{fov}"/>',
-        f'  <transform name="to_world"><lookat origin="{numbers(origin)}" target="{numbers(target)}" up="0, 1, 0"/></transform>',
+        f'  <transform name="to_world">{look}</transform>',
         inner,
         "</sensor>",
     ]
@@ -112,9 +115,8 @@ def write(name, text, size, depth, parts):
 def smoke(n=24):
     """Density in [0, 1] on an n^3 grid: a plume that rises, widens and breaks up; wisps, and empty
     space around it."""
-    z, y, x = np.meshgrid(
-        *[(np.arange(n) + 0.5) / n] * 3, indexing="ij"
-    )  # rows of a volume: z, then y, then x
+    # rows of a volume: z, then y, then x
+    z, y, x = np.meshgrid(*[(np.arange(n) + 0.5) / n] * 3, indexing="ij")
     rng = np.random.default_rng(5)
     turbulence = np.zeros((n, n, n))
     for octave in range(4):
@@ -184,7 +186,8 @@ def main():
         [
             "Smoke over a textured floor, seen from 16 cameras all around it.",
             "",
-            "A heterogeneous grid, many null collisions; every view sees the smoke and most of the floor.",
+            "A heterogeneous grid, many null collisions; "
+            "every view sees the smoke and most of the floor.",
             "Claim: sharing paths saves most of the long multiple scattering.",
         ],
         (1024, 64),
@@ -196,7 +199,8 @@ def main():
         [
             "A light field of 8 x 8 cameras: a glossy knot in homogeneous fog.",
             "",
-            "64 close views share almost all of their paths; the knot's lobes differ from view to view,",
+            "64 close views share almost all of their paths; "
+            "the knot's lobes differ from view to view,",
             "so suffixes must come from the mixture.",
         ],
         (2048, 32),
@@ -207,11 +211,14 @@ def main():
             '    <float name="albedo" value="0.9"/>\n'
             '    <phase type="hg"><float name="g" value="0.5"/></phase>\n  </medium>\n',
             '  <shape type="cube" id="container">\n'
-            '    <transform name="to_world"><scale x="2.5" y="1.6" z="2"/><translate y="1"/></transform>\n'
+            '    <transform name="to_world"><scale x="2.5" y="1.6" z="2"/>'
+            '<translate y="1"/></transform>\n'
             '    <bsdf type="null"/>\n    <ref name="interior" id="fog"/>\n  </shape>\n',
-            '  <shape type="ply" id="knot">\n    <string name="filename" value="../meshes/knot.ply"/>\n'
+            '  <shape type="ply" id="knot">\n'
+            '    <string name="filename" value="../meshes/knot.ply"/>\n'
             '    <transform name="to_world"><scale value="1.6"/><translate y="0.8"/></transform>\n'
-            '    <bsdf type="roughconductor"><string name="material" value="Cu"/><float name="alpha" value="0.12"/></bsdf>\n'
+            '    <bsdf type="roughconductor"><string name="material" value="Cu"/>'
+            '<float name="alpha" value="0.12"/></bsdf>\n'
             "  </shape>\n",
             FLOOR,
             lamp,
@@ -221,7 +228,8 @@ def main():
     write(
         "fly_through",
         [
-            "A camera flies into the smoke: eight views with films of their own, the last two within the medium.",
+            "A camera flies into the smoke: eight views with films of their own, "
+            "the last two within the medium.",
             "",
             "Views that see each other's pivots from very different distances.",
             "Render with mis_integrators.render_views or mis-render (option all-views).",
@@ -246,10 +254,14 @@ def main():
                     camera("back", (0, 1.2, -0.5), (0, 0.9, -4), 45),
                 ]
             ),
-            '  <medium type="homogeneous" id="cloud">\n    <float name="sigma_t" value="0.8"/>\n    <float name="albedo" value="0.95"/>\n'
+            '  <medium type="homogeneous" id="cloud">\n'
+            '    <float name="sigma_t" value="0.8"/>\n'
+            '    <float name="albedo" value="0.95"/>\n'
             "  </medium>\n",
             *(
-                f'  <shape type="sphere" id="{name}">\n    <point name="center" x="0" y="1" z="{z}"/>\n    <float name="radius" value="0.9"/>\n'
+                f'  <shape type="sphere" id="{name}">\n'
+                f'    <point name="center" x="0" y="1" z="{z}"/>\n'
+                '    <float name="radius" value="0.9"/>\n'
                 f'    <bsdf type="null"/>\n    <ref name="interior" id="cloud"/>\n  </shape>\n'
                 for name, z in (("cloud_front", 3), ("cloud_back", -3))
             ),

@@ -52,7 +52,8 @@ def pytest_addoption(parser):
     parser.addoption(
         "--vectors",
         metavar="DIR",
-        help="folder with test vectors (optimal_weights.json, shifts.json, resampling.json), used instead of generated worlds",
+        help="folder with test vectors (optimal_weights.json, shifts.json, resampling.json), "
+        "used instead of generated worlds",
     )
     parser.addoption(
         "--maps",
@@ -74,8 +75,8 @@ def pytest_configure(config):
     )
     config.addinivalue_line(
         "markers",
-        "thinned(inner, n): of a product of parameters, the last of which has `inner` values, every n-th "
-        "case in diagonals; the rest is full",
+        "thinned(inner, n): of a product of parameters, the last of which has `inner` values, "
+        "every n-th case in diagonals; the rest is full",
     )
     config.addinivalue_line(
         "markers",

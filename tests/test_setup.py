@@ -45,7 +45,7 @@ def library(root: Path, name: str, *links: str) -> Path:
     return file
 
 
-# --- Which LLVM -----------------------------------------------------------------------------------
+# --- Which LLVM ---------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -224,7 +224,7 @@ def set_up(tmp_path):
     command(
         tools,
         "apt-cache",
-        "echo libllvm16; echo libllvm17t64; echo libllvm19; echo libllvm19-dev; echo libllvm22; echo libllvm23; echo libllvm100",
+        "for name in 16 17t64 19 19-dev 22 23 100; do echo libllvm$name; done",
     )
     python = command(
         tools,
@@ -311,7 +311,9 @@ def test_set_up_waits_for_another_update(set_up, tmp_path):
     command(
         set_up.tools,
         "apt-get",
-        f'[ -e {tmp_path}/waited ] || {{ echo "E: Could not get lock x." >&2; echo "E: no" >&2; exit 100; }}; touch {tmp_path}/installed',
+        f"[ -e {tmp_path}/waited ] || "
+        '{ echo "E: Could not get lock x." >&2; echo "E: no" >&2; exit 100; }; '
+        f"touch {tmp_path}/installed",
     )
     result, _ = set_up()
     assert result.returncode == 0, result.stderr
@@ -331,7 +333,7 @@ def test_tested_versions_are_printed(capsys):
     assert capsys.readouterr().out == f"{llvm.OLDEST_WORKING} {llvm.NEWEST_TESTED}\n"
 
 
-# --- Registration ---------------------------------------------------------------------------------
+# --- Registration -------------------------------------------------------------
 
 CHECK = """
 def check(variant):
@@ -362,12 +364,13 @@ def test_plugins_are_there_whatever_is_imported_first(code):
 
 def test_scalar_variant_says_what_the_plugins_need():
     result = run_python(
-        "import mis_integrators, mitsuba as mi; mi.set_variant('scalar_rgb')\nmi.load_dict({'type': 'bdpm'})"
+        "import mis_integrators, mitsuba as mi; mi.set_variant('scalar_rgb')\n"
+        "mi.load_dict({'type': 'bdpm'})"
     )
     assert "llvm_ad_*" in result.stderr.splitlines()[-1]
 
 
-# --- Newer versions -------------------------------------------------------------------------------
+# --- Newer versions -----------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -375,7 +378,8 @@ def test_scalar_variant_says_what_the_plugins_need():
 )
 def test_newer_version_is_one_line(name, version):
     result = run_python(
-        f"import drjit, mitsuba; {name}.__version__ = '{version}'\nimport mis_integrators, mis_integrators.app.loading"
+        f"import drjit, mitsuba; {name}.__version__ = '{version}'\n"
+        "import mis_integrators, mis_integrators.app.loading"
     )
     assert result.returncode == 0 and result.stderr.count("\n") == 1
     assert (
@@ -385,7 +389,11 @@ def test_newer_version_is_one_line(name, version):
 
 
 def test_warning_of_a_newer_version_can_be_filtered():
-    code = "import warnings; warnings.filterwarnings('ignore', module='mis_integrators')\nimport mitsuba; mitsuba.__version__ = '3.10.0'\nimport mis_integrators"
+    code = (
+        "import warnings; warnings.filterwarnings('ignore', module='mis_integrators')\n"
+        "import mitsuba; mitsuba.__version__ = '3.10.0'\n"
+        "import mis_integrators"
+    )
     result = run_python(code)
     assert (result.returncode, result.stdout, result.stderr) == (0, "", "")
 
@@ -415,7 +423,7 @@ def test_newest_tested_versions_are_those_of_the_package():
         assert re.search(rf'"{name}>={major}\.{minor}\.\d+,<{major}\.{minor + 1}"', text), name
 
 
-# --- The package ----------------------------------------------------------------------------------
+# --- The package --------------------------------------------------------------
 
 
 def test_modules_that_define_plugin_classes_are_loaded_anew(rgb):
@@ -454,6 +462,20 @@ def test_files_that_are_no_modules_are_declared():
     }
     data = {file for file in package_files() if file.suffix != ".py"}
     assert data and data <= named
+
+
+@pytest.mark.parametrize("command", [("check",), ("format", "--check")], ids=" ".join)
+def test_style_and_layout_are_ruffs(command):
+    """Of the whole repository, as pyproject.toml asks for."""
+    pytest.importorskip("ruff", reason="ruff is not installed: pip install 'mis-integrators[lint]'")
+    result = subprocess.run(
+        [sys.executable, "-m", "ruff", *command, "--no-cache"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert result.returncode == 0, result.stdout
 
 
 def test_type_hints_are_right(tmp_path):

@@ -54,9 +54,8 @@ def pytest_generate_tests(metafunc):
         ]
     else:
         file = Path(directory) / "optimal_weights.json"
-        entries = (
-            json.loads(file.read_text()) if file.exists() else []
-        )  # other kinds of vectors are no business of these tests
+        # other kinds of vectors are no business of these tests
+        entries = json.loads(file.read_text()) if file.exists() else []
         cases = [
             (entry["K"], f"K{entry['K']}-{i}", functools.partial(worlds.load, entry))
             for i, entry in enumerate(entries)
@@ -76,11 +75,11 @@ def distance(weights, expected, relative=True, world=None):
     """Largest difference, relative to 1 + |w|, where light makes the weight matter."""
     return max(
         np.max(
-            np.abs(weights[l, i] - w)
+            np.abs(weights[family, i] - w)
             / (1 + np.abs(w) * relative)
-            * (world is None or world.light(l) > 0)
+            * (world is None or world.light(family) > 0)
         )
-        for (l, i), w in expected.items()
+        for (family, i), w in expected.items()
     )
 
 
@@ -111,18 +110,16 @@ def closed_form(world):
     return dict(zip(world.families(), values))
 
 
-# ---------------------------------------------------------------- optimal weights of known worlds
+# --- optimal weights of known worlds ------------------------------------------
 
 
 def test_recursion(case):
     world, expected, J, _ = case
     weights, e = worlds.recurse(world)
-    assert (
-        distance(weights, expected, relative=False) < 1e-9
-    )  # the answers' own rounding is 1e-11; weights are of order 10
-    assert worlds.noise(world, weights) == pytest.approx(
-        J, rel=1e-9
-    )  # quadratic in the weights' error: rounding only
+    # the answers' own rounding is 1e-11; weights are of order 10
+    assert distance(weights, expected, relative=False) < 1e-9
+    # quadratic in the weights' error: rounding only
+    assert worlds.noise(world, weights) == pytest.approx(J, rel=1e-9)
     assert all(np.all((x > 0) & (x <= 1)) for x in e)
 
 
@@ -130,18 +127,16 @@ def test_recursion_in_single_precision(case):
     world, expected, _, _ = case
     weights, _ = worlds.recurse(world, dtype=np.float32)
     assert all(w.dtype == np.float32 for w in weights.values())
-    assert (
-        distance(weights, expected) < 1e-4
-    )  # some hundred roundings of 6e-8, no cancellation but in 1 - sum: 4e-7 seen
+    # some hundred roundings of 6e-8, no cancellation but in 1 - sum: 4e-7 seen
+    assert distance(weights, expected) < 1e-4
 
 
 def test_single_strategies(case):
-    world, weights, J, singles = case
+    world, _, J, singles = case
     for k in range(world.K):
         noise = worlds.noise(world, worlds.single(world, k))
-        assert singles is None or noise == pytest.approx(
-            singles[k], rel=1e-9
-        )  # sums of a hundred positive terms
+        # sums of a hundred positive terms
+        assert singles is None or noise == pytest.approx(singles[k], rel=1e-9)
         assert noise >= J
 
 
@@ -247,14 +242,13 @@ def test_drjit_arrays(case, local, rgb):
     assert distance(weights, expected) < 1e-5  # fused multiply-adds round otherwise
 
 
-# ---------------------------------------------------------------- extreme worlds
+# --- extreme worlds -----------------------------------------------------------
 
 
 @pytest.mark.parametrize("K", [2, 3, 4, 5])
 @pytest.mark.parametrize("n", [0.01, 1, 1e4, 1e10])
-@pytest.mark.parametrize(
-    "spread, zeros", [(1.2, 0), (1.2, 0.4), (4, 0.2)]
-)  # 4: values from 1e-7 to 1e7
+# 4: values from 1e-7 to 1e7
+@pytest.mark.parametrize("spread, zeros", [(1.2, 0), (1.2, 0.4), (4, 0.2)])
 def test_extreme_worlds(K, n, spread, zeros):
     world, best, J, _ = generated(K, 11, states=(2,) * (K - 1), n_F=n, spread=spread, zeros=zeros)
     weights, _ = worlds.recurse(world)
@@ -263,9 +257,8 @@ def test_extreme_worlds(K, n, spread, zeros):
     assert noise <= J * (1 + 1e-9)
     if spread < 2:
         assert noise == pytest.approx(J, rel=1e-9)
-        assert (
-            distance(weights, best, world=world) < 1e-6
-        )  # lstsq's rounding times condition: 2e-8 at n = 1e10
+        # lstsq's rounding times condition: 2e-8 at n = 1e10
+        assert distance(weights, best, world=world) < 1e-6
         single, _ = worlds.recurse(world, dtype=np.float32)
         assert distance(single, weights) < 1e-4
         assert worlds.noise(
@@ -304,13 +297,12 @@ def test_few_photons(K):
         if i < K - 1:
             throughput = (throughput * world.albedo(i))[..., None] * np.ones_like(world.f[i])
     total = sum(1 / k for k in kappa)
-    assert all(
-        np.allclose(weights[K, i], 1 / k / total, atol=1e-6) for i, k in enumerate(kappa)
-    )  # first order in n
-    assert all(np.allclose(weights[l, l - 1], 1, atol=1e-6) for l in range(2, K))
+    # first order in n
+    assert all(np.allclose(weights[K, i], 1 / k / total, atol=1e-6) for i, k in enumerate(kappa))
+    assert all(np.allclose(weights[family, family - 1], 1, atol=1e-6) for family in range(2, K))
 
 
-# ---------------------------------------------------------------- any input
+# --- any input ----------------------------------------------------------------
 
 values = st.one_of(st.just(0.0), st.floats(1e-12, 1e6))
 factors = st.one_of(st.just(0.0), st.floats(1e-3, 1e3))
@@ -346,18 +338,19 @@ def test_anything_gives_weights(world, noise, local):
     """Also with integrals that are wrong by any factor: the recursion has no singular place."""
     for dtype in (np.float32, np.float64):
         factor = iter(noise)
+
+        def off(x, factor=factor, dtype=dtype):
+            return (x * next(factor)).astype(dtype)
+
         with np.errstate(over="ignore", under="ignore"):
-            weights, e = worlds.recurse(
-                world, local, dtype, estimate=lambda x: (x * next(factor)).astype(dtype)
-            )
+            weights, e = worlds.recurse(world, local, dtype, estimate=off)
         assert all(np.all((x > 0) & (x <= 1)) for x in e)
         assert all(np.all(np.isfinite(w)) for w in weights.values())
-        for l in range(2, world.K + 1):
-            family = [weights[l, i].astype(np.float64) for i in range(l)]
+        for count in range(2, world.K + 1):
+            family = [weights[count, i].astype(np.float64) for i in range(count)]
             size = 1 + sum(np.abs(w) for w in family)
-            assert np.all(
-                np.abs(sum(family) - 1) < 10 * np.finfo(dtype).eps * size
-            )  # at most five terms
+            # at most five terms
+            assert np.all(np.abs(sum(family) - 1) < 10 * np.finfo(dtype).eps * size)
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
@@ -373,13 +366,12 @@ def test_no_weight_for_what_cannot_be(dtype):
 
     for K in (2, 3, 4):
         world = Blocked(**vars(worlds.random_world(5, K)))
-        world.L0 = [
-            0 * x for x in world.L0
-        ]  # nor does a luminance that the weights take for zero change that
+        # nor does a luminance that the weights take for zero change that
+        world.L0 = [0 * x for x in world.L0]
         weights, _ = worlds.recurse(world, dtype=dtype)
-        for l, i in world.families():
+        for family, i in world.families():
             for j in range(i):  # z_{j+1} unreachable
-                assert np.all(weights[l, i][(slice(None),) * j + (0,)] == 0)
+                assert np.all(weights[family, i][(slice(None),) * j + (0,)] == 0)
 
 
 def test_responses():
@@ -392,15 +384,14 @@ def test_responses():
     assert np.allclose(recursion.kernel_rest(r, f), [1, 0, 1e-12, 0], rtol=1e-6, atol=0)
 
 
-# ---------------------------------------------------------------- heuristics
+# --- heuristics ---------------------------------------------------------------
 
 
 @given(st.lists(st.floats(-13, 13), min_size=1, max_size=6), st.sampled_from([1, 2, 3, 1.5]))
 @settings(max_examples=200, deadline=None)
 def test_heuristics_are_veachs(logarithms, beta):
-    densities = np.exp(
-        np.array(logarithms) / beta
-    )  # ratios^beta up to e^26, within the limit of 1e12
+    # ratios^beta up to e^26, within the limit of 1e12
+    densities = np.exp(np.array(logarithms) / beta)
     expected = densities**beta / np.sum(densities**beta)
     ratios = list(densities[:-1] / densities[1:])
     # Positive terms only: a hundred roundings of 1e-16 at most.
@@ -424,9 +415,8 @@ def test_heuristics_take_any_ratio(ratios, beta, dtype):
     with np.errstate(over="ignore"):
         weights = heuristics.heuristic_weights([np.array([ratio], dtype) for ratio in ratios], beta)
     assert all(np.all((w >= 0) & (w <= 1)) for w in weights)
-    assert np.sum(weights) == pytest.approx(
-        1, abs=float(20 * np.finfo(dtype).eps + 1e-11)
-    )  # six roundings, and the limit's 1e-12
+    # six roundings, and the limit's 1e-12
+    assert np.sum(weights) == pytest.approx(1, abs=float(20 * np.finfo(dtype).eps + 1e-11))
 
 
 def test_heuristics_of_impossible_strategies():
@@ -442,9 +432,8 @@ def test_heuristics_on_drjit(rgb):
         weights = heuristics.heuristic_weights([mi.Float(r) for r in ratios], beta)
         with np.errstate(over="ignore"):
             expected = heuristics.heuristic_weights(list(ratios), beta)
-        assert np.allclose(
-            np.array(weights), expected, rtol=1e-4, atol=1e-7
-        )  # powers of Dr.Jit: a few roundings, times ten factors
+        # powers of Dr.Jit: a few roundings, times ten factors
+        assert np.allclose(np.array(weights), expected, rtol=1e-4, atol=1e-7)
 
 
 def test_closed_forms_on_drjit(rgb):
@@ -466,6 +455,5 @@ def test_closed_forms_on_drjit(rgb):
 
     for result, expected in zip(chain(*[mi.Float(a) for a in x]), chain(*x.astype(np.float64))):
         assert dr.width(result) == 50
-        assert np.all(
-            np.abs(np.array(result) - expected) < 1e-4 * (1 + np.abs(expected))
-        )  # a dozen roundings, mild cancellation
+        # a dozen roundings, mild cancellation
+        assert np.all(np.abs(np.array(result) - expected) < 1e-4 * (1 + np.abs(expected)))

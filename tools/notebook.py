@@ -46,9 +46,8 @@ def main(arguments: list[str]) -> int:
     if NOTEBOOK.exists() and NOTEBOOK.read_text() == text:
         return 0
     if "--check" in arguments:
-        print(
-            f"{NOTEBOOK.relative_to(ROOT)} is not what {PAGE.relative_to(ROOT)} says: run tools/notebook.py"
-        )
+        files = f"{NOTEBOOK.relative_to(ROOT)} is not what {PAGE.relative_to(ROOT)} says"
+        print(f"{files}: run tools/notebook.py")
         return 1
     NOTEBOOK.write_text(text)
     return 0

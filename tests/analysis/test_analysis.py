@@ -56,7 +56,7 @@ def exact_divisor():
     return truth() ** 2 + RELATIVE_OFFSET
 
 
-# --- Metrics --------------------------------------------------------------------------------------------
+# --- Metrics ------------------------------------------------------------------
 
 
 def test_squared_error_is_free_of_the_references_noise():
@@ -65,9 +65,8 @@ def test_squared_error_is_free_of_the_references_noise():
     found = errors(render(0), references())
     assert found.mse == pytest.approx(products.mean())
     assert abs(found.mse - (OFFSET**2 + NOISE**2)) < allowed
-    assert (
-        allowed < 0.2 * REFERENCE_NOISE**2
-    )  # else the noise of the references, left in, would pass
+    # else the noise of the references, left in, would pass
+    assert allowed < 0.2 * REFERENCE_NOISE**2
 
 
 def test_relative_squared_error():
@@ -153,7 +152,7 @@ def test_flip():
     assert little == pytest.approx(little_map.mean(), rel=1e-4)
 
 
-# --- Confidence -----------------------------------------------------------------------------------------
+# --- Confidence ---------------------------------------------------------------
 
 
 def covered(trials, make, true):

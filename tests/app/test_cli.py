@@ -88,7 +88,7 @@ def use(monkeypatch):
     return use
 
 
-# --- What is written ------------------------------------------------------------------------------
+# --- What is written ----------------------------------------------------------
 
 
 def test_image_metadata_and_preview(scene, tmp_path):
@@ -103,9 +103,8 @@ def test_image_metadata_and_preview(scene, tmp_path):
     assert mi.__version__ in header["versions"] and header["renderTime"] > 0
     preview = np.array(mi.Bitmap(str(tmp_path / "new" / "a.png")))
     assert preview.shape == (8, 12, 3) and preview.dtype == np.uint8
-    np.testing.assert_allclose(
-        preview[0, 0], [137, 188, 255], atol=1
-    )  # the sRGB curve at 0.25, 0.5 and 1
+    # the sRGB curve at 0.25, 0.5 and 1
+    np.testing.assert_allclose(preview[0, 0], [137, 188, 255], atol=1)
     assert sorted(file.name for file in (tmp_path / "new").iterdir()) == ["a.exr", "a.png"]
 
 
@@ -190,7 +189,7 @@ def test_largest_seed_is_kept_with_the_image(scene, tmp_path):
 def test_failed_write_leaves_the_old_file(tmp_path):
     file = tmp_path / "a.exr"
     output.write_exr(file, np.ones((2, 3, 1)), ["Y"], {})
-    with pytest.raises(Exception):
+    with pytest.raises(Exception, match="object"):
         output.write_exr(file, np.zeros((2, 3, 1)), ["Y"], {"name": object()})
     np.testing.assert_array_equal(read(file)[1]["Y"], 1)
     assert list(tmp_path.iterdir()) == [file]
@@ -205,7 +204,7 @@ def test_preview_of_luminance_and_of_spectral_bands(tmp_path, rgb):
     assert not output.write_png(tmp_path / "bands.png", image, ["S400"])
 
 
-# --- Which integrator, which sensor ---------------------------------------------------------------
+# --- Which integrator, which sensor -------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -279,7 +278,7 @@ def test_sensor_is_chosen(scene, tmp_path):
     assert read(tmp_path / "a.exr")[1]["R"].shape == (6, 5)
 
 
-# --- How much is rendered -------------------------------------------------------------------------
+# --- How much is rendered -----------------------------------------------------
 
 
 def test_passes_are_independent_and_add_up(scene, monkeypatch):
@@ -413,7 +412,7 @@ def test_why_bdpm_auto_chose_is_said(scene, tmp_path, capsys):
     assert capsys.readouterr() == ("", "")
 
 
-# --- Errors ---------------------------------------------------------------------------------------
+# --- Errors -------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -441,7 +440,8 @@ def test_error_in_scene_or_parameter_is_one_line(scene, tmp_path, capsys, argume
     [
         "",
         "<scene",
-        "<scene version='3.0.0'><shape type='obj'><string name='filename' value='none.obj'/></shape></scene>",
+        "<scene version='3.0.0'><shape type='obj'><string name='filename' value='none.obj'/>"
+        "</shape></scene>",
         "<scene version='3.0.0'/>",
         "<bsdf version='3.0.0' type='diffuse'/>",
     ],
@@ -547,7 +547,7 @@ def test_picture_that_cannot_be_written_is_named(scene, tmp_path, use, capsys):
     assert read(tmp_path / "a.exr")[0]["iterations"] == 5
 
 
-# --- Ctrl-C ---------------------------------------------------------------------------------------
+# --- Ctrl-C -------------------------------------------------------------------
 
 
 def test_interrupt_writes_what_there_is(scene, tmp_path, use, capsys):
@@ -615,9 +615,8 @@ def test_interrupted_process(scene, tmp_path):
         env={**os.environ, "PYTHONUNBUFFERED": "1"},
     )
     try:
-        assert (
-            "iteration" in process.stderr.readline()
-        )  # the first line of progress: an iteration is done
+        # the first line of progress: an iteration is done
+        assert "iteration" in process.stderr.readline()
         process.send_signal(signal.SIGINT)
         assert process.wait(timeout=30) == 130
         assert "interrupted after" in process.stderr.read().splitlines()[-1]

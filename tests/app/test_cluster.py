@@ -124,7 +124,7 @@ def test_worker_that_sees_another_scene_is_an_error(scene, client, tmp_path):
     session = cluster.DistributedSession(client, opened, False, 1)
     (tmp_path / "lamp.xml").write_text((tmp_path / "lamp.xml").read_text().replace("5, 4", "5, 5"))
     with pytest.raises(
-        cluster.ClusterError, match="a worker sees another render.*lamp.xml has changed"
+        cluster.ClusterError, match=r"a worker sees another render.*lamp\.xml has changed"
     ):
         iterate_for(session, 60)
 
@@ -155,16 +155,15 @@ def test_error_of_a_worker_leaves_nothing_half_summed(scene, client, monkeypatch
     request = request_for(scene, "path", 8)
     opened = request.open()
     job = cluster.Job("test", request, opened.session.learned, opened.identity(), False, 1)
-    worker = list(client.scheduler_info()["workers"])[0]
+    worker = next(iter(client.scheduler_info()["workers"]))
 
     def ask(iterations):
         return client.submit(cluster.run, job, iterations, pure=False, workers=[worker]).result()
 
     expected = ask([4])[0]["total"]
-    with pytest.raises(Exception):
-        ask(
-            [3, -1]
-        )  # numpy refuses a negative seed, or the sums a negative iteration, after iteration 3 was summed
+    # After iteration 3 was summed, numpy refuses a negative seed, or the sums a negative iteration.
+    with pytest.raises(Exception, match="negative"):
+        ask([3, -1])
     arrays, done, _ = ask([4])
     assert done == Iterations(0, (4,))
     np.testing.assert_allclose(arrays["total"], expected, rtol=1e-4, atol=1e-6)
@@ -236,7 +235,10 @@ def test_scheduler_that_is_not_there(scene, tmp_path, monkeypatch, capsys):
 
 
 def test_dask_that_is_missing(scene, tmp_path):
-    hidden = "import sys; sys.modules['distributed'] = None; from mis_integrators import cli; sys.exit(cli.main())"
+    hidden = (
+        "import sys; sys.modules['distributed'] = None; "
+        "from mis_integrators.app import cli; sys.exit(cli.main())"
+    )
     result = run(
         [
             command(scene)[0],
@@ -304,7 +306,7 @@ def test_stopped_worker_costs_its_iterations_only(scene, client, impatient):
     pids = client.run(os.getpid)
     session = cluster.DistributedSession(client, request.open(), False, 1)
     iterate_for(session, 60, lambda: session.iterations >= 3)
-    victim = list(pids)[0]
+    victim = next(iter(pids))
     iterate_for(session, 60, lambda: client.processing()[victim])
     os.kill(pids[victim], signal.SIGSTOP)
     try:
@@ -315,9 +317,8 @@ def test_stopped_worker_costs_its_iterations_only(scene, client, impatient):
         os.kill(pids[victim], signal.SIGCONT)
     assert session.sums.done == Iterations(60)
     assert same(whole.image(), session.image())
-    iterate_for(
-        session, 20, lambda: not session._watch.silent
-    )  # a worker that is heard of again counts again
+    # a worker that is heard of again counts again
+    iterate_for(session, 20, lambda: not session._watch.silent)
     assert set(session._watch.present) == set(pids)
 
 
@@ -331,7 +332,7 @@ def test_no_worker_is_heard_of(scene, client, impatient):
     polls, start = [], time.monotonic()
     try:
         with pytest.raises(
-            cluster.ClusterError, match="there has been no worker for 2 s.*the 2 that it knows"
+            cluster.ClusterError, match=r"there has been no worker for 2 s.*the 2 that it knows"
         ):
             while True:
                 polls.append(time.monotonic())
@@ -480,26 +481,27 @@ def test_scene_that_a_worker_cannot_open_is_tried_once(scene, client):
     session = cluster.DistributedSession(client, request_for(scene, "path", 1).open(), False, 1)
     (scene.parent / "lamp.xml").write_text("<scene>")
     with pytest.raises(
-        cluster.ClusterError, match="a worker cannot open the scene: .*lamp.xml.*tcp://127.0.0.1"
+        cluster.ClusterError,
+        match=r"a worker cannot open the scene: .*lamp\.xml.*tcp://127\.0\.0\.1",
     ) as raised:
         iterate_for(session, 60)
     assert "\n" not in str(raised.value) and "Traceback" not in str(raised.value)
-    assert (
-        sum(client.run(eval, "__import__('mis_integrators').opening.Request.tries").values()) == 1
-    )
+    tries = client.run(eval, "__import__('mis_integrators').app.request.Request.tries")
+    assert sum(tries.values()) == 1
 
 
 def test_iteration_that_fails_is_tried_once_more_elsewhere(scene, client, monkeypatch):
     session = cluster.DistributedSession(client, request_for(scene, "path", 8).open(), False, 1)
-    numbers = iter(
-        [[0], [1, -1], [2]]
-    )  # the sums refuse a negative iteration, or numpy such a seed
+    # the sums refuse a negative iteration, or numpy such a seed
+    numbers = iter([[0], [1, -1], [2]])
     monkeypatch.setattr(session, "_take_numbers", lambda workers: next(numbers, []))
     sent, send = [], session._send
     monkeypatch.setattr(
         session, "_send", lambda batch, workers: (sent.append(batch), send(batch, workers))
     )
-    with pytest.raises(cluster.ClusterError, match="a worker failed: .*negative.*tcp://127.0.0.1"):
+    with pytest.raises(
+        cluster.ClusterError, match=r"a worker failed: .*negative.*tcp://127\.0\.0\.1"
+    ):
         iterate_for(session, 60)
     (failed,) = [batch for batch in session._waiting if batch.failed_at]
     assert (
@@ -652,9 +654,8 @@ def test_overdue_batches_are_handed_to_others_and_duplicates_dropped(fakes):
     assert [future.key.partition(" ")[2] for future in again] == ["[1]", "[2]", "[3]", "[4]"]
     for future, first in zip(again, client.futures[1:5]):
         assert future.workers != first.workers and not first.released
-    client.futures[1].finish(
-        sums_of(1)
-    )  # the first copy comes after all, and so does the second, at the same time
+    # the first copy comes after all, and so does the second, at the same time
+    client.futures[1].finish(sums_of(1))
     again[0].finish(sums_of(1))
     again[1].finish(sums_of(2))  # of this one only the second comes in time
     iterate_for(session, 10, lambda: len(session.sums.done) == 3)
@@ -662,7 +663,7 @@ def test_overdue_batches_are_handed_to_others_and_duplicates_dropped(fakes):
     client.futures[2].finish(sums_of(2))
     pass_time(session, 1)
     with pytest.raises(
-        cluster.ClusterError, match="no worker has finished iteration [34] in 31 s, 3 times"
+        cluster.ClusterError, match=r"no worker has finished iteration [34] in 31 s, 3 times"
     ):
         pass_time(session, 60)
         pass_time(session, 60)
@@ -671,7 +672,7 @@ def test_overdue_batches_are_handed_to_others_and_duplicates_dropped(fakes):
 
 
 def test_time_in_which_the_gatherer_itself_was_stopped_does_not_count(fakes, monkeypatch):
-    client, session = fakes
+    _, session = fakes
     session.iterate()
     later = time.monotonic() + 10000
     monkeypatch.setattr(cluster.time, "monotonic", lambda: later)
@@ -687,7 +688,7 @@ def test_sums_that_cannot_be_fetched(fakes, monkeypatch):
     session.iterate()
     for count in (1, 2):
         client.futures[-1].finish(TimeoutError())
-        iterate_for(session, 10, lambda: len(client.futures) == count + 1)
+        iterate_for(session, 10, lambda count=count: len(client.futures) == count + 1)
     client.futures[-1].finish(TimeoutError())
     with pytest.raises(cluster.ClusterError, match="the sums of iteration 0 could not be fetched"):
         iterate_for(session, 10)

@@ -101,7 +101,10 @@ def test_module(tmp_path):
 
 def test_nothing_large_is_imported_first():
     """Before the handlers are there."""
-    code = "import sys, mis_render; assert not {'mitsuba', 'drjit', 'numpy', 'mis_integrators'} & set(sys.modules)"
+    code = (
+        "import sys, mis_render\n"
+        "assert not {'mitsuba', 'drjit', 'numpy', 'mis_integrators'} & set(sys.modules)"
+    )
     subprocess.run(
         [sys.executable, "-c", code],
         check=True,

@@ -25,7 +25,7 @@ def scene(tmp_path, rgb):
     return write_scene(tmp_path)
 
 
-# --- Values that are not finite -------------------------------------------------------------------------
+# --- Values that are not finite -----------------------------------------------
 
 
 @pytest.fixture
@@ -243,7 +243,7 @@ def test_one_pixel_that_is_brighter_than_all_others_together():
     assert stopping.relative_error(mean, variance) == pytest.approx(error, rel=0.02)
 
 
-# --- Errors in the middle -------------------------------------------------------------------------------
+# --- Errors in the middle -----------------------------------------------------
 
 
 def failing(monkeypatch, plugin, error, at):
@@ -333,7 +333,7 @@ def test_error_while_summing_sums_nothing(scene, plugin, monkeypatch):
     assert session.iterations == 2
 
 
-# --- Two jobs, one output -------------------------------------------------------------------------------
+# --- Two jobs, one output -----------------------------------------------------
 
 
 def test_second_job_is_refused_and_the_first_goes_on(scene, tmp_path):
@@ -458,7 +458,7 @@ def test_what_is_no_file_is_not_replaced(scene, tmp_path, capsys, kind):
         assert stat.S_ISCHR(os.stat("/dev/null").st_mode)
 
 
-# --- The version that made an image ---------------------------------------------------------------------
+# --- The version that made an image -------------------------------------------
 
 
 def test_other_sources_are_another_render(scene, tmp_path, monkeypatch, capsys):
@@ -476,7 +476,10 @@ def test_other_sources_are_another_render(scene, tmp_path, monkeypatch, capsys):
 
 def test_fingerprint_is_of_every_source(tmp_path):
     """It changes with any byte of any module, and with a module's name."""
-    program = "import sys; sys.path.insert(0, sys.argv[1]); from mis_integrators import fingerprint; print(fingerprint.of_package())"
+    program = (
+        "import sys; sys.path.insert(0, sys.argv[1])\n"
+        "from mis_integrators.app import fingerprint; print(fingerprint.of_package())"
+    )
     import shutil
 
     def fingerprint_of(folder):

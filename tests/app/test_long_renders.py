@@ -29,7 +29,7 @@ def scene(tmp_path, rgb) -> Path:
     return write_scene(tmp_path)
 
 
-# --- Sums and iterations ----------------------------------------------------------------------------
+# --- Sums and iterations ------------------------------------------------------
 
 
 def test_iterations_are_a_set():
@@ -73,7 +73,7 @@ def test_sums_are_merged_once():
     np.testing.assert_array_equal(sums["total"], 2)
 
 
-# --- What a scene consists of -------------------------------------------------------------------------
+# --- What a scene consists of -------------------------------------------------
 
 
 @pytest.mark.parametrize("comment", ["<!-- one -->", "<!-- a -- b, value='none.ply' -->"])
@@ -87,13 +87,14 @@ def test_scene_that_only_mitsuba_takes_has_its_digests(tmp_path, rgb, comment):
     file.write_text(f"""<scene version="3.0.0">{comment}<default name="picture" value="co"/>
         <bsdf type="diffuse"><spectrum name="reflectance" value="{spectrum}"/></bsdf>
         <bsdf type="diffuse"><texture type="bitmap" name="reflectance"
-            ><string name = "filename" value='{tmp_path}/it&apos;s &amp; $picture.bmp'/></texture></bsdf></scene>""")
+            ><string name = "filename" value='{tmp_path}/it&apos;s &amp; $picture.bmp'/></texture>
+        </bsdf></scene>""")
     mi.file_resolver().prepend(str(tmp_path))
     digests = fingerprint.scene_digests(file, {})
     assert sorted(digests) == sorted([f"{tmp_path}/it's & co.bmp", "scene.xml"])
 
 
-# --- Resuming ---------------------------------------------------------------------------------------
+# --- Resuming -----------------------------------------------------------------
 
 PLUGINS = {
     "bdpm_opt3": {"mix_diffuse": True, "variance": True},
@@ -216,9 +217,8 @@ def test_killed_process_resumes(scene, tmp_path, plugin):
     assert process.returncode == -signal.SIGKILL and not (tmp_path / "killed.exr").exists(), (
         "it was over before it was killed"
     )
-    leftover = output._temporary(
-        file
-    )  # what writers leave that were killed, of this version and of an earlier one
+    # what writers leave that were killed, of this version and of an earlier one
+    leftover = output._temporary(file)
     leftover.rename(leftover.with_name(leftover.name.replace(f"-{os.getpid()}-", "-999999999-")))
     (tmp_path / ".killed.checkpoint.123.part").touch()
     final = run(arguments)
@@ -354,7 +354,7 @@ def test_sigterm_is_like_ctrl_c(scene, tmp_path):
     )
 
 
-# --- What is refused --------------------------------------------------------------------------------
+# --- What is refused ----------------------------------------------------------
 
 
 @pytest.fixture
@@ -442,7 +442,7 @@ def test_damage_is_found(kept, tmp_path, scene, capsys):
     assert "damaged" in error and error.count("\n") == 1
 
 
-# --- Disks that are full ----------------------------------------------------------------------------
+# --- Disks that are full ------------------------------------------------------
 
 
 def test_full_disk_leaves_the_checkpoint_and_the_image_before(scene, tmp_path):
@@ -459,9 +459,8 @@ def test_full_disk_leaves_the_checkpoint_and_the_image_before(scene, tmp_path):
     )
     assert limited.returncode == 3
     complaints = [line for line in limited.stderr.splitlines() if line.startswith("mis-render")]
-    assert [line.count("cannot write") for line in complaints] == [1, 1], (
-        limited.stderr
-    )  # each once: the checkpoint, the image
+    # each once: the checkpoint, the image
+    assert [line.count("cannot write") for line in complaints] == [1, 1], limited.stderr
     assert "a.checkpoint: File too large" in complaints[0] and "a.exr" in complaints[1]
     assert [file.read_bytes() for file in files] == before
     assert not list(tmp_path.glob(".*.part"))
@@ -520,7 +519,7 @@ def test_png_that_is_cut_short_is_an_error(tmp_path, rgb, monkeypatch):
     assert (tmp_path / "a.png").read_bytes() == before
 
 
-# --- Preview ----------------------------------------------------------------------------------------
+# --- Preview ------------------------------------------------------------------
 
 
 def test_preview_is_a_whole_picture_at_any_moment(scene, tmp_path, monkeypatch):
@@ -533,10 +532,11 @@ def test_preview_is_a_whole_picture_at_any_moment(scene, tmp_path, monkeypatch):
         def watched():
             if (tmp_path / "a.preview.exr").exists():
                 header, image = read(tmp_path / "a.preview.exr")
+                # channels are sorted: B, G, R
                 assert (
                     same(image[..., ::-1], session.image())
                     and (tmp_path / "a.preview.png").exists()
-                )  # channels are sorted: B, G, R
+                )
                 seen.append(header["iterations"])
             plain()
 
@@ -554,7 +554,7 @@ def test_preview_is_a_whole_picture_at_any_moment(scene, tmp_path, monkeypatch):
     assert sorted(file.name for file in tmp_path.glob("a.*")) == ["a.exr", "a.png"]
 
 
-# --- Target error -----------------------------------------------------------------------------------
+# --- Target error -------------------------------------------------------------
 
 
 def test_relative_error_of_known_noise():
@@ -631,25 +631,25 @@ def test_target_error_stops_the_render(scene, tmp_path, capsys):
     )
     assert read(tmp_path / "a.exr")[0]["iterations"] == 10
     assert "(target 0.001 not reached)" in capsys.readouterr().err
-    assert (
-        render(scene, "-o", tmp_path / "a.exr", "--target-error", 0.2, "--quiet") == 0
-    )  # path, in passes
+    # path, in passes
+    assert render(scene, "-o", tmp_path / "a.exr", "--target-error", 0.2, "--quiet") == 0
     assert read(tmp_path / "a.exr")[0]["relativeError"] <= 0.2
 
 
-# --- Memory -----------------------------------------------------------------------------------------
+# --- Memory -------------------------------------------------------------------
 
 MEMORY = """
 import sys, mis_integrators, mitsuba as mi
 mi.set_variant("llvm_ad_rgb")
-from mis_integrators import loading
+from mis_integrators.app import loading
 from mis_integrators.core.session import make_session
 from pathlib import Path
 loaded = loading.load(Path(sys.argv[1]), {"size": "32"}, sys.argv[2], {})
 session = make_session(loaded.integrator, loaded.scene, loaded.scene.sensors()[0], 0, 0, fine=True)
 session.keep_variance()
 def resident():
-    return int(next(line for line in open("/proc/self/status") if line.startswith("VmRSS")).split()[1]) / 1024
+    line = next(line for line in open("/proc/self/status") if line.startswith("VmRSS"))
+    return int(line.split()[1]) / 1024
 for count in (30, 130):
     while session.iterations < count:
         session.iterate()

@@ -16,12 +16,16 @@ ROOT = Path(__file__).parents[2]
 LIBRARY = """
 #include <stdio.h>
 #include <stdlib.h>
-__attribute__((constructor)) static void run(void) { FILE *file = fopen(getenv("MARK"), "w"); if (file) fclose(file); }
+__attribute__((constructor)) static void run(void) {
+    FILE *file = fopen(getenv("MARK"), "w");
+    if (file) fclose(file);
+}
 """
 SUFFIX = next((Path(mi.__file__).parent / "plugins").iterdir()).suffix
 SCENE = """<scene version="3.0.0">%s<integrator type="path"/>
   <sensor type="perspective"><sampler type="independent"/>
-    <film type="hdrfilm"><integer name="width" value="8"/><integer name="height" value="6"/></film></sensor>
+    <film type="hdrfilm"><integer name="width" value="8"/><integer name="height" value="6"/></film>
+  </sensor>
   <shape type="sphere"/><emitter type="constant"/></scene>"""
 
 

@@ -24,7 +24,7 @@ def points(*errors, off=()):
     return [Point(2.0**i, error, 0.2 if i in off else 0.0, 0.001) for i, error in enumerate(errors)]
 
 
-# --- Analysis -------------------------------------------------------------------------------------------
+# --- Analysis -----------------------------------------------------------------
 
 
 def test_front():
@@ -90,7 +90,7 @@ def test_method_keeps_its_style():
     assert len({(s.colour, s.marker) for s in many.values()}) == len(many)
 
 
-# --- Regressions ----------------------------------------------------------------------------------------
+# --- Regressions --------------------------------------------------------------
 
 
 def row(method, ratio, error=0.01, seeds=6):
@@ -110,7 +110,7 @@ def row(method, ratio, error=0.01, seeds=6):
 
 
 def test_regressions_beyond_the_noise_are_named(module, tmp_path, capsys):
-    regressions = module("regressions")
+    regressions = module("report.regressions")
     before = [row("path", 1.0, 0.0), row("a", 1.0), row("b", 2.0)]
     now = [
         row("path", 1.0, 0.0),
@@ -129,7 +129,7 @@ def test_regressions_beyond_the_noise_are_named(module, tmp_path, capsys):
     )
     assert regressions.find_changes(now, [row("a", 1.0, None)]) == ([], 0)
     kept = tmp_path / "before.json"
-    kept.write_text(json.dumps(module("reports").document(before, {})))
+    kept.write_text(json.dumps(module("common.rows").document(before, {})))
     assert regressions.report(now, kept)
 
 
@@ -137,7 +137,7 @@ def test_regressions_raise_few_false_alarms(module):
     """Two runs of the same program, 60 figures each: some change is named in 5 % of the pairs
     (binomial, four standard deviations)."""
     find_changes, rng, trials, count = (
-        module("regressions").find_changes,
+        module("report.regressions").find_changes,
         np.random.default_rng(2),
         150,
         60,
@@ -156,7 +156,7 @@ def test_regressions_raise_few_false_alarms(module):
 
 
 def test_winner_and_those_that_cannot_be_told_apart(module):
-    compare = module("compare")
+    winners = module("common.winners")
 
     def of(method, *values):
         return {
@@ -175,14 +175,14 @@ def test_winner_and_those_that_cannot_be_told_apart(module):
         of("c", 0.2, 2.0, 0.4),
         of("d", 0.7, 0.72, 0.69),
     ]
-    assert compare.told_apart(rows[2], rows[1]) and not compare.told_apart(rows[3], rows[1])
-    (winner,) = compare.winners(rows)
+    assert winners.told_apart(rows[2], rows[1]) and not winners.told_apart(rows[3], rows[1])
+    (winner,) = winners.winners(rows)
     assert winner["best"] == "a" and winner["about as good"] == "b, c"
     late = [
         {**of("e", 0.1, 0.1, 0.1), "iterations": 1, "seconds": 1.3},
         {**of("f", 0.3, 0.3, 0.3), "iterations": 1, "seconds": 1.1},
     ]
-    assert compare.winners(rows + late)[0]["best"] == "f"
+    assert winners.winners(rows + late)[0]["best"] == "f"
 
 
 def test_radius_for_a_number_of_photons(module):
@@ -190,7 +190,7 @@ def test_radius_for_a_number_of_photons(module):
     session = mi.load_dict(
         {"type": "bdpm", "bdd": 0, "initial_radius": 0.1, "photon_count": 20000}
     ).session(box_scene(16))
-    radius, photons, vertices, found = module("throughput").radius_for(session, 10.0)
+    radius, photons, vertices, found = module("experiments.throughput").radius_for(session, 10.0)
     assert (
         found == pytest.approx(10, rel=0.2)
         and 0.001 < radius < 1
@@ -199,13 +199,13 @@ def test_radius_for_a_number_of_photons(module):
     )
 
 
-# --- The commands ---------------------------------------------------------------------------------------
+# --- The commands -------------------------------------------------------------
 
 
 def test_bundled_scenes_are_as_frozen(module, monkeypatch, tmp_path, capsys):
     """Figures of different versions are about the same scenes. A file that changed, one that is
     new, and one that is gone are named."""
-    freezing = module("freezing")
+    freezing = module("experiments.freezing")
     freezing.check(None)
     frozen = json.loads(freezing.RECORD.read_text())
     assert len(frozen) > 20 and all(len(digest) == 64 for digest in frozen.values())
@@ -224,7 +224,7 @@ def test_bundled_scenes_are_as_frozen(module, monkeypatch, tmp_path, capsys):
 
 def test_sweeps_of_views(module):
     """The views' sweeps name plugins that there are, and vary what they say."""
-    sweeps = [sweep for sweep in module("sweeps").SWEEPS if sweep.labels]
+    sweeps = [sweep for sweep in module("experiments.sweeps").SWEEPS if sweep.labels]
     assert {sweep.parameter for sweep in sweeps} == {"density", "spacing", "sideways"}
     for sweep in sweeps:
         assert [method.label for method in sweep.methods([])] == list(sweep.labels)
@@ -243,7 +243,7 @@ def test_sweeps_of_views(module):
 
 def test_first_views_of_a_scene(module):
     """Those of a batch, and sensors of their own."""
-    load, folder = module("multiview").load, SCENES / "multiview"
+    load, folder = module("experiments.multiview").load, SCENES / "multiview"
     orbit, parameters = load(folder / "smoke_orbit.xml", 0.25, 3)
     assert tuple(orbit.sensors()[0].film().size()) == (48, 16) and parameters["max_depth"] == 64
     whole, _ = load(folder / "smoke_orbit.xml", 0.25)
@@ -253,7 +253,7 @@ def test_first_views_of_a_scene(module):
 
 
 def test_defaults_name_registered_plugins_only(module):
-    methods = module("methods")
+    methods = module("common.methods")
     assert [m.label for m in methods.registered(("path", "nonsense", "bdpm:bdd=0"))] == [
         "path",
         "bdpm:bdd=0",
@@ -261,10 +261,14 @@ def test_defaults_name_registered_plugins_only(module):
     assert methods.registered(methods.COMPARED)[0].label == methods.BASE
 
 
-TINY = """<scene version="3.0.0"><integrator type="path"><integer name="max_depth" value="4"/></integrator>
-    <sensor type="perspective"><transform name="to_world"><lookat origin="0,0,4" target="0,0,0" up="0,1,0"/></transform>
-    <film type="hdrfilm"><integer name="width" value="48"/><integer name="height" value="40"/></film></sensor>
-    <shape type="sphere"/><emitter type="point"><point name="position" x="1" y="2" z="4"/></emitter></scene>"""
+TINY = """<scene version="3.0.0">
+    <integrator type="path"><integer name="max_depth" value="4"/></integrator>
+    <sensor type="perspective">
+    <transform name="to_world"><lookat origin="0,0,4" target="0,0,0" up="0,1,0"/></transform>
+    <film type="hdrfilm">
+    <integer name="width" value="48"/><integer name="height" value="40"/></film></sensor>
+    <shape type="sphere"/>
+    <emitter type="point"><point name="position" x="1" y="2" z="4"/></emitter></scene>"""
 
 
 def test_page_of_one_small_scene(module, tmp_path):
@@ -331,7 +335,7 @@ def test_page_of_one_small_scene(module, tmp_path):
         "HDR-FLIP",
     ):
         assert part in page or (part == "HDR-FLIP" and "relative error" in page), part
-    references, opened = module("references"), module("scene_files").open_scene(scene)
+    references, opened = module("common.references"), module("common.scene_files").open_scene(scene)
     kept = {"references": tmp_path / "references", "reference_method": None}
     assert references.are_there(opened, SimpleNamespace(**kept, reference_time=0.2))
     assert not references.are_there(opened, SimpleNamespace(**kept, reference_time=0.3))
@@ -367,7 +371,7 @@ def test_resampling_is_swept(module, tmp_path):
     pytest.importorskip("matplotlib")
     scene = tmp_path / "tiny.xml"
     scene.write_text(TINY)
-    resampling = module("resampling")
+    resampling = module("experiments.resampling")
     module("run").main(
         [
             "resampling",
@@ -409,7 +413,7 @@ def test_resampling_is_swept(module, tmp_path):
 def test_ratios_of_resampling(module):
     """What a method needs is said as ratios to `bdpt`: half the error in a quarter of the
     iterations that each cost four times as much."""
-    resampling = module("resampling")
+    resampling = module("experiments.resampling")
     base = [{"MAPE": 0.2, "relMSE": 0.04, "noise": 4.0, "cost": 0.01, "iterations": 100}] * 2
     mine = [{"MAPE": 0.1, "relMSE": 0.01, "noise": 0.25, "cost": 0.04, "iterations": 25}] * 2
     found = resampling.row(SimpleNamespace(name="s"), resampling.SWEEPS[0], 50, "pcbpt", mine, base)
@@ -419,22 +423,25 @@ def test_ratios_of_resampling(module):
         found["noise ratio"],
         found["cost ratio"],
     ) == pytest.approx((0.5, 0.25, 1 / 16, 4))
-    line = resampling.lines([found], resampling.SWEEPS[0], "noise ratio")["pcbpt"]
+    lines = module("report.sections").lines
+    line = lines([found], ["pcbpt"], resampling.SWEEPS[0].name, "noise ratio")["pcbpt"]
     assert (line.values, line.ratios) == ([50], [found["noise ratio"]])
-    method = module("methods").parse_method("bdpt_ris:target=f_y_f_yz")
+    method = module("common.methods").parse_method("bdpt_ris:target=f_y_f_yz")
     assert resampling.with_value(method, "resamples", 4).parameters == {
         "target": "f_y_f_yz",
         "resamples": 4,
     }
     assert (
-        resampling.with_value(module("methods").parse_method("bdpt"), "resamples", 4).parameters
+        resampling.with_value(
+            module("common.methods").parse_method("bdpt"), "resamples", 4
+        ).parameters
         == {}
     )
 
 
 def test_a_slow_start_does_not_end_a_rendering(module):
     """The first iteration, with its pilots, tells nothing of the second."""
-    Contender = module("turns").Contender
+    Contender = module("common.turns").Contender
     contender = Contender("any", None, seconds=[1.4], usual=0.2)
     assert contender.wants(2.0) and contender.wants(1.51) and not contender.wants(1.49)
     assert not Contender("any", None, seconds=[1.4]).wants(2.0)

@@ -109,10 +109,12 @@ def test_spectral(rgb, part):
 def test_without_an_id(rgb):
     """The class stands for it, not an address."""
     scene = mi.load_string(
-        '<scene version="3.0.0"><emitter type="constant"><rgb name="radiance" value="nan, 1, 1"/></emitter></scene>'
+        '<scene version="3.0.0"><emitter type="constant">'
+        '<rgb name="radiance" value="nan, 1, 1"/></emitter></scene>'
     )
     assert unfinite_data(scene) == [
-        "ConstantBackgroundEmitter.radiance.value of SRGBReflectanceSpectrum has 1 of 3 values that are not finite"
+        "ConstantBackgroundEmitter.radiance.value of SRGBReflectanceSpectrum "
+        "has 1 of 3 values that are not finite"
     ]
 
 

@@ -256,7 +256,7 @@ def test_any_text_is_refused_or_read(text):
         assert str(error).isprintable() and len(str(error)) < 500
 
 
-# --- What a session has learned -----------------------------------------------------------------------
+# --- What a session has learned -----------------------------------------------
 
 LEARNED = {
     "bdpm": [
@@ -410,7 +410,7 @@ def test_any_value_that_was_learned(sessions, name, value):
         )
 
 
-# --- Checkpoints ----------------------------------------------------------------------------------------
+# --- Checkpoints --------------------------------------------------------------
 
 
 @pytest.fixture

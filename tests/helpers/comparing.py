@@ -36,7 +36,7 @@ WHOLE, BLOCK = 0.01, 0.03
 """Relative errors that a comparison must see, over the whole image and in a block."""
 
 
-# --- Distributions (no SciPy) -----------------------------------------------------------------------
+# --- Distributions (no SciPy) -------------------------------------------------
 
 
 def chi2_tail(x: float, freedom: int) -> float:
@@ -73,7 +73,7 @@ def sidak(false_alarm: float, tests: int) -> float:
     return -math.expm1(math.log1p(-false_alarm) / tests)
 
 
-# --- Batches ------------------------------------------------------------------------------------------
+# --- Batches ------------------------------------------------------------------
 
 
 def block_means(image: np.ndarray, blocks: int) -> np.ndarray:
@@ -177,7 +177,8 @@ def differences(a: Estimate, b: Estimate, false_alarm=FALSE_ALARM, slack=1e-5) -
             error[region, channel], 1e-30
         )
         found.append(
-            f"{place}, channel {channel}: {a.mean[region, channel]:.5g} against {b.mean[region, channel]:.5g} "
+            f"{place}, channel {channel}: "
+            f"{a.mean[region, channel]:.5g} against {b.mean[region, channel]:.5g} "
             f"(ratio {ratio:.4f}, {sigmas:.1f} standard errors)"
         )
     return found
@@ -199,7 +200,7 @@ def assert_same(a: Estimate, b: Estimate, whole=WHOLE, block=BLOCK, slack=1e-5):
     assert_powerful(a, b, whole, block)
 
 
-# --- Renders ------------------------------------------------------------------------------------------
+# --- Renders ------------------------------------------------------------------
 
 
 def render_batches(

@@ -14,10 +14,15 @@ THREE_VIEWS = """<scene version="3.0.0">
   <integrator type="volpath_multiview"><integer name="max_depth" value="2"/></integrator>
   <emitter type="constant"/>
   <shape type="sphere"><bsdf type="diffuse"/></shape>
-  <sensor type="batch"><film type="hdrfilm"><integer name="width" value="$resx"/><integer name="height" value="$resy"/><rfilter type="box"/></film>
-    <sensor type="perspective"><transform name="to_world"><lookat origin="0,0,5" target="0,0,0" up="0,1,0"/></transform></sensor>
-    <sensor type="perspective"><transform name="to_world"><lookat origin="1,0,5" target="0,0,0" up="0,1,0"/></transform></sensor>
-    <sensor type="perspective"><transform name="to_world"><lookat origin="0,1,5" target="0,0,0" up="0,1,0"/></transform></sensor>
+  <sensor type="batch">
+    <film type="hdrfilm"><integer name="width" value="$resx"/><integer name="height" value="$resy"/>
+      <rfilter type="box"/></film>
+    <sensor type="perspective"><transform name="to_world">
+      <lookat origin="0,0,5" target="0,0,0" up="0,1,0"/></transform></sensor>
+    <sensor type="perspective"><transform name="to_world">
+      <lookat origin="1,0,5" target="0,0,0" up="0,1,0"/></transform></sensor>
+    <sensor type="perspective"><transform name="to_world">
+      <lookat origin="0,1,5" target="0,0,0" up="0,1,0"/></transform></sensor>
   </sensor>
 </scene>"""
 """A scene file: a sphere seen by the three sensors of a batch."""
@@ -154,9 +159,8 @@ def world(sensor, medium=None, **objects):
     if medium is not None:
         scene["medium"] = container(medium)
     scene.update(objects)
-    first = {
-        name: scene.pop(name) for name in ("fog",) if name in scene
-    }  # media that others refer to
+    # media that others refer to
+    first = {name: scene.pop(name) for name in ("fog",) if name in scene}
     return mi.load_dict(
         {"type": "scene"}
         | first
@@ -261,7 +265,7 @@ class OracleBatches:
         for _ in range(count):
             seed = self.first_seed + len(self.batches)
             images = []
-            for number, sensor in enumerate(self.scene.sensors()):
+            for number in range(len(self.scene.sensors())):
                 image = np.array(
                     mi.render(
                         self.scene,

@@ -17,18 +17,23 @@ SCENE = """<scene version="3.0.0">
   <default name="size" value="24"/>
   <integrator type="path"><integer name="max_depth" value="4"/></integrator>
   <sensor type="perspective">
-    <transform name="to_world"><lookat origin="0, 1, 4" target="0, 0.6, 0" up="0, 1, 0"/></transform>
+    <transform name="to_world">
+      <lookat origin="0, 1, 4" target="0, 0.6, 0" up="0, 1, 0"/></transform>
     <film type="hdrfilm"><integer name="width" value="$size"/><integer name="height" value="$size"/>
       <string name="pixel_format" value="rgb"/><rfilter type="gaussian"/></film>
     <sampler type="independent"><integer name="sample_count" value="$spp"/></sampler>
   </sensor>
-  <shape type="rectangle"><transform name="to_world"><scale value="2"/><rotate x="1" angle="-90"/></transform>
-    <bsdf type="diffuse"><texture type="bitmap" name="reflectance"><string name="filename" value="$picture"/></texture></bsdf></shape>
-  <shape type="sphere"><point name="center" x="0.6" y="0.5" z="0"/><float name="radius" value="0.5"/><bsdf type="conductor"/></shape>
+  <shape type="rectangle">
+    <transform name="to_world"><scale value="2"/><rotate x="1" angle="-90"/></transform>
+    <bsdf type="diffuse"><texture type="bitmap" name="reflectance">
+      <string name="filename" value="$picture"/></texture></bsdf></shape>
+  <shape type="sphere"><point name="center" x="0.6" y="0.5" z="0"/>
+    <float name="radius" value="0.5"/><bsdf type="conductor"/></shape>
   <include filename="lamp.xml"/>
 </scene>"""
 LAMP = """<scene version="3.0.0">
-  <shape type="rectangle"><transform name="to_world"><scale value="0.5"/><rotate x="1" angle="90"/><translate y="2"/></transform>
+  <shape type="rectangle"><transform name="to_world">
+      <scale value="0.5"/><rotate x="1" angle="90"/><translate y="2"/></transform>
     <bsdf type="diffuse"><spectrum name="reflectance" filename="lamp.spd"/></bsdf>
     <emitter type="area"><rgb name="radiance" value="5, 4, 3"/></emitter></shape>
 </scene>"""

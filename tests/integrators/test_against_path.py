@@ -130,7 +130,7 @@ def test_agrees_full(rgb, emitter, family, bdd):
     agree(bdpm(bdd=bdd, max_depth=6), oracle(emitter, 6), tray(family, emitter), most=8192)
 
 
-# --- Mirrors and glass under lights that no ray can meet --------------------------------------------
+# --- Mirrors and glass under lights that no ray can meet ----------------------
 
 
 def strategies_agree(emitter, first, second, whole=0.01, block=0.03, most=1024):
@@ -220,7 +220,7 @@ def test_caustics_against_ptracer(rgb, emitter, bdd):
     )
 
 
-# --- Shading normals -----------------------------------------------------------------------------------
+# --- Shading normals ----------------------------------------------------------
 
 
 @pytest.mark.thinned(2, 2)
@@ -267,7 +267,7 @@ def test_shading_normals_seen_from_the_light(rgb, bdd, tilt):
     )
 
 
-# --- Light whose texture coordinates overlap ---------------------------------------------------------
+# --- Light whose texture coordinates overlap ----------------------------------
 
 
 @pytest.mark.parametrize("bdd", [0, 1])
@@ -302,7 +302,7 @@ def test_textured_cube_light(rgb, bdd):
     )
 
 
-# --- Bias ---------------------------------------------------------------------------------------------
+# --- Bias ---------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

@@ -78,7 +78,7 @@ def series(first, ratio, count):
     )
 
 
-# --- Point light in the middle of a diffuse sphere -----------------------------------------------------
+# --- Point light in the middle of a diffuse sphere ----------------------------
 
 
 @pytest.mark.thinned(4, 2)
@@ -137,9 +137,8 @@ def test_point_in_sphere_in_every_variant(variant):
     ).mean(axis=(0, 1))
     assert image.shape == (3,)
     luminance = np.array([0.2126, 0.7152, 0.0722])
-    assert image @ luminance == pytest.approx(
-        direct @ luminance, rel=0.05
-    )  # 5 sigma: see test_spectral_colour in test_bdpm.py
+    # 5 sigma: see test_spectral_colour in test_bdpm.py
+    assert image @ luminance == pytest.approx(direct @ luminance, rel=0.05)
 
 
 @BDD
@@ -164,7 +163,7 @@ def test_roulette_in_sphere(rgb, bdd, rr_depth):
     assert_value(scene, bdpm(bdd=bdd, rr_depth=rr_depth), series(0.8 / np.pi, 0.8, None))
 
 
-# --- Furnaces ---------------------------------------------------------------------------------------------
+# --- Furnaces -----------------------------------------------------------------
 
 
 @pytest.mark.thinned(4, 2)
@@ -226,7 +225,7 @@ def test_white_furnace(rgb, bdd, material):
     assert_value(scene, bdpm(bdd=bdd, rr_depth=20), 0.8)
 
 
-# --- Direct light and one bounce ----------------------------------------------------------------------------
+# --- Direct light and one bounce ----------------------------------------------
 
 
 def floor_from_above(half, size=16, reflectance=0.5, **entries):
@@ -281,7 +280,7 @@ def test_irradiance_of_area_light(rgb, shape):
     assert_value(scene, bdpm(bdd=0), 0.5 * 3 * sine2, block=0.02)
 
 
-# --- Caustics ---------------------------------------------------------------------------------------------------
+# --- Caustics -----------------------------------------------------------------
 
 
 def point_irradiance(height, x, y):
@@ -292,9 +291,8 @@ def block_average(function, half, blocks):
     """Averages of a function of (x, y) over the blocks of the image of `floor_from_above`."""
     n = 64
     grid = (np.arange(blocks * n) + 0.5) / (blocks * n) * 2 * half - half
-    x, y = np.meshgrid(
-        -grid, -grid
-    )  # the camera looks down: signs do not matter to symmetric functions
+    # the camera looks down: signs do not matter to symmetric functions
+    x, y = np.meshgrid(-grid, -grid)
     return function(x, y).reshape(blocks, n, blocks, n).mean(axis=(1, 3)).ravel()
 
 
@@ -376,7 +374,7 @@ def test_light_through_mask(rgb, bdd):
     assert_value(scene, bdpm(bdd=bdd, max_depth=3), 0.5 / np.pi * 2 * 0.7)
 
 
-# --- What is not there ------------------------------------------------------------------------------------------
+# --- What is not there --------------------------------------------------------
 
 
 @pytest.mark.parametrize("bdd", [0, 1])

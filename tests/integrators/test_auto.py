@@ -52,7 +52,7 @@ class Unidirectional:
         return PathSession(self.parameters, scene, scene.sensors()[sensor], seed, None)
 
 
-# --- What the choice rests on ----------------------------------------------------------------------------
+# --- What the choice rests on -------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -89,9 +89,8 @@ def test_path_in_parts(rgb, monkeypatch):
     noise -= noise.mean(axis=0)
     noise = (noise / np.maximum(noise.std(axis=0), 1e-6)).reshape(24, 3, -1)  # a part is 16 rows
     for one, other in ((0, 1), (1, 2), (0, 2)):
-        assert abs(np.mean(noise[:, one] * noise[:, other])) < 5.3 / np.sqrt(
-            noise[:, 0].size
-        )  # 1e-7
+        # 1e-7
+        assert abs(np.mean(noise[:, one] * noise[:, other])) < 5.3 / np.sqrt(noise[:, 0].size)
 
 
 def test_census(rgb):
@@ -110,9 +109,8 @@ def test_census(rgb):
     scene = mi.load_dict(box)
     assert mean_segments(scene, scene.sensors()[0], 1, 1, 256, 3, 50).tolist() == [1, 1, 1, 0, 0]
     assert mean_segments(scene, scene.sensors()[0], 1, 1, 256, 7, 50).tolist() == [1, 1, 1, 1, 3]
-    survivors = mean_segments(scene, scene.sensors()[0], 1, 1, 256, 4, 2)[
-        2:4
-    ]  # roulette lets nine tenths go on
+    # roulette lets nine tenths go on
+    survivors = mean_segments(scene, scene.sensors()[0], 1, 1, 256, 4, 2)[2:4]
     assert np.all(np.abs(survivors - [0.9, 0.81]) < 5 * 0.02)
     mirrors = mi.load_dict(
         {
@@ -136,12 +134,13 @@ def test_prices(rgb):
     """Whatever counts costs has a price for every event, and more of anything is dearer."""
     from mis_integrators.integrators.choice import PHOTON_MAPPERS
 
+    # the last two: `light_tracing`
     assert set(costs.PRICES) == {
         "path",
         *(plugin for plugin, _ in PHOTON_MAPPERS),
         "pcbpt",
         "bdpt_ris",
-    }  # the last two: `light_tracing`
+    }
     for plugin in costs.PRICES:
         few, many = (
             costs.cost(plugin, (1.0, 1.0, 1.0, 1.0)),
@@ -156,7 +155,7 @@ def test_prices(rgb):
     )
 
 
-# --- The choice ------------------------------------------------------------------------------------------
+# --- The choice ---------------------------------------------------------------
 
 
 def test_what_needs_no_photons(rgb):
@@ -340,9 +339,8 @@ def test_prediction_is_checked(rgb):
     session.iterate()
     predicted = session.settings["choice.relmse.path"]
     trial = next(t for t in session.decision.trials if t.name == "path")
-    samples = (
-        64 * session.decision.usual_cost / trial.cost
-    )  # as many as cost the same as 64 iterations of bdpm
+    # as many as cost the same as 64 iterations of bdpm
+    samples = 64 * session.decision.usual_cost / trial.cost
     images = [
         np.array(mi.render(scene, integrator=path(), spp=16, seed=seed)).mean(axis=-1)
         for seed in range(12)
@@ -354,7 +352,7 @@ def test_prediction_is_checked(rgb):
     assert 0.5 < predicted / measured < 2
 
 
-# --- The image -------------------------------------------------------------------------------------------
+# --- The image ----------------------------------------------------------------
 
 
 @pytest.mark.parametrize("variant_name", [RGB, MONO])

@@ -38,7 +38,7 @@ def balance(**parameters):
     )
 
 
-# --- One weight function ------------------------------------------------------------------------------
+# --- One weight function ------------------------------------------------------
 
 
 def room(bsdf, light):
@@ -89,9 +89,8 @@ class JointPaths:
                 self.light, value, _ = self.lights.sample_direct(si, rng, self.valid)
                 self.valid &= dr.max(value) > 0
                 bs.wo = si.to_local(self.light.d)
-            towards = dr.normalize(
-                unpack_direction(pack_direction(si.to_world(bs.wo)))
-            )  # as photons remember it
+            # as photons remember it
+            towards = dr.normalize(unpack_direction(pack_direction(si.to_world(bs.wo))))
             if number < length - 1:
                 bs.wo = si.to_local(towards)
             dr.eval(ray, hit, si, bs, rng, self.valid)
@@ -120,9 +119,8 @@ class JointPaths:
             return sampled, sampled
         lamp = self.scene.ray_intersect(si.spawn_ray(self.light.d))
         self.valid &= lamp.emitter(self.scene) == self.light.emitter
-        lamp.p = (
-            self.light.p
-        )  # the ray starts a bit off the surface, and may even miss the lamp's edge
+        # the ray starts a bit off the surface, and may even miss the lamp's edge
+        lamp.p = self.light.p
         met = mi.DirectionSample3f(self.scene, lamp, mi.Interaction3f(si))
         return sampled, weights.next_event_weight(left[-1], mi.Interaction3f(si), met, self.valid)
 
@@ -305,7 +303,7 @@ def test_weights_are_veachs(rgb, light, bsdf, beta):
         assert np.allclose(np.array(mine)[valid], truth, atol=2e-4)
 
 
-# --- Emitters -----------------------------------------------------------------------------------------
+# --- Emitters -----------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -364,7 +362,7 @@ def test_emission_ratio(rgb, emitter):
     assert (np.abs(found - expected) < 3e-3 * expected).mean() > 0.995
 
 
-# --- Renders ------------------------------------------------------------------------------------------
+# --- Renders ------------------------------------------------------------------
 
 RENDERS = [
     (RGB, "smooth0", "rectangle", 3, 1.0),
@@ -466,7 +464,7 @@ def test_agrees_with_one_strategy(rgb, strategies, beta):
     assert_same(*collect_until(*sides, whole=0.015, block=0.06, most=600), whole=0.015, block=0.06)
 
 
-# --- Plugin -------------------------------------------------------------------------------------------
+# --- Plugin -------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

@@ -104,7 +104,7 @@ def last_words(error):
     return str(error).strip().splitlines()[-1]
 
 
-# --- Strategies and bias ---------------------------------------------------------------------------------
+# --- Strategies and bias ------------------------------------------------------
 
 
 @pytest.mark.parametrize("first, second", [(0, 1), (1, 2), (2, 3)])
@@ -188,7 +188,7 @@ def test_alpha_leaves_the_mean(rgb):
     )
 
 
-# --- Seeds ------------------------------------------------------------------------------------------------
+# --- Seeds --------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("bdd", [0, 1])
@@ -240,15 +240,13 @@ def test_seeds_and_iterations_are_uncorrelated(rgb):
     images = [render(scene, seed, 1).mean(axis=2) for seed in (0, 1, 2, 3)]
     images += [picture.mean(axis=2) for picture in pictures(session, 3)]
     noise = [(i - mean).ravel() for i in images[:3]] + [(i - mean).ravel() for i in images[4:]]
-    noise = [
-        np.clip(n, *np.quantile(n, [0.02, 0.98])) for n in noise
-    ]  # a caustic's fireflies would be all that counts
+    # a caustic's fireflies would be all that counts
+    noise = [np.clip(n, *np.quantile(n, [0.02, 0.98])) for n in noise]
     table = np.corrcoef(noise) - np.eye(len(noise))
     assert np.abs(table).max() < 0.2, table.round(2)
     assert not np.array_equal(images[0], images[1])
-    np.testing.assert_allclose(
-        images[3], images[4], rtol=1e-3, atol=1e-6
-    )  # seed 3 is the session's
+    # seed 3 is the session's
+    np.testing.assert_allclose(images[3], images[4], rtol=1e-3, atol=1e-6)
 
 
 def test_error_falls_with_iterations(rgb):
@@ -265,7 +263,7 @@ def test_error_falls_with_iterations(rgb):
     assert 1.6 < ratio < 10, ratio  # 24 seeds, 5 regions: a factor 2.5 is 4 sigma
 
 
-# --- Variance AOV -------------------------------------------------------------------------------------------
+# --- Variance AOV -------------------------------------------------------------
 
 
 @pytest.mark.parametrize("rfilter", ["box", pytest.param("gaussian", marks=pytest.mark.full)])
@@ -313,7 +311,7 @@ def test_variance_needs_two_iterations(rgb):
     )
 
 
-# --- Film -------------------------------------------------------------------------------------------------------
+# --- Film ---------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("rfilter", ["box", "gaussian"])
@@ -401,9 +399,8 @@ def test_alpha_channel_is_that_of_path(rgb):
             for i in (bdpm(hide_emitters=hide), path(hide_emitters=hide))
         ]
         assert images[0].shape == (24, 24, 4)
-        np.testing.assert_allclose(
-            images[0][..., 3], images[1][..., 3], atol=0.2
-        )  # 256 samples: 5 sigma is 0.16
+        # 256 samples: 5 sigma is 0.16
+        np.testing.assert_allclose(images[0][..., 3], images[1][..., 3], atol=0.2)
         assert np.abs(images[0][..., 3] - images[1][..., 3]).mean() < 0.02
         np.testing.assert_allclose(
             images[0].mean(axis=(0, 1)), images[1].mean(axis=(0, 1)), rtol=0.03
@@ -435,7 +432,7 @@ def test_hidden_emitters(rgb, hide, bdd):
     agree(bdpm(bdd=bdd, hide_emitters=hide), path(hide_emitters=hide), scene, blocks=2)
 
 
-# --- Limits --------------------------------------------------------------------------------------------------------
+# --- Limits -------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("scene", ["nothing", "no emitters", "black emitter"])
@@ -552,7 +549,7 @@ def test_rounding_up_is_said_once(rgb):
         logger.remove_appender(listener)
 
 
-# --- Buffers ----------------------------------------------------------------------------------------------------------
+# --- Buffers ------------------------------------------------------------------
 
 
 def with_capacity(scene, photons=None, vertices=None, **parameters):
@@ -622,7 +619,7 @@ def test_vertices_that_overflow_in_the_pilot_are_not_lost(rgb, monkeypatch):
     for room in (None, 11):
         session = bdpm(bdd=1, initial_radius=0.0).session(scene, seed=1, spp=4)
         if room:
-            monkeypatch.setattr(session, "_vertex_room", lambda paths: room)
+            monkeypatch.setattr(session, "_vertex_room", lambda paths, room=room: room)
         session.start()
         radii.append(session.radii)
     assert radii[0].keys() == radii[1].keys() == {"caustic", "indirect"}
@@ -638,7 +635,7 @@ def test_camera_pass_in_parts(rgb, monkeypatch, chunk):
     np.testing.assert_allclose(with_capacity(scene), whole, rtol=1e-3, atol=1e-6)
 
 
-# --- Surfaces that photons must not pass ---------------------------------------------------------------------------------
+# --- Surfaces that photons must not pass --------------------------------------
 
 
 def two_sided(*bsdfs):
@@ -690,6 +687,7 @@ def test_no_light_leaks_through_a_wall(rgb, thickness, bdd):
 def test_no_light_leaks_around_a_corner(rgb):
     """A wall that the light only grazes from its front does not catch the photons of a bright floor
     beside it."""
+    # the wall's front looks away from the lamp
     scene = mi.load_dict(
         {
             "type": "scene",
@@ -711,7 +709,7 @@ def test_no_light_leaks_around_a_corner(rgb):
                 "film": film(16),
             },
         }
-    )  # the wall's front looks away from the lamp
+    )
     assert render(scene, bdd=0, initial_radius=0.3, spp=32).max() == 0
 
 
@@ -841,9 +839,8 @@ def test_a_camera_that_sees_one_point(rgb):
     a.add(150)
     b.add(16)
     assert smallest_visible(a.estimate(), b.estimate())[0] < 0.25, "test too weak"
-    assert not differences(
-        a.estimate(), b.estimate(), slack=0.05
-    )  # a disk around one point is as wrong as its light is curved
+    # a disk around one point is as wrong as its light is curved
+    assert not differences(a.estimate(), b.estimate(), slack=0.05)
     assert a.session.radii["indirect"] > 0.03
 
 
@@ -887,7 +884,7 @@ def test_rare_photons_get_no_smallest_radius(rgb):
     assert session.radii["indirect"] == pytest.approx(0.16)
 
 
-# --- Camera paths of an iteration ------------------------------------------------------------------------
+# --- Camera paths of an iteration ---------------------------------------------
 
 
 def made_up_pilot(scene, direct_noise, shared=True):
@@ -1010,7 +1007,7 @@ def test_a_timed_render_chooses_its_camera_paths(rgb, monkeypatch):
     assert (counted.iterations_planned, counted.settings["camera_paths"]) == (4, 1)
 
 
-# --- Errors ---------------------------------------------------------------------------------------------------------------
+# --- Errors -------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -1170,7 +1167,7 @@ def test_missing_sensor(rgb):
         bdpm().render(box_scene(8), sensor=3, spp=1)
 
 
-# --- Variants ----------------------------------------------------------------------------------------------------------------
+# --- Variants -----------------------------------------------------------------
 
 
 def test_every_variant_renders(variant):
@@ -1268,7 +1265,7 @@ def test_alpha_at_the_last_depth(rgb, max_depth):
         assert abs(ours.mean() - theirs.mean()) < 0.01
 
 
-# --- Set-up ----------------------------------------------------------------------------------------------
+# --- Set-up -------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("changed", [False, True], ids=["kept", "changed"])

@@ -5,6 +5,8 @@ Comparisons of renders as in `test_against_path`: false-alarm rate 1e-6 each, an
 % in the image and of 3 or 8 % in a block is seen with a probability of 0.95.
 """
 
+from itertools import pairwise
+
 from mis_integrators.core.random import next_2d, streams
 from mis_integrators.core.traits import SceneTraits
 from mis_integrators.integrators.pyramid import technique_names
@@ -60,7 +62,7 @@ def bdpt(**parameters):
     return mi.load_dict({"type": "bdpt", "max_depth": 4, "camera_paths": 8, **parameters})
 
 
-# --- One weight function ---------------------------------------------------------------------------------
+# --- One weight function ------------------------------------------------------
 
 
 def room(bsdf, light, sensor="perspective"):
@@ -156,7 +158,7 @@ class JointPaths:
 
     def densities(self, number):
         """(p_camera, p_light) at a vertex."""
-        _, si, _, to_camera, to_light, _ = self.vertices[number]
+        *_, to_camera, to_light, _ = self.vertices[number]
         _, p_camera, p_light = self.vertex_bsdf(number).f_and_pdfs(to_camera, to_light, self.valid)
         return p_camera, p_light
 
@@ -320,7 +322,6 @@ class JointPaths:
 
     def joined(self, camera, light, z):
         a, b = self.record(z, "camera", camera[z]), self.record(z + 1, "light", light[z + 1])
-        _, si, _, _, to_light, _ = self.vertices[z]
         return join(self.traits, a, b, [], self.valid), a, b
 
 
@@ -344,14 +345,13 @@ def test_weights_sum_to_one(rgb, bsdf, light, sensor, length, beta, eta):
     assert len(total) > 100
     assert np.mean(np.abs(total - 1) < 2e-3) > 0.995, np.sort(np.abs(total - 1))[-20:]
     smooth = [s for s, w in by_technique.items() if w.max() > 1e-3]
-    assert set(smooth) == set(by_technique) - (
-        {0} if light in ("point", "spot") else set()
-    )  # each of them counts somewhere
+    # each of them counts somewhere
+    assert set(smooth) == set(by_technique) - ({0} if light in ("point", "spot") else set())
 
 
 @pytest.mark.parametrize("kind", ["camera", "light"])
 def test_states_of_traced_subpaths(rgb, kind):
-    """Kept vertices carry what the hooks of `transport.subpaths` say, recomputed from the vertices
+    """Kept vertices carry what the hooks of `paths.subpaths` say, recomputed from the vertices
     before them, in a scene without delta functions and with all kinds of junctions."""
     scene, beta = room("rough", "area"), 2
     traits, lights, sensor = SceneTraits(scene), Lights(scene), scene.sensors()[0]
@@ -411,7 +411,7 @@ def test_states_of_traced_subpaths(rgb, kind):
         assert np.mean(np.abs(ratio - 1) < 2e-3) > 0.98, np.sort(ratio)
 
 
-# --- Each technique alone --------------------------------------------------------------------------------
+# --- Each technique alone -----------------------------------------------------
 
 
 def technique_estimates(scene, integrator, batches, blocks=1):
@@ -548,7 +548,7 @@ def test_pyramid_adds_up(rgb):
     ]
 
 
-# --- Images -----------------------------------------------------------------------------------------------
+# --- Images -------------------------------------------------------------------
 
 # emitter, family, sensor, variant, filter
 DEFAULT = [
@@ -679,7 +679,7 @@ def test_shading_normals_seen_from_the_light(rgb, tilt):
         assert 6 * np.sqrt(estimates[other].error2[0].max()) < 0.1 * first.mean[0].max()
 
 
-# --- Film ----------------------------------------------------------------------------------------------------
+# --- Film ---------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("rfilter, border", [("gaussian", False), ("mitchell", True)])
@@ -826,7 +826,7 @@ def test_max_depth(rgb):
         )
         np.testing.assert_allclose(mine, truth, rtol=0.02, atol=1e-6)
         means.append(truth[0, 0])
-    assert means[0] == 0 and all(b > 1.03 * a for a, b in zip(means, means[1:4]))
+    assert means[0] == 0 and all(b > 1.03 * a for a, b in pairwise(means[:4]))
 
 
 def test_roulette_and_unlimited_depth_leave_the_mean(rgb):
@@ -840,7 +840,7 @@ def test_roulette_and_unlimited_depth_leave_the_mean(rgb):
         assert_same(*collect_until(batches, exact, 0.01, 0.03), 0.01, 0.03, 1e-4)
 
 
-# --- Seeds and buffers -----------------------------------------------------------------------------------
+# --- Seeds and buffers --------------------------------------------------------
 
 
 def render(scene, seed=0, spp=8, **parameters):
@@ -923,7 +923,7 @@ def test_variance_is_that_of_the_mean(rgb):
     assert estimated == pytest.approx(empirical, rel=0.2)
 
 
-# --- Parameters -----------------------------------------------------------------------------------------------
+# --- Parameters ---------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

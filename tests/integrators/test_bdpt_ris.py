@@ -52,7 +52,7 @@ def plugin(name, **parameters):
     return mi.load_dict({"type": name, "max_depth": 4, "camera_paths": 4, **parameters})
 
 
-# --- One weight function ---------------------------------------------------------------------------------
+# --- One weight function ------------------------------------------------------
 
 
 class ResampledPaths(JointPaths):
@@ -100,6 +100,7 @@ class ResampledPaths(JointPaths):
         """`(buffer, slot of each vertex, what `leave` says after the last one)`."""
         buffer = new_vertices(self.traits, self.capacity, STEP)
         left, parent, slots = not_left(self.COUNT), dr.full(mi.UInt32, NO_PARENT, self.COUNT), []
+        density = mi.Float(0)
         for number in range(self.length):
             _, si, _, to_camera, to_light, delta = self.vertices[number]
             p_camera, p_light = self.densities(number)
@@ -171,9 +172,8 @@ class ResampledPaths(JointPaths):
         self.light, self.brought = self.lights.emitted(
             last, self.light.emitter, place, self.light.n, self.light.uv, self.valid
         )
-        self.valid &= (dr.max(self.brought) > 0) & (
-            self.light.dist > 1e-2
-        )  # not of a vertex on the lamp itself
+        # not of a vertex on the lamp itself
+        self.valid &= (dr.max(self.brought) > 0) & (self.light.dist > 1e-2)
         camera, camera_slots, left, density, parent = self.camera_buffer(weights)
         light, light_slots = self.light_buffer(weights)
         delta = [np.array(v[-1]) for v in self.vertices]
@@ -293,9 +293,8 @@ def test_weights_sum_to_one(rgb, name, bsdf, light, sensor, length, parameters):
         np.sort(np.abs(total - 1))[-20:]
     )
     smooth = {s for s, w in by_technique.items() if w.max() > 1e-3}
-    assert smooth == set(by_technique) - (
-        {0} if light in ("point", "spot") else set()
-    )  # each of them counts somewhere
+    # each of them counts somewhere
+    assert smooth == set(by_technique) - ({0} if light in ("point", "spot") else set())
 
 
 def test_guessed_weight_is_the_weight_where_nothing_is_guessed(rgb):
@@ -322,7 +321,7 @@ def test_guessed_weight_is_the_weight_where_nothing_is_guessed(rgb):
     assert 0.01 < np.mean(exact[first]) < 0.99 and set(vertices[first]) == {3}
 
 
-# --- Images ------------------------------------------------------------------------------------------------
+# --- Images -------------------------------------------------------------------
 
 
 def assert_value(integrator, scene, value, whole=0.01):
@@ -455,7 +454,7 @@ def test_bundled_scenes(rgb, scene):
     assert_same(*collect_until(a, b, 0.03, 0.08, most=1000), 0.03, 0.08)
 
 
-# --- Where resampling could fail ----------------------------------------------------------------------------
+# --- Where resampling could fail ----------------------------------------------
 
 
 def test_nothing_is_visible(rgb):
@@ -489,9 +488,8 @@ def test_nothing_is_visible(rgb):
         session = plugin(name).session(scene, 0, 1, 0)
         session.iterate()
         session.iterate()
-        assert np.all(
-            (session.image() >= 0) & (session.image() < 1e-4)
-        )  # rays start a little beside their surface
+        # rays start a little beside their surface
+        assert np.all((session.image() >= 0) & (session.image() < 1e-4))
         assert all(np.isfinite(np.array(x)).all() for x in (session.records, session.shares))
 
 
@@ -559,7 +557,7 @@ def test_dark_and_short(rgb, parameters):
     np.testing.assert_allclose(*[x.mean(axis=(0, 1)) for x in images], rtol=0.03)
 
 
-# --- Which camera vertices draw -----------------------------------------------------------------------------
+# --- Which camera vertices draw -----------------------------------------------
 
 
 def test_slight_vertices_are_thinned_out(rgb):
@@ -620,7 +618,7 @@ def test_slight_vertices_are_thinned_out(rgb):
     assert abs(mean - 1) < 5 * error and error < 0.1
 
 
-# --- Repeatability, memory, parameters ----------------------------------------------------------------------
+# --- Repeatability, memory, parameters ----------------------------------------
 
 
 def test_same_seed_same_image(rgb):
@@ -631,10 +629,11 @@ def test_same_seed_same_image(rgb):
     means = [[picture.mean() for picture in pictures(session, 30)] for session in sessions]
     np.testing.assert_allclose(sessions[0].image(), sessions[1].image(), rtol=1e-4, atol=1e-6)
     same, other = np.array(means[0]), np.array(means[2])
+    # 1e-6 for 30 pairs
     assert (
         abs(np.corrcoef(same, other)[0, 1]) < 0.75
         and abs(np.corrcoef(same[1:], same[:-1])[0, 1]) < 0.75
-    )  # 1e-6 for 30 pairs
+    )
 
 
 @pytest.mark.parametrize("light_paths", [30, 300])
@@ -653,7 +652,7 @@ def test_iterations_in_any_order(rgb, light_paths):
 
 def test_replays_are_what_was_recorded(monkeypatch):
     """The pass that makes the pmfs has a size that Dr.Jit, left alone, would take for a multiple of
-    its virtual calls' data, and get wrong (`transport.recording.lanes`): 192 cache points times 520
+    its virtual calls' data, and get wrong (`core.recording.lanes`): 192 cache points times 520
     light vertices."""
     mi.set_variant(MONO)
     from mis_integrators.integrators import resampled
@@ -755,7 +754,7 @@ def test_pilot_sees_all_of_the_film(rgb, monkeypatch):
     assert apart < np.sqrt(-np.log(1e-6 / 2) / 2 * (1 / len(a) + 1 / len(b)))
 
 
-# --- How many light sub-paths -------------------------------------------------------------------------------
+# --- How many light sub-paths -------------------------------------------------
 
 
 def test_best_ratio_is_the_best():
@@ -851,9 +850,8 @@ def test_light_tracing_does_not_follow_the_parts(rgb, monkeypatch):
         for session in sessions:
             session.start()
         chosen.append(np.log([session.light_tracing for session in sessions]))
-    assert (
-        session.chunks == 3 and abs(np.mean(chosen[0]) - np.mean(chosen[1])) < 0.3
-    )  # log(sqrt(3)) = 0.55
+    # log(sqrt(3)) = 0.55
+    assert session.chunks == 3 and abs(np.mean(chosen[0]) - np.mean(chosen[1])) < 0.3
 
 
 @pytest.mark.parametrize("ratio", [0.125, 8])

@@ -45,7 +45,7 @@ at such a radius may take from shapes' edges."""
 DEPTH, MOST = 4, 480
 
 
-# --- Random scenes ------------------------------------------------------------------------------------
+# --- Random scenes ------------------------------------------------------------
 
 
 def compare(scene, plugin, whole):
@@ -141,26 +141,30 @@ def test_many_random_scenes(rgb, plugin):
     assert np.quantile(visible, 0.25) < 0.1
 
 
-# --- Random parameters --------------------------------------------------------------------------------
+# --- Random parameters --------------------------------------------------------
 
 PARAMETERS = """
 import json, random, sys
 import mis_integrators, mitsuba as mi, numpy as np
-from mis_integrators import loading, _plugins
+from mis_integrators import _plugins
+from mis_integrators.app import loading
 mi.set_variant("llvm_ad_rgb")
 seed, tries, renders = map(int, sys.argv[1:])
 random = random.Random(seed)
 SCENE = '''<scene version="3.0.0"><integrator type="%s">%s</integrator>
-  <sensor type="perspective"><transform name="to_world"><lookat origin="0,2,4" target="0,0,0" up="0,1,0"/></transform>
-    <film type="hdrfilm"><integer name="width" value="8"/><integer name="height" value="6"/></film></sensor>
+  <sensor type="perspective">
+    <transform name="to_world"><lookat origin="0,2,4" target="0,0,0" up="0,1,0"/></transform>
+    <film type="hdrfilm"><integer name="width" value="8"/><integer name="height" value="6"/></film>
+  </sensor>
   <shape type="rectangle"><transform name="to_world"><rotate x="1" angle="-90"/></transform></shape>
   <emitter type="point"><point name="position" x="0" y="2" z="1"/></emitter></scene>'''
-NAMES = sorted({name for plugin in _plugins.PLUGINS for name in mi.load_dict({"type": plugin}).settings()} - {"integrator"})
 ODD = ["samples_per_pass", "nope", "bsdf", "spp", "Strategies", ""]
-VALUES = {"integer": ["0", "1", "2", "3", "5", "-1", "-2", "7", "2147483647", "1000000000000", "1.5", ""],
+VALUES = {"integer": ["0", "1", "2", "3", "5", "-1", "-2", "7", "2147483647", "1000000000000",
+                      "1.5", ""],
           "float": ["0", "0.5", "1", "2", "-1", "1e308", "nan", "inf", "1e-40", "0,5", "0.05"],
           "boolean": ["true", "false", "yes", "1"],
-          "string": ["full", "local", "mis", "", "none", "f_y_f_yz", "raw_depth", "\\u00e9\\u0416", "x" * 5000]}
+          "string": ["full", "local", "mis", "", "none", "f_y_f_yz", "raw_depth",
+                     "\\u00e9\\u0416", "x" * 5000]}
 counts = {"rendered": 0, "made": 0, "refused": 0}
 for number in range(tries):
     plugin = random.choice(sorted(_plugins.PLUGINS))
@@ -168,9 +172,16 @@ for number in range(tries):
     chosen = random.sample(known + ODD if random.random() < 0.3 else known, random.randint(1, 3))
     right = {bool: "boolean", int: "integer", float: "float", str: "string"}
     default = mi.load_dict({"type": plugin}).settings()
-    kinds = [right[type(default[name])] if name in default and random.random() < 0.8 else random.choice(sorted(VALUES)) for name in chosen]
+    kinds = [
+        right[type(default[name])] if name in default and random.random() < 0.8
+        else random.choice(sorted(VALUES))
+        for name in chosen
+    ]
     values = [random.choice(VALUES[kind]) for kind in kinds]
-    xml = SCENE % (plugin, "".join(f'<{kind} name="{name}" value="{value}"/>' for kind, name, value in zip(kinds, chosen, values)))
+    xml = SCENE % (plugin, "".join(
+        f'<{kind} name="{name}" value="{value}"/>'
+        for kind, name, value in zip(kinds, chosen, values)
+    ))
     try:
         scene = mi.load_string(xml)
         counts["made"] += 1
@@ -181,7 +192,7 @@ for number in range(tries):
     except loading.SCENE_ERRORS as error:
         message = loading.one_line(error)
         by_plugin = f"{plugin}: " in message and any(f'"{name}"' in message for name in chosen)
-        by_parser = "could not parse" in message and any(f'"{value}"' in message for value in values)
+        by_parser = "could not parse" in message and any(f'"{v}"' in message for v in values)
         assert by_plugin or by_parser, (message, xml)
         assert len(message) < 20000 and "Traceback" not in message, message
         counts["refused"] += 1
@@ -199,9 +210,8 @@ def random_parameters(seed, tries, renders, timeout):
         env={**os.environ, "PYTHONPATH": str(ROOT)},
     )
     assert result.returncode == 0, result.stderr[-3000:]
-    return json.loads(
-        result.stdout[result.stdout.rindex("{") :]
-    )  # Mitsuba's warnings end where their colour does
+    # Mitsuba's warnings end where their colour does
+    return json.loads(result.stdout[result.stdout.rindex("{") :])
 
 
 def test_random_parameters():
@@ -218,7 +228,7 @@ def test_many_random_parameters(seed):
     assert counts["rendered"] == 60
 
 
-# --- One process --------------------------------------------------------------------------------------
+# --- One process --------------------------------------------------------------
 
 
 def small_world(radiance=3.0):
@@ -330,16 +340,18 @@ def test_threads_take_turns(rgb, monkeypatch):
 
 GROWTH = """
 import gc, sys
-sys.path.insert(0, "tests")
+sys.path[:0] = ["tests/integrators", "tests/helpers"]
 import mis_integrators, mitsuba as mi, drjit as dr
 mi.set_variant("llvm_ad_rgb")
 import test_hard_use as hard
 plugins = sys.argv[2:]
 def resident():
     gc.collect(); dr.flush_malloc_cache()
-    return int(next(line for line in open("/proc/self/status") if line.startswith("VmRSS")).split()[1]) / 1024
+    line = next(line for line in open("/proc/self/status") if line.startswith("VmRSS"))
+    return int(line.split()[1]) / 1024
 for number in range(int(sys.argv[1]) + 1):
-    hard.picture(plugins[number % len(plugins)], seed=number, scene=hard.small_world(1 + number % 7))
+    scene = hard.small_world(1 + number % 7)
+    hard.picture(plugins[number % len(plugins)], seed=number, scene=scene)
     if number == 20:
         early = resident()
 print(early, resident())

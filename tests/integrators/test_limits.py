@@ -42,7 +42,8 @@ def scene_file(tmp_path, rgb):
         size = "".join(f'<integer name="{name}" value="{value}"/>' for name, value in film.items())
         file = tmp_path / "scene.xml"
         file.write_text(
-            f'<scene version="3.0.0"><integrator type="path"/><sensor type="perspective"><film type="hdrfilm">{size}</film></sensor>'
+            '<scene version="3.0.0"><integrator type="path"/>'
+            f'<sensor type="perspective"><film type="hdrfilm">{size}</film></sensor>'
             '<shape type="sphere"/><emitter type="constant"/></scene>'
         )
         return file
@@ -50,7 +51,7 @@ def scene_file(tmp_path, rgb):
     return write
 
 
-# --- Films --------------------------------------------------------------------------------------------
+# --- Films --------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("film", EMPTY_FILMS, ids=str)
@@ -126,7 +127,7 @@ def test_light_paths_of_a_part_are_bounded(rgb, plugin):
     )
 
 
-# --- Numbers ------------------------------------------------------------------------------------------
+# --- Numbers ------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

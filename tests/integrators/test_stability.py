@@ -140,7 +140,8 @@ def tail_too_long(mixed, singles):
     log, error = max(ratios)
     if not found and log + error > math.log(LONGEST):
         raise TooWeak(
-            f"too weak: {math.exp(log):.2f} times, but {math.exp(log + error):.1f} times not excluded"
+            f"too weak: {math.exp(log):.2f} times, "
+            f"but {math.exp(log + error):.1f} times not excluded"
         )
     return ", ".join(found)
 
@@ -155,7 +156,8 @@ def too_noisy(mixed, singles, tail, tails):
         ) > math.log(TAIL)
         (mine, my_error), (its, its_error) = mixed[rare], single[rare]
         if mine - its - threshold() * math.hypot(my_error, its_error) > math.log(NOISE):
-            return f"variance {math.exp(mine - its):.2f} times that of bdd={bdd}{' in all pixels' if rare else ''}"
+            where = " in all pixels" if rare else ""
+            return f"variance {math.exp(mine - its):.2f} times that of bdd={bdd}{where}"
     return None
 
 

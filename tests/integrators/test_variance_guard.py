@@ -128,8 +128,8 @@ def test_advantage_is_what_it_was(measured, request):
             f"{name}, {what}: too noisy to guard anything (tolerance {tolerance:.2f})"
         )
         assert log_ratio < before + tolerance, (
-            f"{name}, {what}: variance ratio {math.exp(log_ratio):.3f}, was {math.exp(before):.3f}; "
-            f"tolerance {math.expm1(tolerance):.1%}"
+            f"{name}, {what}: variance ratio {math.exp(log_ratio):.3f}, "
+            f"was {math.exp(before):.3f}; tolerance {math.expm1(tolerance):.1%}"
         )
 
 

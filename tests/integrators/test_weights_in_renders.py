@@ -39,7 +39,7 @@ def weighted(plugin="bdpm_opt", **parameters):
     )
 
 
-# --- One weight function ------------------------------------------------------------------------------
+# --- One weight function ------------------------------------------------------
 
 
 class JointPaths:
@@ -166,7 +166,7 @@ def test_a_direction_that_the_camera_never_takes_is_left_to_the_photons(rgb):
     assert np.allclose(np.array(weight), 1)
 
 
-# --- Means --------------------------------------------------------------------------------------------
+# --- Means --------------------------------------------------------------------
 
 # emitter, family, parameters, sensor, variant, filter
 ROWS = [
@@ -255,7 +255,7 @@ def test_one_strategy_is_bdpm(rgb):
     assert np.abs(np.array(one) - np.array(plain)).max() < 2e-4 * np.array(plain).max()
 
 
-# --- Noise --------------------------------------------------------------------------------------------
+# --- Noise --------------------------------------------------------------------
 
 
 def variances(scene, integrator, iterations=48, trimmed=1e-3):
@@ -487,7 +487,7 @@ def test_other_weights_are_worse(rgb, monkeypatch, number):
     assert measured == pytest.approx(noise_in_sphere(1 + steps[0], 0.5 + steps[1]), rel=0.15)
 
 
-# --- Where weights could fail -------------------------------------------------------------------------
+# --- Where weights could fail -------------------------------------------------
 
 LAMP_AT_A_WALL = {"type": "point", "position": [-0.98, 0.5, 1.0], "intensity": 1e-6}
 
@@ -537,7 +537,7 @@ def test_mean_survives(rgb, case, plugin):
     assert_powerful(a, b, power, power)
 
 
-# --- Plugins ------------------------------------------------------------------------------------------
+# --- Plugins ------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("plugin, strategies", [("bdpm_opt2", 2), ("bdpm_opt3", 3)])

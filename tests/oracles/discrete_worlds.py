@@ -29,7 +29,7 @@ class World:
 
     def families(self):
         """All (l, i), shortest family first; l = 1 has one strategy, whose weight is one."""
-        return [(l, i) for l in range(2, self.K + 1) for i in range(l)]
+        return [(family, i) for family in range(2, self.K + 1) for i in range(family)]
 
     def albedo(self, j):
         return np.sum(self.f[j] * self.measure[j], axis=-1)
@@ -43,10 +43,10 @@ class World:
         """b/L, zero where L is: there the paper has nothing to say."""
         return np.where(self.L > 0, self.b / np.where(self.L > 0, self.L, 1), 0)
 
-    def light(self, l):
+    def light(self, family):
         """Luminance that ends the paths of family l: direct at z_{l-1}, or all of it for the last
         one."""
-        return self.L if l == self.K else self.L0[l - 2]
+        return self.L if family == self.K else self.L0[family - 2]
 
 
 def load(entry):
@@ -96,7 +96,7 @@ def random_world(seed, K, states=None, n_F=None, N_B=None, spread=1.2, zeros=0.0
     )
 
 
-# ---------------------------------------------------------------- noise, and its minimum by brute force
+# --- noise, and its minimum by brute force ------------------------------------
 
 
 def residuals(world, weights):
@@ -108,11 +108,8 @@ def residuals(world, weights):
     times what is gathered at z_i, averaged over light paths.
     """
     K, measure, f = world.K, world.measure, world.f
-    throughput, chance, flux = (
-        [np.array(1.0)],
-        [np.array(1.0)],
-        [np.array(1.0)],
-    )  # per level: T, P, f_0 ... f_j dmu_1 ... dmu_{j+1}
+    # per level: T, P, f_0 ... f_j dmu_1 ... dmu_{j+1}
+    throughput, chance, flux = [np.array(1.0)], [np.array(1.0)], [np.array(1.0)]
     for j in range(K - 1):
         throughput.append(
             throughput[j][..., None] * world.albedo(j)[..., None] * np.ones_like(f[j])
@@ -121,16 +118,17 @@ def residuals(world, weights):
         flux.append(flux[j][..., None] * f[j] * measure[j])
 
     costs, gathered = [], [np.zeros(np.shape(t)) for t in throughput]
-    for l, i in world.families():
-        carried = world.light(l) * weights[l, i]
-        if i < l - 1 or l == K:
+    for family, i in world.families():
+        carried = world.light(family) * weights[family, i]
+        if i < family - 1 or family == K:
             if i == K - 1:
                 kappa = throughput[i] * world.c()
             else:
                 kappa = world.N_B * f[0] if i == 0 else throughput[i][..., None] * f[i]
-                kappa = kappa.reshape(kappa.shape + (1,) * (l - 2 - i))
-            costs.append(np.sqrt(kappa / world.n_F * flux[l - 1] * world.light(l)) * weights[l, i])
-        for j in range(l - 2, i - 1, -1):
+                kappa = kappa.reshape(kappa.shape + (1,) * (family - 2 - i))
+            cost = np.sqrt(kappa / world.n_F * flux[family - 1] * world.light(family))
+            costs.append(cost * weights[family, i])
+        for j in range(family - 2, i - 1, -1):
             carried = np.sum(carried * f[j] * measure[j], axis=-1)
         gathered[i] = gathered[i] + carried
     X = np.zeros(())
@@ -148,27 +146,27 @@ def noise(world, weights):
 def single(world, k):
     """Weights that gather everything at z_k, or at the last vertex of shorter families."""
     return {
-        (l, i): np.full(np.shape(world.light(l)), float(i == min(k, l - 1)))
-        for l, i in world.families()
+        (family, i): np.full(np.shape(world.light(family)), float(i == min(k, family - 1)))
+        for family, i in world.families()
     }
 
 
 def _unpack(world, x):
     """Weights from the free ones (i > 0); those of i = 0 make each family's sum one."""
     weights, at = {}, 0
-    for l in range(2, world.K + 1):
-        shape, rest = np.shape(world.light(l)), 1.0
-        for i in range(1, l):
-            weights[l, i] = x[at : at + np.prod(shape)].reshape(shape)
+    for family in range(2, world.K + 1):
+        shape, rest = np.shape(world.light(family)), 1.0
+        for i in range(1, family):
+            weights[family, i] = x[at : at + np.prod(shape)].reshape(shape)
             at += np.prod(shape)
-            rest = rest - weights[l, i]
-        weights[l, 0] = rest
+            rest = rest - weights[family, i]
+        weights[family, 0] = rest
     return weights
 
 
 def free(world):
     """Number of weights that can be chosen freely."""
-    return sum((l - 1) * np.size(world.light(l)) for l in range(2, world.K + 1))
+    return sum((family - 1) * np.size(world.light(family)) for family in range(2, world.K + 1))
 
 
 def perturbed(world, weights, change):
@@ -190,7 +188,7 @@ def brute_force(world):
     return _unpack(world, x / size)
 
 
-# ---------------------------------------------------------------- the recursion on a world
+# --- the recursion on a world -------------------------------------------------
 
 
 def on_numpy(function, *arguments):
@@ -266,14 +264,15 @@ def recurse(world, local=False, dtype=np.float64, call=on_numpy, estimate=lambda
         drive.append(call(recursion.bounded_drive, raw, r[i + 1]))
 
     weights = {}
-    for l in range(2, K + 1):
-        if l < K:
-            w = call(recursion.direct_weight, drive[l - 1], e[l - 1])
+    for family in range(2, K + 1):
+        last = family - 1
+        if family < K:
+            w = call(recursion.direct_weight, drive[last], e[last])
         else:
-            w = call(recursion.deepest_weight, drive[l - 1], e[l - 1], r[l - 1], c)
-        weights[l, l - 1] = deeper = w
-        for i in range(l - 2, 0, -1):
-            at = (...,) + (None,) * (l - 2 - i)
+            w = call(recursion.deepest_weight, drive[last], e[last], r[last], c)
+        weights[family, last] = deeper = w
+        for i in range(family - 2, 0, -1):
+            at = (...,) + (None,) * (family - 2 - i)
             w = call(
                 recursion.inner_weight,
                 drive[i][(*at, None)],
@@ -281,6 +280,6 @@ def recurse(world, local=False, dtype=np.float64, call=on_numpy, estimate=lambda
                 theta[i][at],
                 deeper,
             )
-            weights[l, i], deeper = w, deeper + w
-        weights[l, 0] = 1 - deeper
+            weights[family, i], deeper = w, deeper + w
+        weights[family, 0] = 1 - deeper
     return weights, e[1:]

@@ -9,10 +9,12 @@ Photons merge at y_M with the weight w0 or at y_{M+1} with the weight w1, functi
 y_M -> y_{M+1}. Direct light always has the weight one. Arrays of one shape, one element a
 direction, NumPy or Dr.Jit:
 
-    f, p   BSDF value (no cosine) and camera path's density of the direction at y_M, per projected solid angle [1/sr]
+    f, p   BSDF value (no cosine) and camera path's density of the direction at y_M,
+           per projected solid angle [1/sr]
     L      luminance of y_{M+1} towards y_M, indirect light included [W/(m^2 sr)]; positive
     b      integral of f^2 over the indirect radiance incident at y_{M+1} [W/(m^2 sr^2)]
-    n      photons per unit of irradiance: merge area times light sub-paths over the light's flux [m^2/W]
+    n      photons per unit of irradiance: merge area times light sub-paths over the light's
+           flux [m^2/W]
 
 Integrals over the directions, projected solid angle, are arguments: `weights` takes the caller's
 quadrature.

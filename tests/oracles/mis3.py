@@ -11,11 +11,16 @@ Photons of three and more segments have the weights w30, w31, w32 at y0, y1, y2;
 segments w20 at y0, and direct light at y1 has w21. Arrays, NumPy or Dr.Jit (elementwise formulas),
 of the directions y0 -> z1 and z1 -> z2, per projected solid angle:
 
-    f0, L0, E2   one value a z1: BSDF at y0 [1/sr], direct luminance of z1 [W/(m^2 sr)], throughput E2 = E1 mu_1 of the camera path
-    f1, L, b     one value a (z1, z2): BSDF at z1, luminance of z2 (positive), integral of f^2 over its incident indirect radiance
-    E1           albedo mu_0 of y0: throughput of the camera path behind it; its densities are p_i = f_i / mu_i
-    n            photons per unit of irradiance: merge area times light sub-paths over the light's flux [m^2/W]
-    q, c         kernel costs: q = N_B f0 at y0 (one value a z1), c = b/L + n L at y2 (one value a (z1, z2)) [1/sr]
+    f0, L0, E2   one value a z1: BSDF at y0 [1/sr], direct luminance of z1 [W/(m^2 sr)],
+                 throughput E2 = E1 mu_1 of the camera path
+    f1, L, b     one value a (z1, z2): BSDF at z1, luminance of z2 (positive), integral of f^2
+                 over its incident indirect radiance
+    E1           albedo mu_0 of y0: throughput of the camera path behind it; its densities are
+                 p_i = f_i / mu_i
+    n            photons per unit of irradiance: merge area times light sub-paths over the
+                 light's flux [m^2/W]
+    q, c         kernel costs: q = N_B f0 at y0 (one value a z1), c = b/L + n L at y2
+                 (one value a (z1, z2)) [1/sr]
 
 Integrals over z1 or z2 are arguments: `weights` takes the caller's quadratures. One value a z1
 meets one a (z1, z2) by broadcasting: the caller gives it a last axis of length one.

@@ -26,7 +26,7 @@ def _rgb(rgb):
     pass
 
 
-# --- Photon map -------------------------------------------------------------------------------------------
+# --- Photon map ---------------------------------------------------------------
 
 
 def test_kernels_do_not_know_where_numpy_keeps_numbers():
@@ -36,7 +36,7 @@ def test_kernels_do_not_know_where_numpy_keeps_numbers():
     for offset in range(16):
         array = packing.from_numpy(mi.Float, numbers[offset : offset + 400])
         records = dr.gather(mi.Vector4f, array, dr.arange(mi.UInt32, 100)) + 1
-        kernels |= kernels_of(lambda: dr.eval(records))
+        kernels |= kernels_of(lambda records=records: dr.eval(records))
         np.testing.assert_array_equal(
             packing.to_numpy(records).T.ravel(), numbers[offset : offset + 400] + 1
         )
@@ -222,7 +222,7 @@ def test_map_finds_everything(seed, n, radius, offset):
     assert (number <= (distances < radius * (1 + 1e-4)).sum(axis=1)).all()
 
 
-# --- Packing ------------------------------------------------------------------------------------------------
+# --- Packing ------------------------------------------------------------------
 
 unit_vectors = (
     st.tuples(*[st.floats(-1, 1)] * 3)
@@ -263,7 +263,7 @@ def test_float_bits_round_trip(x):
     assert float(packing.bits_float(packing.float_bits(mi.Float(x)))[0]) == np.float32(x)
 
 
-# --- Random numbers ---------------------------------------------------------------------------------------------
+# --- Random numbers -----------------------------------------------------------
 
 
 def test_streams_are_uniform_and_differ():
@@ -289,7 +289,7 @@ def test_seeds_of_purposes_differ():
     assert len(words) == 20 * 50 * 3
 
 
-# --- Light sub-paths ----------------------------------------------------------------------------------------------
+# --- Light sub-paths ----------------------------------------------------------
 
 
 def emission(scene, count=1 << 18, seed=7):
@@ -385,7 +385,7 @@ def test_area_lights_emit_outwards_like_cosine(shape, rotation):
             },
         }
     )
-    lights, ray, flux = emission(scene, 1 << 16)
+    _, ray, flux = emission(scene, 1 << 16)
     area = float(scene.shapes()[0].surface_area()[0])
     np.testing.assert_allclose(flux, np.pi * 3 * area, rtol=1e-4)
     assert not np.array(scene.ray_test(ray)).any()
@@ -444,7 +444,7 @@ def test_small_spots_of_light_are_not_taken_for_darkness():
     scene = mi.load_dict({"type": "scene", "lamp": lamp})
     emitter = scene.emitters()[0]
     assert _mean_power(emitter) == 0, "test too weak"
-    lights, ray, flux = emission(scene, 1 << 21)
+    lights, _, flux = emission(scene, 1 << 21)
     assert not lights.dark
     mean, error = mean_and_error(flux)
     everywhere = mi.warp.square_to_uniform_sphere(
@@ -491,7 +491,7 @@ def test_spectral_suns_are_chosen_by_their_light():
     assert chosen[1] == pytest.approx(chosen[0], rel=0.1)
 
 
-# --- Direct light ---------------------------------------------------------------------------------------------------
+# --- Direct light -------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -553,9 +553,8 @@ def test_density_of_direct_light(emitter):
     again = np.array(lights.pdf_direct(si, found, mi.Bool(True)))
     stated = np.array(pdf + dr.zeros(mi.Float, n))
     relative = np.abs(again - stated)[valid] / stated[valid]
-    assert np.quantile(relative, 0.9) < 0.02, np.quantile(
-        relative, [0.5, 0.9, 0.98]
-    )  # grazing ones suffer from rounding
+    # grazing ones suffer from rounding
+    assert np.quantile(relative, 0.9) < 0.02, np.quantile(relative, [0.5, 0.9, 0.98])
     # Radiance integrated with that density is radiance integrated with uniform directions.
     value, error = mean_and_error(np.array(dr.mean(weight) + dr.zeros(mi.Float, n)))
     d = mi.warp.square_to_uniform_sphere(next_2d(rng))
@@ -577,7 +576,7 @@ def test_weights_sum_to_one(a, b):
         assert weights[0] == pytest.approx(a * a / (a * a + b * b), rel=1e-3)
 
 
-# --- Environments ---------------------------------------------------------------------------------------------------------
+# --- Environments -------------------------------------------------------------
 
 
 def test_direction_cells():
@@ -604,7 +603,7 @@ def test_environment_directions(emitter):
     rng = streams(dr.arange(mi.UInt32, n), mi.UInt32(3))
     it = dr.zeros(mi.Interaction3f, n)
     it.p = guide.center
-    towards, pdf, row, _ = guide.sample_direction(
+    towards, pdf, *_ = guide.sample_direction(
         environment, mi.UInt32(0), it, next_2d(rng), rng.next_float32(), mi.Bool(True)
     )
     inverse = np.array(dr.select(pdf > 0, dr.rcp(pdf), 0))
@@ -672,9 +671,10 @@ def test_position_density(emitter):
     ).all()
 
 
-def room_with_window(sky={"type": "sunsky", "sun_direction": [0.8, 0.1, 0.5], "turbidity": 3.0}):
+def room_with_window(sky=None):
     """A closed room of 6 x 4 x 3 with a window of 1 x 1 in one wall; the camera stands inside, the
     sky (a sun, unless told otherwise) looks in."""
+    sky = sky or {"type": "sunsky", "sun_direction": [0.8, 0.1, 0.5], "turbidity": 3.0}
     wall = {"type": "twosided", "bsdf": diffuse(0.7)}
 
     def slab(x0, x1, y0, y1, z0, z1):

@@ -40,7 +40,7 @@ def test_neighbours_are_the_nearest(rgb, count, neighbors, stretch):
     rows = np.array(grid.row(mi.Point3f(q), mi.Normal3f(m)))
     assert rows.max() < grid.rows
     cell, face = rows // 6, rows % 6
-    nx, ny, nz = grid.resolution
+    nx, ny, _ = grid.resolution
     edge = 1 / float(grid._scale[0])
     centre = (np.stack([cell % nx, cell // nx % ny, cell // (nx * ny)]) + 0.5) * edge + p.min(
         axis=1

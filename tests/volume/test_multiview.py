@@ -88,7 +88,7 @@ def reference(g):
     return oracle.estimate()
 
 
-# --- One view ------------------------------------------------------------------------------------------------
+# --- One view -----------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -153,7 +153,7 @@ def test_transmittance(rgb, scale):
     assert abs(value.mean() - exact) < 5 * value.std() / np.sqrt(n) < 0.03 * exact  # 6e-7
 
 
-# --- Several views ---------------------------------------------------------------------------------------------
+# --- Several views ------------------------------------------------------------
 
 
 @pytest.mark.parametrize("shift", SHIFTS)
@@ -295,12 +295,11 @@ def test_views_without_overlap(rgb):
         alone.add(count)
         apart.append(np.var(alone.batches, axis=0)[1:].mean())
     ratio = np.var(together.batches, axis=0)[1:].mean() / np.mean(apart)
-    assert abs(np.log(ratio)) < 6 * np.sqrt(
-        4 / count / 4
-    )  # variances of `count` batches, of some four independent blocks
+    # variances of `count` batches, of some four independent blocks
+    assert abs(np.log(ratio)) < 6 * np.sqrt(4 / count / 4)
 
 
-# --- What can go wrong -----------------------------------------------------------------------------------------
+# --- What can go wrong --------------------------------------------------------
 
 
 def test_hostile_views(rgb):
@@ -321,9 +320,8 @@ def test_hostile_views(rgb):
         "interior": {"type": "ref", "id": "fog"},
     }
     inside = view((0, 0.2, 3.4)) | {"medium": {"type": "ref", "id": "fog"}}
-    near = view((0.8, 0.3, 7.0), fov=19.0, near_clip=5.0) | {
-        "medium": {"type": "ref", "id": "fog"}
-    }  # its near plane stands in the fog
+    # its near plane stands in the fog
+    near = view((0.8, 0.3, 7.0), fov=19.0, near_clip=5.0) | {"medium": {"type": "ref", "id": "fog"}}
     half = view((-2.5, 0.8, 6.0), (-0.8, 0, 0), fov=20.0)
     scene = world(
         None,
@@ -483,7 +481,7 @@ def test_views_on_both_sides_of_a_surface(rgb):
     assert together.statistics["reached"] > 0.1 * together.statistics["tried"]
 
 
-# --- Films ------------------------------------------------------------------------------------------------------
+# --- Films --------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -542,9 +540,8 @@ def test_films(rgb, rfilter, options):
             for side in (mine, theirs)
         )
         assert not differences(a, b)
-        assert (
-            smallest_visible(a, b)[0] < 0.05 and np.median(smallest_visible(a, b)) < 0.25
-        )  # of the whole, and of a border pixel
+        # of the whole, and of a border pixel
+        assert smallest_visible(a, b)[0] < 0.05 and np.median(smallest_visible(a, b)) < 0.25
 
 
 def test_variance(rgb):
@@ -561,12 +558,11 @@ def test_variance(rgb):
         images = np.array(images)
         assert session.channels[-3:] == ["var.R", "var.G", "var.B"]
         told, seen = images[..., -3:].mean(), images[..., :3].var(axis=0, ddof=1).mean()
-        assert told == pytest.approx(
-            seen, rel=0.15
-        )  # twelve iterations; the mean is over 1500 values of 40 renders each
+        # twelve iterations; the mean is over 1500 values of 40 renders each
+        assert told == pytest.approx(seen, rel=0.15)
 
 
-# --- Sessions ---------------------------------------------------------------------------------------------------
+# --- Sessions -----------------------------------------------------------------
 
 
 def test_seeds_and_parts(rgb, monkeypatch):
@@ -671,9 +667,8 @@ def test_cameras_are_mitsubas(rgb):
         seen = np.array(ds.pdf) > 0
         assert seen.mean() > 0.95 and ((np.array(density) > 0) == seen).mean() > 0.995
         seen &= np.array(density) > 0
-        known = seen & (
-            np.array(weight.x) > 0
-        )  # 3.9.1 forgets the principal point in it: zero where the film is shifted to
+        # 3.9.1 forgets the principal point in it: zero where the film is shifted to
+        known = seen & (np.array(weight.x) > 0)
         assert known.mean() > (0.75 if number == 0 else 0.95)
         assert np.allclose(np.array(density)[known], np.array(weight.x)[known] * 220, rtol=1e-3)
         assert np.allclose(np.array(position)[:, seen], np.array(ds.uv)[:, seen], atol=2e-3)
@@ -759,7 +754,7 @@ def test_little_light(rgb, depth, lit):
     ) == (lit and depth == 1)
 
 
-# --- Errors -----------------------------------------------------------------------------------------------------
+# --- Errors -------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -798,7 +793,7 @@ def test_scenes_refused(rgb):
     refused(["at least two"], multiview(variance=True), s=view((0, 0, 4)))
 
 
-# --- The command ------------------------------------------------------------------------------------------------
+# --- The command --------------------------------------------------------------
 
 
 def test_command(rgb, tmp_path, capsys):

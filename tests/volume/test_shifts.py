@@ -67,9 +67,8 @@ def generated():
 
 
 def stored(file):
-    entries = (
-        json.loads(file.read_text()) if file.exists() else []
-    )  # other kinds of vectors are no business of these tests
+    # other kinds of vectors are no business of these tests
+    entries = json.loads(file.read_text()) if file.exists() else []
     for number, entry in enumerate(entries):
         base, target = (
             Sections(entry[s]["tmin"], entry[s]["tmax"], entry[s]["majorant"])
@@ -101,7 +100,7 @@ def on_arrays(segment, make):
     )
 
 
-# --- Known answers ------------------------------------------------------------------------------------
+# --- Known answers ------------------------------------------------------------
 
 
 def test_stretches(case):
@@ -157,7 +156,7 @@ def test_copies(name, seed):
             )
 
 
-# --- What every shift obeys -------------------------------------------------------------------------------
+# --- What every shift obeys ---------------------------------------------------
 
 
 def interior_points(segment, count, margin=0.02):
@@ -265,9 +264,8 @@ def test_thick_media(name, precision, rgb):
                 )
                 assert values[0][-1] == pytest.approx(5, abs=1e-5)
                 assert np.all(values[3] >= 0)
-                assert (
-                    values[0][0] < 4.999 or base_depth > 100
-                )  # all of the base's first hundredth goes to the end only if it is opaque
+                # all of the base's first hundredth goes to the end only if it is opaque
+                assert values[0][0] < 4.999 or base_depth > 100
 
 
 def test_primary_sample_deep_inside():
@@ -281,9 +279,8 @@ def test_primary_sample_deep_inside():
         assert np.allclose(same.t, t, atol=1e-6) and np.allclose(same.jacobian, 1, rtol=1e-3)
     thin, thick = Sections([0.0], [1.0], [2.0]), Sections([0.0], [1.0], [200.0])
     t = np.array([0.3, 0.999])
-    expected = [
-        -np.log1p(-(-np.expm1(-2 * x)) / (-np.expm1(-2.0))) / 200 for x in t
-    ]  # u'max = 1 in double precision
+    # u'max = 1 in double precision
+    expected = [-np.log1p(-np.expm1(-2 * x) / np.expm1(-2.0)) / 200 for x in t]
     assert np.allclose(shifts.primary_sample(thin, thick, t).t, expected, rtol=1e-9)
 
 

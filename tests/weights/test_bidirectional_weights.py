@@ -33,10 +33,11 @@ class RandomPaths:
         for i, is_delta in enumerate(self.delta):
             if is_delta:
                 self.to_light[i] = self.to_camera[i]
+        # of light sub-paths at x_1 over next-event estimation; of camera rays at x_{k-1}
         self.emission, self.lens = (
             draw(),
             draw(),
-        )  # of light sub-paths at x_1 over next-event estimation; of camera rays at x_{k-1}
+        )
         self.direct = draw()  # next-event estimation, per projected solid angle at x_1
         self.met = met
 

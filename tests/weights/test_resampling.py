@@ -79,9 +79,8 @@ def pytest_generate_tests(metafunc):
             )
         else:
             file = Path(directory) / "resampling.json"
-            worlds = (
-                json.loads(file.read_text()) if file.exists() else []
-            )  # other kinds of vectors are no business of these tests
+            # other kinds of vectors are no business of these tests
+            worlds = json.loads(file.read_text()) if file.exists() else []
             names = [str(i) for i in range(len(worlds))]
         metafunc.parametrize(
             "world",
@@ -107,7 +106,7 @@ def moment(world, g=None):
     )
 
 
-# ---------------------------------------------------------------- exact worlds
+# --- exact worlds -------------------------------------------------------------
 
 
 def test_variance_is_exact(world):
@@ -165,9 +164,8 @@ def test_weights_are_the_best(world):
 
 
 def test_single_precision(world):
-    assert variance(world, np.float32) == pytest.approx(
-        variance(world), rel=2e-4
-    )  # differences of sums of some tens of terms
+    # differences of sums of some tens of terms
+    assert variance(world, np.float32) == pytest.approx(variance(world), rel=2e-4)
 
 
 def test_drjit_arrays(world, rgb):
@@ -182,7 +180,7 @@ def test_drjit_arrays(world, rgb):
         assert float(dr.sum(probability)[0]) == pytest.approx(1, abs=1e-6)
 
 
-# ---------------------------------------------------------------- limits
+# --- limits -------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("S", [1, 2, 5])
@@ -215,9 +213,8 @@ def test_length_share_above_one(dtype):
             value = resampling.gain(np.array([1.0], dtype), np.array([share], dtype), M)
             assert np.all((value > 0) & (value <= M))
     assert np.all(resampling.bracket(np.array([1 + 1e-6, 2, 1e9], dtype), 1) == 0)
-    assert (
-        resampling.gain(np.array([0.3], dtype), np.array([1.2], dtype), 1)[0] == 1
-    )  # the only proposal is always drawn
+    # the only proposal is always drawn
+    assert resampling.gain(np.array([0.3], dtype), np.array([1.2], dtype), 1)[0] == 1
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])

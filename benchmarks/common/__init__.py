@@ -1,0 +1,1 @@
+"""What experiments and report both need: scenes, methods, references, measured renders, rows."""

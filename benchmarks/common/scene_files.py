@@ -1,0 +1,100 @@
+"""Which scenes are measured, and how their files are opened."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+from xml.etree import ElementTree
+
+from mis_integrators.app import loading
+
+import mitsuba as mi
+
+BUNDLED = Path(__file__).resolve().parents[2] / "scenes"
+
+
+@dataclass
+class OpenScene:
+    """A loaded scene: its file, what its own integrator hands on to others, its sensor and film
+    size."""
+
+    path: Path | None
+    """``None`` for a scene that no file holds."""
+    scene: mi.Scene
+    inherited: dict[str, loading.Value]
+    made: str = ""
+    """What a scene without a file was made from: it tells it from all others."""
+    title: str = ""
+    """Its name."""
+
+    @property
+    def name(self) -> str:
+        """The file's name, or its folder's where all files are called ``scene.xml``."""
+        if self.path is None:
+            return self.title
+        return self.path.resolve().parent.name if self.path.stem == "scene" else self.path.stem
+
+    @property
+    def sensor(self) -> mi.Sensor:
+        return self.scene.sensors()[0]
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the rendered window."""
+        width, height = self.sensor.film().crop_size()
+        return int(width), int(height)
+
+    @property
+    def pixels(self) -> int:
+        return self.size[0] * self.size[1]
+
+
+def bundled() -> list[Path]:
+    """The scenes that come with the project."""
+    return sorted(BUNDLED.glob("*.xml"))
+
+
+def open_scene(path: Path, size: tuple[int, int] | None = None) -> OpenScene:
+    """Load a scene, its film resized to ``size`` if given (the sensor keeps its field of view)."""
+    loaded = loading.load(path, {}, "path", {})
+    if size:
+        film = mi.traverse(loaded.scene.sensors()[0])
+        film["film.size"] = mi.ScalarVector2u(*size)
+        film.update()
+    inherited = {
+        name: loaded.parameters[name] for name in loading.INHERITED if name in loaded.parameters
+    }
+    return OpenScene(path, loaded.scene, inherited)
+
+
+def scaled_size(path: Path, scale: float) -> tuple[int, int] | None:
+    """The scene's own film size times ``scale``; ``None`` where that changes nothing."""
+    if scale == 1:
+        return None
+    width, height = open_scene(path).size
+    return max(1, round(width * scale)), max(1, round(height * scale))
+
+
+def files_of(path: Path) -> list[Path]:
+    """The scene file and every file that it names."""
+    named = {
+        path.parent / element.get("value", "")
+        for element in ElementTree.parse(path).iter("string")
+        if element.get("name") == "filename"
+    }
+    return [path, *sorted(named)]
+
+
+def digests(path: Path) -> dict[str, str]:
+    """SHA-256 of the scene's files, by their names relative to its folder."""
+    return {
+        file.relative_to(path.parent).as_posix(): hashlib.sha256(file.read_bytes()).hexdigest()
+        for file in files_of(path)
+    }
+
+
+def fingerprint(opened: OpenScene) -> str:
+    """One SHA-256 for all of the scene's files, or for what it was made from."""
+    content = repr(sorted(digests(opened.path).items())) if opened.path else opened.made
+    return hashlib.sha256(content.encode()).hexdigest()

@@ -1,0 +1,144 @@
+"""Equal time for several renderings in one process: they take turns in short slices, so that what
+else the machine does hits all alike."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+from mis_integrators.core.session import Session
+
+import drjit as dr
+import numpy as np
+
+from common.references import colours
+
+SLICE_SECONDS = 0.5
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """The picture after some rendering time."""
+
+    seconds: float
+    iterations: int
+    samples_per_pixel: int
+    image: np.ndarray
+    """Colours, (H, W, 3)."""
+
+
+@dataclass
+class Contender:
+    """One rendering in progress, and the time that it has used; compiling kernels is counted
+    apart."""
+
+    label: str
+    session: Session
+    seconds: list[float] = field(default_factory=list)
+    """Rendering seconds of each iteration."""
+    setting_up: float = 0.0
+    """Seconds that went before the first iteration."""
+    compiling: float = 0.0
+    usual: float | None = None
+    """Seconds of an iteration, if known before: the first one of this rendering, with its pilots,
+    does not tell."""
+    observe: Callable[[list[dict], float], None] | None = None
+    """Called after each iteration with its kernels (as in Dr.Jit's kernel history) and its
+    seconds."""
+    marks: list[float] = field(default_factory=list)
+    """Rendering seconds, ascending, after which a snapshot is wanted."""
+    snapshots: list[Snapshot] = field(default_factory=list)
+
+    @classmethod
+    def begin(
+        cls,
+        label: str,
+        make: Callable[[int], Session],
+        seed: int,
+        marks: Sequence[float] = (),
+        usual: float | None = None,
+    ) -> Contender:
+        """Make a session; the time that it takes counts."""
+        start = time.perf_counter()
+        session = make(seed)
+        return cls(
+            label, session, setting_up=time.perf_counter() - start, usual=usual, marks=list(marks)
+        )
+
+    @property
+    def rendering(self) -> float:
+        """Seconds used so far."""
+        return self.setting_up + sum(self.seconds)
+
+    @property
+    def first(self) -> float:
+        """Seconds until the first iteration was done: preparation, a pilot, recording, the
+        iteration."""
+        return self.setting_up + self.seconds[0]
+
+    def iterate(self) -> None:
+        """Run one iteration against this rendering's own clock."""
+        dr.kernel_history_clear()
+        start = time.perf_counter()
+        self.session.iterate()
+        seconds = time.perf_counter() - start
+        kernels = dr.kernel_history()
+        compiling = min(seconds, compile_seconds(kernels))
+        self.compiling += compiling
+        self.seconds.append(seconds - compiling)
+        if self.observe:
+            self.observe(kernels, seconds)
+        if self.marks and self.rendering >= self.marks[0]:
+            self.marks = [mark for mark in self.marks if mark > self.rendering]
+            self.take_snapshot()
+
+    def take_snapshot(self) -> None:
+        """Keep the picture as it is now; the time that it takes does not count."""
+        session = self.session
+        samples = session.iterations * session.camera_paths
+        self.snapshots.append(
+            Snapshot(self.rendering, session.iterations, samples, colours(session))
+        )
+
+    def wants(self, seconds: float, spp: int | None = None) -> bool:
+        """Whether one more iteration brings the time used closer to ``seconds``, or is needed for
+        ``spp`` samples per pixel."""
+        if spp:
+            return self.session.iterations * self.session.camera_paths < spp
+        if not self.seconds:
+            return True
+        next_one = (
+            self.usual if len(self.seconds) == 1 and self.usual is not None else self.seconds[-1]
+        )
+        return self.rendering + 0.5 * next_one < seconds
+
+
+def compile_seconds(kernels: Sequence[dict]) -> float:
+    """Seconds that kernels of Dr.Jit's history took to compile; next to none for those found in a
+    cache."""
+    return (
+        sum(kernel.get("codegen_time", 0) + kernel.get("backend_time", 0) for kernel in kernels)
+        / 1000
+    )
+
+
+def take_turns(
+    contenders: Sequence[Contender],
+    seconds: float,
+    tell: Callable[[str], None] = lambda text: None,
+    spp: int | None = None,
+) -> None:
+    """Let each contender use ``seconds`` of rendering time, or take ``spp`` samples per pixel, in
+    slices, in an order that rotates."""
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        turn = 0
+        while unfinished := [c for c in contenders if c.wants(seconds, spp)]:
+            turn += 1
+            shift = turn % len(unfinished)
+            for contender in unfinished[shift:] + unfinished[:shift]:
+                end = contender.rendering + SLICE_SECONDS
+                while contender.rendering < end and contender.wants(seconds, spp):
+                    contender.iterate()
+            tell(f"{min(c.rendering for c in contenders):.1f} of {seconds:g} s each")
+        dr.kernel_history_clear()

@@ -1,0 +1,158 @@
+"""Prices of events: fits what iterations cost to what they do, over scenes, in units of one segment
+of Mitsuba's `path`.
+
+Processor time is measured, not the clock's: other work on the machine disturbs it less. The
+sessions take turns.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from pathlib import Path
+
+from mis_integrators.integrators import costs, light_tracing
+from mis_integrators.integrators.choice import PHOTON_MAPPERS, name_of
+from mis_integrators.integrators.unidirectional import PathSession
+from mis_integrators.paths.path_length_statistics import mean_segments
+
+import mitsuba as mi
+import numpy as np
+
+from common.rows import show, tell
+from common.scene_files import open_scene, scaled_size
+
+METHODS = (("path", {}), *PHOTON_MAPPERS)
+CONNECTED, LIGHT_TRACING = ("pcbpt", "bdpt_ris"), (0.5, 2.0)
+"""Plugins that choose how many light sub-paths they trace, and numbers of those, for each camera
+path, so that their price shows."""
+PLUGINS = (*dict.fromkeys(plugin for plugin, _ in METHODS), *CONNECTED)
+RADII = (1.0, 2.0)
+"""Multiples of the automatic radius, so that the price of a gathered photon shows."""
+ITERATIONS, SKIPPED = 8, 2
+TARGET = Path(costs.__file__).with_name("costs.json")
+
+
+def run(options: argparse.Namespace) -> None:
+    """The sub-command ``costs``: measures, prints how well the fit explains each measurement, and
+    writes the prices."""
+    rows = []
+    for path in options.scenes:
+        opened = open_scene(path, scaled_size(path, options.scale))
+        tell(opened.name)
+        rows += measured(opened, options.plugins)
+    prices, table = dict(costs.PRICES), []
+    for plugin in options.plugins:
+        own = [row for row in rows if row["plugin"] == plugin]
+        prices[plugin] = fit(own)
+        for row in own:
+            predicted = costs.cost(plugin, row["events"], prices)
+            table.append(
+                {
+                    "scene": row["scene"],
+                    "method": row["method"],
+                    "cost": row["cost"],
+                    "predicted / cost": predicted / row["cost"],
+                }
+            )
+    show(
+        "Cost of an iteration, in segments of path a pixel",
+        table,
+        ("scene", "method", "cost", "predicted / cost"),
+    )
+    TARGET.write_text(
+        json.dumps(
+            {
+                plugin: {name: round(value, 5) for name, value in price.items()}
+                for plugin, price in prices.items()
+            },
+            indent=1,
+        )
+        + "\n"
+    )
+    tell(f"prices written to {TARGET}")
+
+
+def measured(opened, plugins) -> list[dict]:
+    """One row a method and radius, or number of light sub-paths: events a pixel, and cost in units
+    of a segment of `path`."""
+    scene, sensor = opened.scene, opened.sensor
+    first = mi.load_dict({"type": "bdpm", "camera_paths": 1, **opened.inherited})
+    segments = mean_segments(
+        scene, sensor, 1, 1, int(np.prod(opened.size)), first.max_depth, first.rr_depth
+    )
+    sessions = []
+    for plugin, parameters in METHODS:
+        if plugin not in (*plugins, "path"):
+            continue
+        given = {**opened.inherited, **parameters}
+        if plugin == "path":
+            session = PathSession(first, scene, sensor, 0, None)
+            sessions.append((plugin, plugin, session, costs.events(session, segments, None, 0.0)))
+            continue
+        pilot = mi.load_dict({"type": plugin, **given}).session(scene, sensor)
+        pilot.iterate()
+        if pilot.forecast is None:
+            continue
+        for factor in RADII:
+            session = mi.load_dict({"type": plugin, **given}).session(scene, sensor)
+            session.radii = {kind: radius * factor for kind, radius in pilot.radii.items()}
+            session.iterate()
+            counted = costs.events(
+                session, segments, session.last_vertex, pilot.forecast.gathered * factor**2
+            )
+            sessions.append(
+                (plugin, f"{name_of(plugin, parameters)} x {factor:g}", session, counted)
+            )
+    for plugin in [plugin for plugin in CONNECTED if plugin in plugins]:
+        for ratio in LIGHT_TRACING:
+            session = mi.load_dict(
+                {"type": plugin, "light_tracing": ratio, **opened.inherited}
+            ).session(scene, sensor)
+            session.iterate()
+            sessions.append(
+                (
+                    plugin,
+                    f"{plugin} light_tracing={ratio:g}",
+                    session,
+                    light_tracing.events(session),
+                )
+            )
+    seconds = {label: [] for _, label, _, _ in sessions}
+    for _ in range(ITERATIONS):
+        for _, label, session, _ in sessions:
+            start = time.process_time()
+            session.iterate()
+            seconds[label].append(time.process_time() - start)
+    took = {label: float(np.median(times[SKIPPED:])) for label, times in seconds.items()}
+    unit = took["path"] / float(sum(segments))
+    return [
+        {
+            "scene": opened.name,
+            "plugin": plugin,
+            "method": label,
+            "events": counted,
+            "cost": took[label] / unit,
+        }
+        for plugin, label, _, counted in sessions
+    ]
+
+
+def fit(rows: list[dict]) -> dict[str, float]:
+    """Prices, none negative, that explain the costs with the least squared relative error."""
+    counts = np.array([row["events"] for row in rows])
+    cost = np.array([row["cost"] for row in rows])
+    if rows[0]["plugin"] == "path":
+        return dict(zip(costs.EVENTS, (1.0, 0.0, 0.0, 0.0)))
+    used = list(range(counts.shape[1]))
+    while True:  # least squares, dropping the most negative price until none is
+        solution, *_ = np.linalg.lstsq(
+            counts[:, used] / cost[:, None], np.ones(len(cost)), rcond=None
+        )
+        if solution.min() >= 0:
+            break
+        del used[int(np.argmin(solution))]
+    prices = np.zeros(counts.shape[1])
+    prices[used] = solution
+    return dict(zip(costs.EVENTS, prices.tolist()))

@@ -1,0 +1,143 @@
+"""Variance of one iteration at equal radius: numbers against the best single strategy, and maps
+side by side."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+
+from mis_integrators.analysis.metrics import trimmed_mean
+from mis_integrators.analysis.variance_maps import best_single, relative_variance, share_worse
+from mis_integrators.app import loading
+from mis_integrators.core.traits import scene_bounds
+
+import numpy as np
+
+from common.methods import Method
+from common.rows import Row, console, save, show, tell
+from common.scene_files import OpenScene, open_scene, scaled_size
+from report import sections
+from report.figures import draw_variance_maps
+from report.page import Page
+
+COLUMNS = (
+    "scene",
+    "N_B",
+    "radius",
+    "method",
+    "relative variance",
+    "ratio to best single",
+    "untrimmed ratio",
+    "time ratio",
+    "equal-time ratio",
+    "blocks worse",
+)
+
+
+def run(options: argparse.Namespace) -> None:
+    """The sub-command ``variance``."""
+    rows: list[Row] = []
+    page = Page("Variance of one iteration", options.out / "variance.html")
+    for path in options.scenes:
+        opened = open_scene(path, scaled_size(path, options.scale))
+        for camera_paths in options.camera_paths:
+            found = compare(opened, camera_paths, options)
+            show(f"{opened.name}: one iteration, N_B = {camera_paths}", found, COLUMNS)
+            rows += found
+            save(options.out, "variance", rows, vars(options))
+            page.add(sections.variance(opened.name, picture_of(opened, camera_paths, options)))
+    for camera_paths in options.camera_paths:
+        summarise([row for row in rows if row["N_B"] == camera_paths], camera_paths)
+    page.write()
+    console.print(f"page: {page.path}")
+
+
+def picture_of(opened: OpenScene, camera_paths: int, options: argparse.Namespace) -> Path:
+    """Where the maps of a scene are drawn."""
+    return options.out / f"variance_{opened.name}_{camera_paths}.png"
+
+
+def compare(opened: OpenScene, camera_paths: int, options: argparse.Namespace) -> list[Row]:
+    """A row a method; pictures and maps go to a PNG. Ratios are to the best of the pure strategies
+    (`bdpm`), or of all if there is none.
+
+    Methods whose plugin has no merge radius or no channel of variances, and those that cannot
+    render the scene, are left out.
+    """
+    diagonal = float(np.linalg.norm(np.array(scene_bounds(opened.scene).extents())))
+    radius = options.radius or options.radius_share * diagonal
+    common = {"initial_radius": radius, "camera_paths": camera_paths, "variance": True}
+    methods, images, variances, seconds = [], [], [], []
+    for method in options.integrators:
+        try:
+            integrator = Method(
+                method.label, method.plugin, {**common, **method.parameters}
+            ).integrator(opened)
+            session = integrator.session(opened.scene, opened.sensor, seed=1)
+            session.iterate()
+        except loading.SCENE_ERRORS as error:
+            console.print(f"{opened.name}: {method.label} left out: {loading.one_line(error)}")
+            continue
+        session.iterate()
+        start = time.perf_counter()
+        while session.iterations < options.iterations + 2:
+            session.iterate()
+            tell(f"{opened.name}: {method.label} {session.iterations}")
+        methods.append(method)
+        seconds.append((time.perf_counter() - start) / options.iterations)
+        image = session.image()
+        images.append(image[..., :3])
+        variances.append(image[..., -3:] * session.iterations)
+    if not methods:
+        raise SystemExit(f"{opened.name}: no method's variance can be measured")
+    mean = np.mean(images, axis=0)
+    maps = [relative_variance(variance, mean) for variance in variances]
+    singles = [number for number, method in enumerate(methods) if method.plugin == "bdpm"] or list(
+        range(len(methods))
+    )
+    best = best_single([maps[number] for number in singles])
+    number_of_best = next(number for number in singles if maps[number] is best)
+    rows: list[Row] = []
+    for method, mine, spent in zip(methods, maps, seconds):
+        ratio = trimmed_mean(mine) / trimmed_mean(best)
+        rows.append(
+            {
+                "scene": opened.name,
+                "N_B": camera_paths,
+                "radius": radius,
+                "method": method.label,
+                "relative variance": trimmed_mean(mine),
+                "ratio to best single": ratio,
+                "untrimmed ratio": float(mine.mean() / best.mean()),
+                "time ratio": spent / seconds[number_of_best],
+                "equal-time ratio": ratio * spent / seconds[number_of_best],
+                "blocks worse": share_worse(mine, best),
+            }
+        )
+    draw_variance_maps(
+        picture_of(opened, camera_paths, options),
+        [method.label for method in methods],
+        images,
+        maps,
+        [row["ratio to best single"] for row in rows],
+    )
+    return rows
+
+
+def summarise(rows: list[Row], camera_paths: int) -> None:
+    """Geometric means over the scenes."""
+    table = []
+    for method in dict.fromkeys(row["method"] for row in rows):
+        mine = [row for row in rows if row["method"] == method]
+        table.append(
+            {
+                "method": method,
+                **{
+                    name: float(np.exp(np.mean([np.log(row[name]) for row in mine])))
+                    for name in ("ratio to best single", "equal-time ratio")
+                },
+                "worst scene": max(row["ratio to best single"] for row in mine),
+            }
+        )
+    show(f"Geometric means over the scenes, N_B = {camera_paths}", table)

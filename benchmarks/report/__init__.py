@@ -1,0 +1,1 @@
+"""What draws tables, charts and pages of what it is given; it measures nothing."""
