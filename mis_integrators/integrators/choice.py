@@ -3,7 +3,7 @@ predicted from a pilot.
 
 Every candidate is tried on the same few thousand pixels. Its error after n iterations is its
 squared bias (the blur of the photons' disks) plus its variance over n, both relative and pixel by
-pixel (`transport.radius`); n follows from what an iteration costs (`costs`). Candidates that cannot
+pixel (`pilot.radius`); n follows from what an iteration costs (`costs`). Candidates that cannot
 see some of the light are not tried.
 """
 

@@ -19,8 +19,8 @@ PRICES = json.loads(Path(__file__).with_name("costs.json").read_text())
 def events(session, segments, last_vertex, gathered):
     """Events of an iteration of one camera path a pixel, in the order of `EVENTS`.
 
-    `segments`: `transport.census.mean_segments`; `last_vertex`: the last smooth vertex that shades
-    (`None`: all); `gathered`: photons within a vertex's merge disks.
+    `segments`: `paths.path_length_statistics.mean_segments`; `last_vertex`: the last smooth vertex
+    that shades (`None`: all); `gathered`: photons within a vertex's merge disks.
     """
     camera = float(sum(segments if last_vertex is None else segments[: last_vertex + 1]))
     paths = getattr(session, "light_path_count", 0)

@@ -1,8 +1,8 @@
 """Where resampled connections and their weights meet.
 
-Hooks of `transport.subpaths` and `transport.camera_vertices`, and what resampling makes of each
-technique of a joint path. All techniques of a path evaluate one function: a technique that joins a
-light sub-path Y to the camera vertex z is taken to draw it with
+The state (`mis.state.ConnectionState`) of `paths.subpaths` and `paths.camera_vertices`, and what
+resampling makes of each technique of a joint path. All techniques of a path evaluate one function:
+a technique that joins a light sub-path Y to the camera vertex z is taken to draw it with
 
     q/p = (a + c) r + b  if a cache point of z sees what z sees, else  c r + b,
     r = f_y rho G softened,    G softened = G d^2 / (d^2 + h^2)

@@ -16,7 +16,7 @@ from ..weights import bidirectional as theory
 
 
 class ConnectionWeights:
-    """Hooks of `transport.subpaths`, and the weights of joined sub-paths.
+    """The state of sub-paths (`mis.state.ConnectionState`), and the weights of joined sub-paths.
 
     `beta`: Veach's exponent; `ratio`: light sub-paths over camera paths, of the whole crop window;
     `eta` [m^2]: pi R^2 N of merging, or 0.
@@ -87,7 +87,7 @@ class ConnectionWeights:
 
     def merged(self, camera, state, back_at_light, back_at_camera):
         """Weight of merging a camera vertex with a light vertex of that `state` (arguments as of
-        `weigh` of `transport.merging.merge`)."""
+        `weigh` of `photons.merge.merge`)."""
         a_light = theory.nearer(*state, back_at_light, self.beta)
         a_camera = theory.nearer(camera["d_vcm"], camera["d_vc"], back_at_camera, self.beta)
         return theory.merge_weight(a_light, a_camera, self.eta, self.beta)
