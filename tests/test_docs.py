@@ -209,3 +209,17 @@ def test_index_names_every_page():
     assert [
         page.name for page in PAGES if page.name != "README.md" and f"({page.name})" not in index
     ] == []
+
+
+def test_the_path_through_the_code_is_true():
+    """Each file of the page is there and defines the function or class that is named beside it."""
+    page = (ROOT / "docs" / "a_path_through_the_code.md").read_text()
+    named = re.findall(r"\| `([\w/]+\.py)` \| `(\w+)` \|", page)
+    named += re.findall(r"`([\w/]+\.py)`, `(\w+)`", page)
+    assert len(named) >= 20
+    for file, name in named:
+        source = (ROOT / "mis_integrators" / file).read_text()
+        assert re.search(rf"^\s*(def|class) {name}\b", source, re.MULTILINE), (file, name)
+    for file in re.findall(r"`([\w/]+\.py)`", page):
+        folder = ROOT if file.startswith("tests/") else ROOT / "mis_integrators"
+        assert (folder / file).exists(), file
