@@ -13,10 +13,11 @@ from ..core.recording import recorder
 from ..core.traits import SceneTraits, lookup
 from ..core.untrusted import Fields
 from ..lights.lights import Lights
-from ..paths.camera_pass import film_sample_count, trace_camera_paths
+from ..paths.camera import film_sample_count
 from ..photons.coverage import covered_share
 from ..photons.gather import gather_photons
 from ..photons.grid import PhotonMap, build_photon_map, smallest_cell
+from ..photons.queries import trace_camera_paths
 from ..photons.trace import trace_light_paths
 from ..pilot.run import choose_radii
 from .common import MOST_LIGHT_PATHS, IterativeIntegrator, IterativeSession

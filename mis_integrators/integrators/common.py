@@ -16,7 +16,7 @@ from ..core.recording import settle
 from ..core.render_lock import RENDER_LOCK, under_render_lock
 from ..core.traits import UnsupportedScene, check_film, check_scene, check_variant, unfinite_data
 from ..core.untrusted import Fields
-from ..paths.camera_pass import film_sample_count, with_gaps
+from ..paths.camera import film_sample_count, with_gaps
 from .parameters import Parameters
 
 MOST_PATHS = 2**32 - 1

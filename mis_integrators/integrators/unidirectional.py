@@ -8,7 +8,7 @@ import mitsuba as mi
 
 from ..core.film import splat_samples
 from ..core.untrusted import Fields
-from ..paths.camera_pass import film_sample_count, start_camera_paths
+from ..paths.camera import film_sample_count, start_camera_paths
 from .common import IterativeSession
 
 BUSY = 1 << 19

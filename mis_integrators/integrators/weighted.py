@@ -5,8 +5,8 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from ..paths.camera_pass import STATE, trace_camera_paths
 from ..photons.gather import gather_photons, vertex_section
+from ..photons.queries import STATE, trace_camera_paths
 from ..photons.trace import trace_light_paths
 from .bdpm import BDPM, BDPMSession
 

@@ -35,8 +35,8 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.packing import bits_float, float_bits
-from ..paths.camera_pass import STATE
 from ..paths.light_starts import seen_from
+from ..photons.queries import STATE
 from ..weights.heuristics import add_ratio, bounded_power, weight
 
 SMALLEST_DENSITY = 1e-20

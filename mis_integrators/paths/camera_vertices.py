@@ -11,11 +11,9 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.packing import Store
-from ..core.random import next_2d
 from ..core.records import Layout
 from ..core.spectra import channel_mean
-from .camera_pass import behind_emitters, start_camera_paths, with_gaps, within_crop
-from .roulette import russian_roulette
+from .camera import trace_camera, with_gaps, within_crop
 from .sensor import Lens
 from .subpaths import NO_PARENT, keep_vertex, new_vertices, vertex_layout
 from .vertex import VertexBSDF, scattered_mean
@@ -96,7 +94,102 @@ def step_to_hit(lights, soften, left, density, origin, ds, light, squared, mask)
     )
 
 
-@dr.syntax
+class StepVisitor:
+    """Keeps the smooth vertices of camera sub-paths with the steps that led to them, and the lights
+    that they meet (a `CameraVisitor`).
+
+    Its state: how many vertices a sub-path has kept, the place of the last one that scattered
+    smoothly, the density of its direction (per solid angle; zero after a delta function), the last
+    vertex of whichever kind, and what `leave` returns.
+    """
+
+    def __init__(
+        self, scene, sensor, lights, traits, soften, ratio, hide_emitters, capacity, hit_capacity
+    ):
+        self.scene, self.film, self.lights, self.traits = scene, sensor.film(), lights, traits
+        self.soften, self.ratio, self.lens = soften, ratio, Lens(sensor)
+        self.hide_emitters = hide_emitters
+        self.store = Store(
+            vertices=new_vertices(traits, capacity, STEP),
+            room=dr.opaque(mi.UInt32, capacity),
+            count=dr.zeros(mi.UInt32, 1),
+            hits=hit_layout().room(hit_capacity),
+            hit_room=dr.opaque(mi.UInt32, hit_capacity),
+            hit_count=dr.zeros(mi.UInt32, 1),
+        )
+
+    def begin(self, n_paths, splat, aperture):
+        self.inside, self.aperture = within_crop(self.film, splat), aperture
+        origin = dr.zeros(mi.Interaction3f)
+        return [mi.UInt32(0), mi.UInt32(NO_PARENT), mi.Float(0), origin, not_left(n_paths)]
+
+    def emission(self, state, at, active):
+        _, parent, density, origin, left = state
+        store, si = self.store, at.si
+        ds = mi.DirectionSample3f(self.scene, si, origin)
+        shown = active & (ds.emitter != None)  # noqa: E711 (array comparison)
+        if self.hide_emitters:
+            shown &= at.visible  # what is behind nothing but null surfaces is hidden, too
+        light = ds.emitter.eval(si, shown)
+        value = at.throughput * light
+        met = shown & (at.depth > 1) & (dr.max(value) > 0)
+        slot = dr.scatter_inc(store.hit_count, mi.UInt32(0), met)
+        met &= slot < store.hit_room
+        squared = dr.maximum(dr.squared_norm(si.p - origin.p), 1e-20)
+        squared = dr.select(si.is_valid(), squared, dr.inf)
+        values = step_to_hit(
+            self.lights, self.soften, left, density, origin, ds, light, squared, met
+        )
+        values |= {"value": value, "path": at.path, "depth": at.depth, "parent": parent}
+        hit_layout().write(store.hits, values, slot, met)
+        return dr.select(shown & (at.depth == 1), value, 0)
+
+    def unfinished(self, state):
+        return mi.Bool(True)
+
+    def arrive(self, state, at, rng, active):
+        number, parent, density, origin, left = state
+        si = at.si
+        smooth = active & mi.has_flag(at.bsdf.flags(), mi.BSDFFlags.Smooth)
+        squared = dr.maximum(dr.squared_norm(si.p - origin.p), 1e-20)
+        cosine = dr.abs(dr.dot(si.n, at.towards))
+        step = step_to_vertex(self.soften, left, density, cosine, squared)
+        if self.lens.connects:
+            first = active & (at.depth == 1)
+            seen = first & self.inside
+            of_rays = cosine * self.lens.density(si.p, si.time, self.aperture, seen)
+            of_rays = dr.select(of_rays > 0, self.ratio * dr.rcp(dr.maximum(of_rays, 1e-20)), 0)
+            step[0] = dr.select(first, of_rays, step[0])
+        at.vertex_bsdf = VertexBSDF.at(self.traits, si, at.bsdf, smooth)
+        wanted = smooth & (dr.max(at.throughput) > 0)
+        at.slot = keep_vertex(
+            self.store,
+            at.vertex_bsdf,
+            si,
+            at.hit,
+            at.towards,
+            at.throughput,
+            at.path,
+            at.depth,
+            number,
+            parent,
+            step,
+            STEP,
+            wanted,
+        )
+        number = dr.select(wanted, number + 1, number)
+        return [number, parent, density, origin, left], mi.Spectrum(0)
+
+    def leave(self, state, at, rng, bs, weight, delta, active):
+        number, parent, _, _, left = state
+        si, wo, smoothly = at.si, at.si.to_world(bs.wo), active & ~delta
+        value, p_forward, p_back = at.vertex_bsdf.f_and_pdfs(at.towards, wo, smoothly)
+        parent = dr.select(smoothly, at.slot, parent)
+        left = leave(self.soften, left, si, value, p_forward, p_back, wo, smoothly)
+        density = dr.select(delta, 0, p_forward * dr.abs(dr.dot(si.n, wo)))
+        return [number, parent, density, mi.Interaction3f(si), left], weight, active
+
+
 def trace_camera_vertices(
     scene,
     sensor,
@@ -130,127 +223,26 @@ def trace_camera_vertices(
     `soften.softened(geometry, squared)` may change the geometric term of a step that starts there,
     with its squared distance (infinite for environments).
     """
-    first = with_gaps(first, skip, n_paths, camera_paths)
-    path, active, rng, ray, sensor_weight, splat, aperture = start_camera_paths(
-        sensor, seed, first, 1, n_paths, camera_paths, wavelength_sample
+    visitor = StepVisitor(
+        scene, sensor, lights, traits, soften, ratio, hide_emitters, capacity, hit_capacity
     )
-    lens = Lens(sensor)
-    inside = within_crop(sensor.film(), splat)
-    throughput = mi.Spectrum(sensor_weight)
-    radiance = mi.Spectrum(0)
-    depth = mi.UInt32(0)
-    number = mi.UInt32(0)
-    parent = mi.UInt32(NO_PARENT)  # the last vertex that scattered smoothly
-    eta = mi.Float(1)
-    density = mi.Float(
-        0
-    )  # with which the direction was sampled, per solid angle; zero after a delta function
-    left = not_left(n_paths)  # of the parent
-    origin = dr.zeros(mi.Interaction3f)  # the last vertex, of whichever kind
-    context = mi.BSDFContext()
-    store = Store(
-        vertices=new_vertices(traits, capacity, STEP),
-        room=dr.opaque(mi.UInt32, capacity),
-        count=dr.zeros(mi.UInt32, 1),
-        hits=hit_layout().room(hit_capacity),
-        hit_room=dr.opaque(mi.UInt32, hit_capacity),
-        hit_count=dr.zeros(mi.UInt32, 1),
+    radiance, alpha, splat = trace_camera(
+        scene,
+        sensor,
+        integrator,
+        traits,
+        visitor,
+        seed,
+        with_gaps(first, skip, n_paths, camera_paths),
+        1,
+        n_paths,
+        camera_paths,
+        wavelength_sample,
+        max_depth,
+        rr_depth,
+        hide_emitters,
     )
-    visible = mi.Bool((scene.environment() is not None) and not hide_emitters)
-    if dr.hint(max_depth == 0, mode="scalar"):
-        active &= False
-
-    hit = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
-    if dr.hint(hide_emitters, mode="scalar"):
-        hit, ray = behind_emitters(scene, integrator, hit, ray, active)
-
-    while dr.hint(active, label="camera vertices"):
-        si = hit.compute_surface_interaction(ray, mi.RayFlags.All, active=active)
-        depth += 1
-        towards = -ray.d
-        squared = dr.maximum(dr.squared_norm(si.p - origin.p), 1e-20)
-
-        # ---- Emission met by the path
-        if dr.hint(traits.has_light_surfaces, mode="scalar"):
-            ds = mi.DirectionSample3f(scene, si, origin)
-            shown = active & (ds.emitter != None)  # noqa: E711 (array comparison)
-            if dr.hint(hide_emitters, mode="scalar"):
-                shown &= visible  # what is behind nothing but null surfaces is hidden, too
-            light = ds.emitter.eval(si, shown)
-            radiance[shown & (depth == 1)] += throughput * light
-            met = shown & (depth > 1) & (dr.max(light * throughput) > 0)
-            slot = dr.scatter_inc(store.hit_count, mi.UInt32(0), met)
-            met &= slot < store.hit_room
-            values = step_to_hit(
-                lights,
-                soften,
-                left,
-                density,
-                origin,
-                ds,
-                light,
-                dr.select(si.is_valid(), squared, dr.inf),
-                met,
-            )
-            values |= {"value": throughput * light, "path": path, "depth": depth, "parent": parent}
-            hit_layout().write(store.hits, values, slot, met)
-
-        active &= si.is_valid()
-        met = mi.Bool(active)  # a surface, perhaps the last one
-        bsdf = si.bsdf(ray)
-        if dr.hint(max_depth > 0, mode="scalar"):
-            active &= depth < max_depth
-        smooth = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-
-        # ---- Keep the vertex
-        cosine = dr.abs(dr.dot(si.n, towards))
-        begin = active & (depth == 1)
-        step = step_to_vertex(soften, left, density, cosine, squared)
-        if dr.hint(lens.connects, mode="scalar"):
-            of_rays = cosine * lens.density(si.p, si.time, aperture, begin & inside)
-            step[0] = dr.select(
-                begin,
-                dr.select(of_rays > 0, ratio * dr.rcp(dr.maximum(of_rays, 1e-20)), 0),
-                step[0],
-            )
-        vertex_bsdf = VertexBSDF.at(traits, si, bsdf, smooth)
-        wanted = smooth & (dr.max(throughput) > 0)
-        slot = keep_vertex(
-            store,
-            vertex_bsdf,
-            si,
-            hit,
-            towards,
-            throughput,
-            path,
-            depth,
-            number,
-            parent,
-            step,
-            STEP,
-            wanted,
-        )
-        number = dr.select(wanted, number + 1, number)
-
-        # ---- Go on
-        bs, weight = bsdf.sample(context, si, rng.next_float32(met), next_2d(rng, met), met)
-        delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-        visible |= met & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
-        wo = si.to_world(bs.wo)
-        value, p_forward, p_back = vertex_bsdf.f_and_pdfs(towards, wo, active & ~delta)
-        parent = dr.select(active & ~delta, slot, parent)
-        left = leave(soften, left, si, value, p_forward, p_back, wo, active & ~delta)
-        density = dr.select(delta, 0, p_forward * dr.abs(dr.dot(si.n, wo)))
-        origin = mi.Interaction3f(si)
-        throughput *= weight
-        eta *= bs.eta
-        ray = si.spawn_ray(wo)
-        throughput, active = russian_roulette(
-            rng, throughput, dr.max(throughput), eta, depth >= rr_depth, active
-        )
-        hit = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
-
-    alpha = dr.select(visible, mi.Float(1), mi.Float(0))
+    store = visitor.store
     return radiance, alpha, splat, store.vertices, store.count, store.hits, store.hit_count
 
 

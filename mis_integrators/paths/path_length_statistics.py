@@ -9,7 +9,7 @@ import numpy as np
 
 from ..core.packing import Store
 from ..core.random import next_2d
-from .camera_pass import start_camera_paths
+from .camera import start_camera_paths
 from .roulette import russian_roulette
 
 SMOOTH_VERTICES = 4

@@ -10,7 +10,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from .camera_pass import behind_emitters
+from .camera import behind_emitters
 
 CONNECTED = ("PerspectiveCamera", "ThinLensCamera", "OrthographicCamera")
 

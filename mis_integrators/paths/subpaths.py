@@ -14,11 +14,9 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.packing import Store
-from ..core.random import next_2d
 from ..core.records import Layout
-from .camera_pass import behind_emitters, start_camera_paths, with_gaps, within_crop
+from .camera import trace_camera, with_gaps, within_crop
 from .light import trace_light
-from .roulette import russian_roulette
 from .sensor import Lens
 from .vertex import VertexBSDF, scattered_mean
 
@@ -244,7 +242,140 @@ def trace_light_subpaths(
     return store.vertices, store.count, store.lengths
 
 
-@dr.syntax
+class CameraVertexVisitor:
+    """Keeps the smooth vertices of camera sub-paths, and weights the light that they meet and that
+    next-event estimation finds (a `CameraVisitor`).
+
+    Its state: how many vertices a sub-path has kept, the place of the last one, the density of its
+    direction (per solid angle; zero after a delta function), the last vertex of whichever kind,
+    and the state of `weights`.
+    """
+
+    def __init__(
+        self,
+        scene,
+        sensor,
+        lights,
+        traits,
+        weights,
+        max_depth,
+        hide_emitters,
+        capacity,
+        ledger,
+        shortest,
+    ):
+        self.scene, self.film, self.lights, self.traits = scene, sensor.film(), lights, traits
+        self.weights, self.ledger, self.lens = weights, ledger, Lens(sensor)
+        self.hide_emitters = hide_emitters
+        self.deepest = max_depth - shortest if max_depth > 0 else None
+        self.store = Store(
+            vertices=new_vertices(traits, capacity, weights.states),
+            room=dr.opaque(mi.UInt32, capacity),
+            count=dr.zeros(mi.UInt32, 1),
+        )
+
+    def begin(self, n_paths, splat, aperture):
+        self.inside, self.aperture = within_crop(self.film, splat), aperture
+        origin, sums = dr.zeros(mi.Interaction3f), self.weights.blank(n_paths)
+        return [mi.UInt32(0), mi.UInt32(NO_PARENT), mi.Float(0), origin, sums]
+
+    def emission(self, state, at, active):
+        _, _, density, origin, sums = state
+        lights = self.lights
+        ds = mi.DirectionSample3f(self.scene, at.si, origin)
+        shown = active & (ds.emitter != None)  # noqa: E711 (array comparison)
+        if self.hide_emitters:
+            shown &= at.visible  # what is behind nothing but null surfaces is hidden, too
+        later = shown & (at.depth > 1)
+        share = self.weights.hit_emitter(
+            sums,
+            lights.pdf_direct(origin, ds, later),
+            lights.emission_over_nee_pdf(origin, ds, later),
+            density,
+        )
+        share = dr.select(later, share, 1)
+        light = at.throughput * ds.emitter.eval(at.si, shown)
+        if self.ledger is not None:
+            self.ledger.hit_emitter(at.path, at.depth, light, share, shown)
+        return dr.select(shown, light * share, 0)
+
+    def unfinished(self, state):
+        return mi.Bool(True)
+
+    def arrive(self, state, at, rng, active):
+        number, parent, density, origin, sums = state
+        si, weights = at.si, self.weights
+        smooth = active & mi.has_flag(at.bsdf.flags(), mi.BSDFFlags.Smooth)
+        cosine = dr.abs(dr.dot(si.n, at.towards))
+        first = active & (at.depth == 1)
+        of_rays = mi.Float(0)
+        if self.lens.connects:
+            seen = first & self.inside
+            of_rays = cosine * self.lens.density(si.p, si.time, self.aperture, seen)
+        squared = dr.maximum(dr.squared_norm(si.p - origin.p), 1e-20)
+        arrival = density * cosine * dr.rcp(squared)
+        sums = _either(
+            first,
+            weights.init_camera(of_rays, first),
+            weights.propagate(sums, arrival, si, squared, at.depth),
+        )
+        at.vertex_bsdf = VertexBSDF.at(self.traits, si, at.bsdf, smooth)
+        direct = mi.Spectrum(0)
+        if not self.lights.dark:
+            direct = self._direct(sums, at, rng, smooth)
+        wanted = smooth & (dr.max(at.throughput) > 0)
+        if self.deepest is not None:
+            wanted &= mi.Int32(at.depth) <= self.deepest
+        slot = keep_vertex(
+            self.store,
+            at.vertex_bsdf,
+            si,
+            at.hit,
+            at.towards,
+            at.throughput,
+            at.path,
+            at.depth,
+            number,
+            parent,
+            sums,
+            weights.states,
+            wanted,
+        )
+        number = dr.select(wanted, number + 1, number)
+        return [number, dr.select(wanted, slot, parent), density, origin, sums], direct
+
+    def _direct(self, sums, at, rng, smooth):
+        """Radiance of direct light at smooth vertices, by next-event estimation."""
+        si, lights = at.si, self.lights
+        ds, light, light_pdf = lights.sample_direct(si, rng, smooth)
+        reached = smooth & (dr.max(light) > 0)
+        # elsewhere the direction may not even be a number
+        direction = dr.select(reached, ds.d, mi.Vector3f(0, 0, 1))
+        response, p_camera, p_light = at.vertex_bsdf.f_and_pdfs(at.towards, direction, reached)
+        facing = dr.abs(dr.dot(si.n, direction))
+        share = self.weights.next_event(
+            sums,
+            light_pdf,
+            facing * lights.emission_over_nee_pdf(si, ds, reached),
+            p_camera * facing,
+            p_light,
+            ds.delta,
+        )
+        light = at.throughput * response * light
+        if self.ledger is not None:
+            self.ledger.next_event(at.path, at.depth + 1, light, share, reached)
+        return dr.select(reached, light * share, 0)
+
+    def leave(self, state, at, rng, bs, weight, delta, active):
+        number, parent, _, _, sums = state
+        si, wo = at.si, at.si.to_world(bs.wo)
+        value, p_forward, p_back = at.vertex_bsdf.f_and_pdfs(at.towards, wo, active & ~delta)
+        mean = scattered_mean(value, si.n, wo)
+        sums = _either(active, self.weights.scatter(sums, p_forward, p_back, delta, mean), sums)
+        density = dr.select(delta, 0, p_forward * dr.abs(dr.dot(si.n, wo)))
+        return [number, parent, density, mi.Interaction3f(si), sums], weight, active
+
+
 def trace_camera_subpaths(
     scene,
     sensor,
@@ -275,152 +406,23 @@ def trace_camera_subpaths(
     depth, value, share, mask)` and `direct(...)`, with the length of the joint path in segments,
     and the weight apart.
     """
-    first = with_gaps(first, skip, n_paths, camera_paths)
-    path, active, rng, ray, sensor_weight, splat, aperture = start_camera_paths(
-        sensor, seed, first, 1, n_paths, camera_paths, wavelength_sample
+    visitor = CameraVertexVisitor(
+        scene, sensor, lights, traits, weights, max_depth, hide_emitters, capacity, ledger, shortest
     )
-    lens = Lens(sensor)
-    inside = within_crop(sensor.film(), splat)
-    throughput = mi.Spectrum(sensor_weight)
-    radiance = mi.Spectrum(0)
-    depth = mi.UInt32(0)
-    number = mi.UInt32(0)
-    parent = mi.UInt32(NO_PARENT)
-    eta = mi.Float(1)
-    state = weights.blank(n_paths)
-    density = mi.Float(
-        0
-    )  # with which the direction was sampled, per solid angle; zero after a delta function
-    origin = dr.zeros(mi.Interaction3f)  # the last vertex, of whichever kind
-    context = mi.BSDFContext()
-    store = Store(
-        vertices=new_vertices(traits, capacity, weights.states),
-        room=dr.opaque(mi.UInt32, capacity),
-        count=dr.zeros(mi.UInt32, 1),
+    radiance, alpha, splat = trace_camera(
+        scene,
+        sensor,
+        integrator,
+        traits,
+        visitor,
+        seed,
+        with_gaps(first, skip, n_paths, camera_paths),
+        1,
+        n_paths,
+        camera_paths,
+        wavelength_sample,
+        max_depth,
+        rr_depth,
+        hide_emitters,
     )
-    visible = mi.Bool((scene.environment() is not None) and not hide_emitters)
-    if dr.hint(max_depth == 0, mode="scalar"):
-        active &= False
-
-    hit = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
-    if dr.hint(hide_emitters, mode="scalar"):
-        hit, ray = behind_emitters(scene, integrator, hit, ray, active)
-
-    while dr.hint(active, label="camera sub-paths"):
-        si = hit.compute_surface_interaction(ray, mi.RayFlags.All, active=active)
-        depth += 1
-        towards = -ray.d
-
-        # ---- Emission met by the path
-        if dr.hint(traits.has_light_surfaces, mode="scalar"):
-            ds = mi.DirectionSample3f(scene, si, origin)
-            shown = active & (ds.emitter != None)  # noqa: E711 (array comparison)
-            if dr.hint(hide_emitters, mode="scalar"):
-                shown &= visible  # what is behind nothing but null surfaces is hidden, too
-            later = shown & (depth > 1)
-            share = weights.hit_emitter(
-                state,
-                lights.pdf_direct(origin, ds, later),
-                lights.emission_over_nee_pdf(origin, ds, later),
-                density,
-            )
-            share = dr.select(later, share, 1)
-            light = throughput * ds.emitter.eval(si, shown)
-            radiance[shown] += light * share
-            if dr.hint(ledger is not None, mode="scalar"):
-                ledger.hit_emitter(path, depth, light, share, shown)
-
-        active &= si.is_valid()
-        met = mi.Bool(active)  # a surface, perhaps the last one
-        bsdf = si.bsdf(ray)
-        if dr.hint(max_depth > 0, mode="scalar"):
-            active &= depth < max_depth
-        smooth = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-
-        # ---- Arrive
-        cosine = dr.abs(dr.dot(si.n, towards))
-        begin = active & (depth == 1)
-        of_rays = mi.Float(0)
-        if dr.hint(lens.connects, mode="scalar"):
-            of_rays = cosine * lens.density(si.p, si.time, aperture, begin & inside)
-        squared = dr.maximum(dr.squared_norm(si.p - origin.p), 1e-20)
-        arrival = density * cosine * dr.rcp(squared)
-        state = _either(
-            begin,
-            weights.init_camera(of_rays, begin),
-            weights.propagate(state, arrival, si, squared, depth),
-        )
-        vertex_bsdf = VertexBSDF.at(traits, si, bsdf, smooth)
-
-        # ---- Direct light
-        if dr.hint(not lights.dark, mode="scalar"):
-            ds, light, light_pdf = lights.sample_direct(si, rng, smooth)
-            reached = smooth & (dr.max(light) > 0)
-            direction = dr.select(
-                reached, ds.d, mi.Vector3f(0, 0, 1)
-            )  # elsewhere it may not even be a number
-            response, p_camera, p_light = vertex_bsdf.f_and_pdfs(towards, direction, reached)
-            facing = dr.abs(dr.dot(si.n, direction))
-            share = weights.next_event(
-                state,
-                light_pdf,
-                facing * lights.emission_over_nee_pdf(si, ds, reached),
-                p_camera * facing,
-                p_light,
-                ds.delta,
-            )
-            light = throughput * response * light
-            radiance[reached] += light * share
-            if dr.hint(ledger is not None, mode="scalar"):
-                ledger.next_event(path, depth + 1, light, share, reached)
-
-        # ---- Keep the vertex
-        wanted = smooth & (dr.max(throughput) > 0)
-        if dr.hint(max_depth > 0, mode="scalar"):
-            wanted &= depth + shortest <= max_depth
-        slot = keep_vertex(
-            store,
-            vertex_bsdf,
-            si,
-            hit,
-            towards,
-            throughput,
-            path,
-            depth,
-            number,
-            parent,
-            state,
-            weights.states,
-            wanted,
-        )
-        number = dr.select(wanted, number + 1, number)
-        parent = dr.select(wanted, slot, parent)
-
-        # ---- Go on
-        bs, weight = bsdf.sample(context, si, rng.next_float32(met), next_2d(rng, met), met)
-        delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-        visible |= met & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
-        wo = si.to_world(bs.wo)
-        value, p_forward, p_back = vertex_bsdf.f_and_pdfs(towards, wo, active & ~delta)
-        state = _either(
-            active,
-            weights.scatter(state, p_forward, p_back, delta, scattered_mean(value, si.n, wo)),
-            state,
-        )
-        density = dr.select(delta, 0, p_forward * dr.abs(dr.dot(si.n, wo)))
-        origin = mi.Interaction3f(si)
-        throughput *= weight
-        eta *= bs.eta
-        ray = si.spawn_ray(wo)
-        throughput, active = russian_roulette(
-            rng, throughput, dr.max(throughput), eta, depth >= rr_depth, active
-        )
-        hit = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
-
-    return (
-        radiance,
-        dr.select(visible, mi.Float(1), mi.Float(0)),
-        splat,
-        store.vertices,
-        store.count,
-    )
+    return radiance, alpha, splat, visitor.store.vertices, visitor.store.count

@@ -8,7 +8,7 @@ import mitsuba as mi
 from ..core.packing import unpack_depth, unpack_direction, unpack_normal
 from ..core.spectra import channel_mean
 from ..core.traits import lookup
-from ..paths.camera_pass import LAST_VERTEX
+from ..photons.queries import LAST_VERTEX
 from .grid import for_each_photon, read_power
 
 SAME_SURFACE_COSINE = 0.7

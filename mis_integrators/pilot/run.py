@@ -15,7 +15,7 @@ import numpy as np
 
 from ..core.recording import lanes
 from ..core.spectra import channel_mean
-from ..paths.camera_pass import film_sample_count, film_size
+from ..paths.camera import film_sample_count, film_size
 from ..photons.gather import mean_photon_count
 from .radius import (
     LARGEST_SHARE,

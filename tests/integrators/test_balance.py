@@ -11,9 +11,9 @@ from mis_integrators.core.traits import SceneTraits
 from mis_integrators.lights.environment_guide import EnvironmentGuide
 from mis_integrators.lights.lights import Lights
 from mis_integrators.mis.heuristic import HeuristicWeights
-from mis_integrators.paths.camera_pass import LAST_VERTEX, STATE
 from mis_integrators.photons.gather import gather_photons
 from mis_integrators.photons.grid import build_photon_map
+from mis_integrators.photons.queries import LAST_VERTEX, STATE
 from mis_integrators.weights.heuristics import heuristic_weights
 
 import drjit as dr

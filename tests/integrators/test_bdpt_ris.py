@@ -715,7 +715,7 @@ def test_parts_share_their_proposals(rgb, monkeypatch):
 def test_parts_hold_every_path_once(rgb, monkeypatch):
     """Parts of a film, each of which sees all of it."""
     from mis_integrators.integrators import resampled
-    from mis_integrators.paths.camera_pass import with_gaps
+    from mis_integrators.paths.camera import with_gaps
 
     monkeypatch.setattr(resampled, "CHUNK", 470)
     session = plugin("pcbpt").session(box_scene(23), 0, 1, 0)

@@ -4,7 +4,7 @@ render that was asked for; no traceback."""
 from mis_integrators import _plugins
 from mis_integrators.app import cli
 from mis_integrators.core.traits import UnsupportedScene
-from mis_integrators.paths.camera_pass import film_sample_count
+from mis_integrators.paths.camera import film_sample_count
 
 import mitsuba as mi
 import pytest

@@ -1,0 +1,228 @@
+"""The tracer of camera sub-paths: one loop, for gathering, for joining, and for vertices alone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import drjit as dr
+import mitsuba as mi
+
+from ..core.random import next_2d, streams
+from .camera_rays import sample_camera_ray
+from .roulette import russian_roulette
+
+Array = Any
+
+
+def film_samples(sensor, index, camera_paths: int, rng):
+    """Film positions of camera paths `index` (in pixels, crop offset included), in the order pixel
+    by pixel, row by row.
+
+    Returns `(position in [0, 1]^2 of the crop window, position for splatting)`; with a film that
+    samples its border the grid covers the border too, as in Mitsuba's own integrators.
+    """
+    film = sensor.film()
+    width, _ = film_size(sensor)
+    pixel = index // camera_paths
+    corner = (
+        mi.Vector2i(mi.Int32(pixel % width), mi.Int32(pixel // width))
+        - border_size(film)
+        + mi.Vector2i(film.crop_offset())
+    )
+    position = mi.Vector2f(corner) + mi.Vector2f(next_2d(rng))
+    scale = dr.rcp(mi.ScalarVector2f(film.crop_size()))
+    unit = (position - mi.ScalarVector2f(film.crop_offset())) * scale
+    splat = mi.Vector2f(corner) if film.rfilter().is_box_filter() else position
+    return mi.Point2f(unit), mi.Point2f(splat)
+
+
+def film_size(sensor):
+    """Width and height, in pixels, of what camera paths are sent through: the crop window, with its
+    border where the film samples it."""
+    film = sensor.film()
+    return tuple(int(size) + 2 * border_size(film) for size in film.crop_size())
+
+
+def border_size(film):
+    """Pixels beyond each edge of the crop window that camera paths are sent through, too."""
+    return film.rfilter().border_size() if film.sample_border() else 0
+
+
+def film_sample_count(sensor):
+    """Pixels that camera paths are sent through."""
+    width, height = film_size(sensor)
+    return width * height
+
+
+def within_crop(film, splat):
+    """Whether positions for splatting lie in the crop window, and not in a border that the film
+    samples besides."""
+    if not film.sample_border():
+        return mi.Bool(True)
+    offset, size = mi.ScalarVector2f(film.crop_offset()), mi.ScalarVector2f(film.crop_size())
+    return dr.all((splat >= offset) & (splat < offset + size))
+
+
+def start_camera_paths(
+    sensor, seed, first, stride: int, n_paths: int, camera_paths: int, wavelength_sample
+):
+    """Camera rays of `n_paths` paths, numbers `first`, `first + stride`, ... of `film_samples`.
+
+    Returns `(path, active, rng, ray, weight, splat, aperture)`: the index of each, whether there is
+    a path of that number, its random numbers, the ray and its weight, the position for splatting,
+    and the sample that chose the point of the lens.
+    """
+    path = dr.arange(mi.UInt32, n_paths)
+    number = path * stride + first
+    active = number < film_sample_count(sensor) * camera_paths
+    rng = streams(number, seed)
+    unit, splat = film_samples(sensor, number, camera_paths, rng)
+    aperture = next_2d(rng) if sensor.needs_aperture_sample() else mi.Point2f(0.5)
+    time = mi.Float(sensor.shutter_open())
+    if sensor.shutter_open_time() > 0:
+        time += rng.next_float32() * sensor.shutter_open_time()
+    ray, weight = sample_camera_ray(sensor, time, wavelength_sample, unit, aperture, active)
+    return path, active, rng, mi.Ray3f(ray), weight, splat, aperture
+
+
+def with_gaps(first, skip, n_paths: int, camera_paths: int):
+    """What `start_camera_paths`, with a `stride` of one, takes as `first` to leave out `skip`
+    numbers after each pixel's `camera_paths`."""
+    return first + dr.arange(mi.UInt32, n_paths) // camera_paths * skip
+
+
+def behind_emitters(scene, integrator, hit, ray, active):
+    """Camera rays that meet an emitter's shape, and their hits, moved on to what is behind it
+    (`hide_emitters`)."""
+    on_light = active & hit.is_valid() & (hit.shape.emitter() != None)  # noqa: E711 (array comparison)
+    behind = hit.compute_surface_interaction(ray, mi.RayFlags.Minimal, on_light).spawn_ray(ray.d)
+    hit[on_light] = integrator.skip_area_emitters(scene, behind, True, on_light)
+    ray.o[on_light] = behind.o
+    return hit, ray
+
+
+@dataclass
+class CameraArrival:
+    """Camera sub-paths that have met something, one a lane.
+
+    `si`, `hit`, `ray`: the interaction (perhaps invalid), what it is computed from, and the ray
+    that led there; `towards`: unit vector to where the sub-path came from; `throughput` that
+    arrives; `path`: its number; `depth`: segments so far; `visible`: it has met more than null
+    surfaces; `bsdf`: of the surface.
+    """
+
+    si: mi.SurfaceInteraction3f
+    hit: mi.PreliminaryIntersection3f
+    ray: mi.Ray3f
+    towards: mi.Vector3f
+    throughput: mi.Spectrum
+    path: mi.UInt32
+    depth: mi.UInt32
+    visible: mi.Bool
+    bsdf: mi.BSDFPtr
+
+
+class CameraVisitor(Protocol):
+    """What is done where camera sub-paths meet surfaces and lights. Its state, a list of arrays,
+    travels with them. Radiance is a spectrum, zero on all other lanes, throughput included."""
+
+    def begin(self, n_paths: int, splat: Array, aperture: Array) -> list[Any]:
+        """The state before the first surface. `splat`: positions on the film; `aperture`: samples
+        that chose the points of the lens."""
+
+    def emission(self, state: list[Any], at: CameraArrival, active: Array) -> Array:
+        """Radiance of a light that is met. Not called in scenes without lights that can be met."""
+
+    def unfinished(self, state: list[Any]) -> Array:
+        """Which sub-paths may scatter at what they have met."""
+
+    def arrive(
+        self, state: list[Any], at: CameraArrival, rng: Any, active: Array
+    ) -> tuple[list[Any], Array]:
+        """The state at a surface, and radiance of direct light there."""
+
+    def leave(
+        self,
+        state: list[Any],
+        at: CameraArrival,
+        rng: Any,
+        bs: Any,
+        weight: Array,
+        delta: Array,
+        active: Array,
+    ) -> tuple[list[Any], Array, Array]:
+        """After scattering, by a delta function or not: the state, the throughput's factor (at
+        first `weight`), and which sub-paths go on."""
+
+
+@dr.syntax
+def trace_camera(
+    scene,
+    sensor,
+    integrator,
+    traits,
+    visitor,
+    seed,
+    first,
+    stride: int,
+    n_paths: int,
+    camera_paths: int,
+    wavelength_sample,
+    max_depth: int,
+    rr_depth: int,
+    hide_emitters: bool,
+):
+    """Traces `n_paths` camera paths, numbers `first`, `first + stride`, ... of `film_samples`, and
+    shows what they meet to the `visitor`, a `CameraVisitor`.
+
+    Returns `(radiance, alpha, splat position)` of each path.
+    """
+    path, active, rng, ray, sensor_weight, splat, aperture = start_camera_paths(
+        sensor, seed, first, stride, n_paths, camera_paths, wavelength_sample
+    )
+    throughput = mi.Spectrum(sensor_weight)
+    radiance = mi.Spectrum(0)
+    depth = mi.UInt32(0)
+    eta = mi.Float(1)
+    context = mi.BSDFContext()
+    state = visitor.begin(n_paths, splat, aperture)
+    visible = mi.Bool((scene.environment() is not None) and not hide_emitters)
+    if dr.hint(max_depth == 0, mode="scalar"):
+        active &= False
+
+    hit = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
+    if dr.hint(hide_emitters, mode="scalar"):
+        hit, ray = behind_emitters(scene, integrator, hit, ray, active)
+
+    while dr.hint(active, label="camera sub-paths"):
+        si = hit.compute_surface_interaction(ray, mi.RayFlags.All, active=active)
+        depth += 1
+        at = CameraArrival(si, hit, ray, -ray.d, throughput, path, depth, visible, si.bsdf(ray))
+
+        # ---- Emission met by the path
+        if dr.hint(traits.has_light_surfaces, mode="scalar"):
+            radiance += visitor.emission(state, at, active)
+
+        # ---- Arrive
+        active &= si.is_valid() & visitor.unfinished(state)
+        met = mi.Bool(active)  # a surface, perhaps the last one
+        if dr.hint(max_depth > 0, mode="scalar"):
+            active &= depth < max_depth
+        state, direct = visitor.arrive(state, at, rng, active)
+        radiance += direct
+
+        # ---- Go on
+        bs, weight = at.bsdf.sample(context, si, rng.next_float32(met), next_2d(rng, met), met)
+        delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+        visible |= met & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
+        state, weight, active = visitor.leave(state, at, rng, bs, weight, delta, active)
+        throughput *= weight
+        eta *= bs.eta
+        ray = si.spawn_ray(si.to_world(bs.wo))
+        throughput, active = russian_roulette(
+            rng, throughput, dr.max(throughput), eta, depth >= rr_depth, active
+        )
+        hit = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
+
+    return radiance, dr.select(visible, mi.Float(1), mi.Float(0)), splat

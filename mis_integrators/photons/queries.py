@@ -1,0 +1,250 @@
+"""Camera sub-paths that gather photons: direct light on the way, and the vertices at which photons
+are to be gathered."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from ..core.packing import Store
+from ..lights.lights import mis_power
+from ..paths.camera import trace_camera
+
+
+def new_vertex_buffer(capacity, weighted=False):
+    """Room for `capacity` camera vertices that wait for photons: what rebuilds the surface
+    interaction there, the path's throughput up to it, its path's number, and its depth in segments
+    with the top bit set where all photons are wanted (else only caustic ones); if `weighted`, the
+    state of the weights there. Unused places have throughput zero."""
+    extra = (
+        {name: dr.empty(mi.Spectrum, capacity) for name in (*STATE, "share")} if weighted else {}
+    )
+    return extra | {
+        "ray_o": dr.empty(mi.Point3f, capacity),
+        "ray_d": dr.empty(mi.Vector3f, capacity),
+        "hit": dr.empty(mi.PreliminaryIntersection3f, capacity),
+        "throughput": dr.zeros(mi.Spectrum, capacity),
+        "path": dr.empty(mi.UInt32, capacity),
+        "depth": dr.empty(mi.UInt32, capacity),
+    }
+
+
+LAST_VERTEX = 1 << 31
+STATE = ("weights.0", "weights.1", "weights.2")
+"""What a vertex buffer calls the state of the weights."""
+
+
+class QueryVisitor:
+    """Direct light, and vertices that wait for photons (a `CameraVisitor`).
+
+    Its state: smooth vertices left behind; whether the last vertex scattered by a delta function;
+    the density of the last smooth scattering; the last smooth vertex; the weight of direct light
+    there; and the state of `weights`.
+    """
+
+    def __init__(
+        self,
+        scene,
+        lights,
+        traits,
+        bdd,
+        hide_emitters,
+        capacity,
+        has_caustics,
+        has_indirect,
+        one_vertex,
+        weights,
+    ):
+        self.scene, self.lights, self.traits, self.weights = scene, lights, traits, weights
+        self.bdd, self.hide_emitters, self.capacity = bdd, hide_emitters, capacity
+        self.has_caustics, self.has_indirect = has_caustics, has_indirect
+        self.one_vertex = one_vertex
+        self.sections = 1 if weights is None else bdd + 1
+        self.by_light = weights is not None and weights.weighs_points_of_lights
+        self.store = Store(
+            vertices=new_vertex_buffer(capacity * self.sections, weights is not None),
+            count=dr.zeros(mi.UInt32, self.sections),
+        )
+
+    def begin(self, n_paths, splat, aperture):
+        sums = [] if self.weights is None else self.weights.init(n_paths)
+        origin = dr.zeros(mi.Interaction3f)
+        return [mi.UInt32(0), mi.Bool(False), mi.Float(1), origin, mi.Spectrum(1), sums]
+
+    def emission(self, state, at, active):
+        vertex, behind_delta, scatter_pdf, origin, share_here, sums = state
+        ds = mi.DirectionSample3f(self.scene, at.si, origin)
+        shown = active & ((vertex == 0) | ~behind_delta)
+        if self.hide_emitters:
+            shown &= (at.depth > 1) | at.si.is_valid()
+        later = shown & (vertex > 0)
+        light_pdf = self.lights.pdf_direct(origin, ds, later)
+        if self.by_light:
+            share_here = self.weights.next_event_weight(sums, origin, ds, later)
+        share = dr.select(
+            vertex == 0, mi.Spectrum(1), mis_power(scatter_pdf, light_pdf) * share_here
+        )
+        return dr.select(shown, at.throughput * share * ds.emitter.eval(at.si, shown), 0)
+
+    def unfinished(self, state):
+        return state[0] <= self.bdd
+
+    def arrive(self, state, at, rng, active):
+        vertex, behind_delta, scatter_pdf, origin, share_here, sums = state
+        weights, bsdf = self.weights, at.bsdf
+        smooth = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+        at.ends = vertex >= self.bdd  # the path's last smooth vertex
+        if weights is not None:
+            sums, share = weights.propagate(sums, at.si, bsdf, vertex, smooth)
+            share_here = dr.select(smooth, share, share_here)
+            at.ends |= weights.ends(bsdf, vertex, smooth)
+        state = [vertex, behind_delta, scatter_pdf, origin, share_here, sums]
+        direct = mi.Spectrum(0)
+        if not self.lights.dark:
+            direct = self._direct(state, at, rng, smooth)
+        self._ask_for_photons(state, at, rng, smooth)
+        return state, direct
+
+    def _direct(self, state, at, rng, smooth):
+        """Radiance of direct light at smooth vertices, by next-event estimation."""
+        vertex, _, _, _, share_here, sums = state
+        si, weights = at.si, self.weights
+        ds, light, light_pdf = self.lights.sample_direct(si, rng, smooth)
+        wo = si.to_local(ds.d)
+        response, response_pdf = at.bsdf.eval_pdf(mi.BSDFContext(), si, wo, smooth)
+        if self.by_light:
+            reached = smooth & (dr.max(light) > 0)  # elsewhere `ds` may not even be a number
+            left = weights.scatter(sums, si, at.bsdf, mi.BSDFSample3f(wo), vertex, reached)
+            share_here = weights.next_event_weight(left, si, ds, reached)
+        share = dr.select(ds.delta, 1, mis_power(light_pdf, response_pdf)) * share_here
+        return dr.select(smooth, at.throughput * share * response * light, 0)
+
+    def _ask_for_photons(self, state, at, rng, smooth):
+        """Stores the vertices at which photons are to be gathered."""
+        vertex, _, _, _, share_here, sums = state
+        weights, store = self.weights, self.store
+        last = (vertex == self.bdd) | (weights is not None)
+        wants = smooth & (dr.max(at.throughput) > 0)
+        kept = mi.Float(1)
+        if self.sections > 1:
+            kept = weights.merge_probability(sums, share_here, vertex, at.ends)
+            wants &= rng.next_float32(wants) < kept
+        if not self.has_caustics:
+            wants &= last & self.has_indirect
+        slot = mi.UInt32(at.path)
+        if not self.one_vertex:
+            section = mi.UInt32(0)
+            if weights is not None:
+                section = dr.select(at.ends, mi.UInt32(self.bdd), vertex)
+            slot = dr.scatter_inc(store.count, section, wants)
+            wants &= slot < self.capacity
+            slot += section * self.capacity
+        if not self.capacity:
+            return
+        values = {
+            "ray_o": at.ray.o,
+            "ray_d": at.ray.d,
+            "hit": at.hit,
+            "throughput": at.throughput * dr.rcp(dr.select(wants, kept, 1)),
+            "path": at.path,
+            "depth": at.depth | dr.select(last, mi.UInt32(LAST_VERTEX), mi.UInt32(0)),
+        }
+        if weights is not None:
+            values |= {**dict(zip(STATE, weights.stored(sums))), "share": share_here}
+        for name, value in values.items():
+            dr.scatter(store.vertices[name], value, slot, wants)
+
+    def leave(self, state, at, rng, bs, weight, delta, active):
+        vertex, _, scatter_pdf, origin, share_here, sums = state
+        if not self.traits.has_light_surfaces:
+            active &= delta | ~at.ends
+        if self.weights is not None:
+            smoothly = active & ~delta
+            sums = self.weights.scatter(sums, at.si, at.bsdf, bs, vertex, smoothly)
+            if self.sections > 1:
+                probability = self.weights.continue_probability(sums, vertex)
+                probability = dr.select(smoothly, probability, 1)
+                active &= rng.next_float32(active) < probability
+                weight *= dr.rcp(dr.select(active, probability, 1))
+        scattered = active & ~delta
+        beyond = dr.select(at.ends, mi.UInt32(self.bdd), vertex) + 1
+        state = [
+            dr.select(scattered, beyond, vertex),
+            mi.Bool(delta),
+            dr.select(scattered, bs.pdf, scatter_pdf),
+            dr.select(scattered, mi.Interaction3f(at.si), origin),
+            share_here,
+            sums,
+        ]
+        return state, weight, active
+
+
+def trace_camera_paths(
+    scene,
+    sensor,
+    integrator,
+    lights,
+    traits,
+    seed,
+    first,
+    stride: int,
+    n_paths: int,
+    camera_paths: int,
+    wavelength_sample,
+    bdd: int,
+    max_depth: int,
+    rr_depth: int,
+    hide_emitters: bool,
+    capacity: int,
+    has_caustics: bool,
+    has_indirect: bool,
+    one_vertex: bool,
+    weights=None,
+):
+    """Traces `n_paths` camera paths, numbers `first`, `first + stride`, ... of `film_samples`, to
+    their `bdd`-th smooth vertex.
+
+    On the way: emission seen directly or through delta surfaces; at every smooth vertex up to the
+    `bdd`-th, direct light by next-event estimation combined with BSDF sampling (power heuristic).
+    Light that reaches a smooth vertex through delta surfaces belongs to caustic photons and is left
+    out. Delta vertices do not count; a BSDF with both parts is a smooth vertex whose delta part
+    goes on.
+
+    Returns `(radiance, alpha, splat position, vertices, count)`: the vertices at which photons are
+    to be gathered, as made by `new_vertex_buffer`, and how many wanted a place in it (width one).
+    With `one_vertex` each path owns the place of its number.
+
+    With `weights` (a `mis.state.MergeState`) all photons are wanted at every smooth vertex, and
+    direct light at each is weighted. The vertex buffer is then one section for each smooth vertex
+    of the path, of `capacity` each (a path's last vertex in the last section), and `count` has one
+    entry for each.
+    """
+    visitor = QueryVisitor(
+        scene,
+        lights,
+        traits,
+        bdd,
+        hide_emitters,
+        capacity,
+        has_caustics,
+        has_indirect,
+        one_vertex,
+        weights,
+    )
+    radiance, alpha, splat = trace_camera(
+        scene,
+        sensor,
+        integrator,
+        traits,
+        visitor,
+        seed,
+        first,
+        stride,
+        n_paths,
+        camera_paths,
+        wavelength_sample,
+        max_depth,
+        rr_depth,
+        hide_emitters,
+    )
+    return radiance, alpha, splat, visitor.store.vertices, visitor.store.count
