@@ -124,15 +124,13 @@ def _of_body(body: memoryview) -> Checkpoint:
             raise Malformed(f"its sums {shown(name)} have values that are not finite")
     if end != len(body):
         raise Malformed(f"{len(body) - end} bytes follow its sums")
-    seconds = fields.number("seconds", positive=False)
-    done = _iterations(fields, seconds + fields.number("compiling", positive=False))
+    seconds = fields.number("seconds")
+    done = _iterations(fields, seconds + fields.number("compiling"))
     identity, learned = fields.any("identity"), fields.any("learned")
     for name, value in (("identity", identity), ("learned", learned)):
         if not isinstance(value, dict):
             raise fields.refuse(name, "an object")
-    checkpoint = Checkpoint(
-        identity, learned, done, seconds, fields.number("compiling", positive=False), arrays
-    )
+    checkpoint = Checkpoint(identity, learned, done, seconds, fields.number("compiling"), arrays)
     fields.finish()
     return checkpoint
 
@@ -143,7 +141,7 @@ def _shapes(fields: Fields) -> dict[str, tuple[int, ...]]:
         is_text(name)
         and isinstance(shape, list)
         and len(shape) <= 3
-        and all(type(n) is int and 0 <= n < 2**32 for n in shape)
+        and all(type(n) is int and 0 < n < 2**32 for n in shape)
         for name, shape in given.items()
     ):
         raise fields.refuse("arrays", "the shapes of sums")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import json
 import math
 import os
 import sys
@@ -20,7 +21,7 @@ from ..core.untrusted import Malformed
 from . import checkpoint, cluster, loading, output, reproduce
 from .checkpoint import Checkpoint, CheckpointError
 from .options import parse, versions
-from .progress import Progress
+from .progress import Progress, complain
 from .render_loop import Chore, Clock, Interrupt, fewest_iterations, iterate
 from .request import Request
 from .target_error import TargetError
@@ -58,11 +59,11 @@ def main(arguments: list[str] | None = None) -> int:
     except BaseException as error:
         # Libraries turn an interrupt that reaches them into errors of any kind.
         if interrupt.stopped or isinstance(error, KeyboardInterrupt):
-            print("mis-render: interrupted, nothing written", file=sys.stderr)
+            complain("interrupted, nothing written")
             return EXIT_INTERRUPTED
         if not isinstance(error, Failure):
             raise
-        print(f"mis-render: {error}", file=sys.stderr)
+        complain(str(error))
         return error.code
 
 
@@ -93,12 +94,12 @@ def _render_alone(options: argparse.Namespace, interrupt: Interrupt) -> int:
             )
             opened = _request(options).open(needs_views)
             for description in unfinite_data(opened.loaded.scene):
-                _warn(
+                complain(
                     f"{description} (NaN or infinite): what they light or colour is left out of "
                     "the image"
                 )
             session: Any = opened.session
-            if learned:
+            if learned != {}:
                 _recall_image(session, learned, options)
             identity = opened.identity() if options.checkpoint else {}
             keep_variance = bool(options.checkpoint or options.target_error)
@@ -113,7 +114,9 @@ def _render_alone(options: argparse.Namespace, interrupt: Interrupt) -> int:
             kept, broken = _render(
                 session, opened.sensor, options, identity, clock, target, interrupt
             )
-        except (*loading.SCENE_ERRORS, cluster.ClusterError) as error:
+        except (Failure, MemoryError):
+            raise
+        except Exception as error:
             raise _failure(error) from error
 
         metadata = _metadata(options, opened.loaded, session, clock)
@@ -122,7 +125,7 @@ def _render_alone(options: argparse.Namespace, interrupt: Interrupt) -> int:
         )
         if pixels := session.unfinite_pixels():
             metadata["unfinitePixels"] = pixels
-            _warn(
+            complain(
                 f"{pixels} pixels had values that are not finite (NaN or infinite) in some "
                 "iterations; those values are left out"
             )
@@ -130,14 +133,15 @@ def _render_alone(options: argparse.Namespace, interrupt: Interrupt) -> int:
             target.update(session)
             metadata["relativeError"] = target.error
             if target.black:
-                _warn(
+                complain(
                     "the image is black, so that its relative error says nothing: is there "
                     "light, and does the camera look at it?"
                 )
         # Before the workers are left, which may take long.
         written = _write(options, session, metadata, options.output, kept)
-        for suffix in (".preview.exr", ".preview.png"):
-            options.output.with_suffix(suffix).unlink(missing_ok=True)
+        for suffix in (".preview.exr", ".preview.png") if options.preview else ():
+            with contextlib.suppress(OSError):
+                options.output.with_suffix(suffix).unlink()
     report = (
         f"{metadata['spp']} samples per pixel in {clock.rendering:.1f} s (and "
         f"{clock.compiling:.1f} s of "
@@ -149,10 +153,10 @@ def _render_alone(options: argparse.Namespace, interrupt: Interrupt) -> int:
             failure.code, f"{failure}; what was rendered before is written, {report}"
         ) from broken
     if interrupt.requested:
-        print(f"mis-render: interrupted after {report}", file=sys.stderr)
+        complain(f"interrupted after {report}")
         return EXIT_INTERRUPTED
     if not options.quiet:
-        print(report, file=sys.stderr)
+        complain(report, "")
     return EXIT_OK
 
 
@@ -172,18 +176,13 @@ def _failure(error: BaseException) -> Failure:
     )
 
 
-def _warn(text: str) -> None:
-    """Say what the user must know, however quiet all else is to be."""
-    print(f"mis-render: {text}", file=sys.stderr)
-
-
 def _follow(options: argparse.Namespace) -> dict[str, Any]:
     """Set the options to those of the image of ``--like``; returns what its session had learned."""
     recipe = reproduce.read(options.like)
     for name, value in recipe.options.items():
         setattr(options, name, value)
     if recipe.remark and not options.quiet:
-        print(f"mis-render: {options.like} {recipe.remark}", file=sys.stderr)
+        complain(f"{options.like} {recipe.remark}")
     return recipe.learned
 
 
@@ -285,6 +284,8 @@ def _render(
             )
         except Exception as error:
             if session.iterations < fewest_iterations(session):
+                if options.checkpoint and session.iterations:
+                    keep.now()
                 raise
             broken = error
         if not options.checkpoint:
@@ -319,17 +320,21 @@ def _resume(options: argparse.Namespace, identity: dict[str, Any], session: Sess
             raise CheckpointError(f"{path} is of another render: {what}")
         session.recall(dict(found.learned))
         shapes = {name: array.shape for name, array in found.arrays.items()}
-        if len(found.done) and shapes != session.sum_shapes():
-            raise CheckpointError(
-                f"{path} is no checkpoint of this render: its sums have other names or shapes"
-            )
+        learned = json.loads(json.dumps(session.learned))
+        if shapes != (session.sum_shapes() if len(found.done) else {}) or (
+            len(found.done) and learned != found.learned
+        ):
+            raise CheckpointError(f"{path} is no checkpoint of this render: its sums do not fit")
         session.sums.merge(found.arrays, found.done)
     except Malformed as error:
         raise Failure(
             EXIT_CHECKPOINT, f"cannot resume: {path} is no checkpoint of this render: {error}"
         ) from error
-    except (CheckpointError, OSError, MemoryError) as error:
-        raise Failure(EXIT_CHECKPOINT, f"cannot resume: {error or OUT_OF_MEMORY}") from error
+    except CheckpointError as error:
+        raise Failure(EXIT_CHECKPOINT, f"cannot resume: {error}") from error
+    except (OSError, MemoryError) as error:
+        reason = getattr(error, "strerror", None) or OUT_OF_MEMORY
+        raise Failure(EXIT_CHECKPOINT, f"cannot resume: {path}: {reason}") from error
     for written in (path, options.output, options.output.with_suffix(".png")):
         output.remove_leftovers(written)
     return Clock(found.seconds, found.compiling)

@@ -59,6 +59,8 @@ OVERDUE_SECONDS, OVERDUE_FACTOR = 30.0, 5.0
 """A batch is overdue after so many seconds (in which a worker may still open the scene and compile;
 longer, if the first batch of all came back so late), and so many times what it and those before it
 usually take."""
+FIRST_BATCH_SECONDS = 1800.0
+"""The same while no batch has come back: opening the scene, compiling, and one iteration."""
 HAND_OUTS = 3
 """How often a batch may become overdue, or its sums may not be fetched; then the render gives
 up."""
@@ -517,9 +519,9 @@ class DistributedSession:
         return True
 
     def _seconds_allowed(self) -> float:
-        """Seconds after which a batch is overdue: never, before the first has come back."""
+        """Seconds after which a batch is overdue."""
         if not self._usual:
-            return math.inf
+            return FIRST_BATCH_SECONDS
         before = max(BATCHES_PER_WORKER, math.ceil(len(self._waiting) / len(self._watch.present)))
         longest = max(len(batch.numbers) for batch in self._waiting)
         return max(

@@ -47,7 +47,8 @@ def of_package() -> str:
     make two images."""
     root = Path(__file__).parents[1]
     digest = hashlib.sha256()
-    for file in sorted(file for pattern in ("*.py", "*.json") for file in root.rglob(pattern)):
+    files = (file for pattern in ("*.py", "*.json") for file in root.rglob(pattern))
+    for file in sorted(file for file in files if file.is_file()):
         digest.update(f"{file.relative_to(root).as_posix()}\n{_digest(file)}\n".encode())
     return digest.hexdigest()[:12]
 

@@ -16,6 +16,8 @@ LARGEST_SEED = 2**32 - 1
 MOST_SAMPLES = 2**31 - 1
 """Samples per pixel at most."""
 MOST_SENSORS = 2**16
+SMALLEST_NUMBER, LARGEST_NUMBER = 1e-9, 1e9
+"""Of seconds, and of relative errors."""
 MOST_WORKERS = 2**10
 """Processes on this machine at most."""
 
@@ -235,6 +237,8 @@ def _positive_number(text: str) -> float:
         value = float(text)
     except ValueError:
         raise argparse.ArgumentTypeError(f"{shown(text)} is not a number") from None
-    if not 0 < value < float("inf"):
-        raise argparse.ArgumentTypeError(f"{shown(text)} is not a finite number, more than 0")
+    if not SMALLEST_NUMBER <= value <= LARGEST_NUMBER:
+        raise argparse.ArgumentTypeError(
+            f"{shown(text)} is not a finite number from {SMALLEST_NUMBER:g} to {LARGEST_NUMBER:g}"
+        )
     return value

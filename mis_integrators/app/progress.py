@@ -1,8 +1,9 @@
 """Show the progress of a render: a bar on a terminal, now and then a line elsewhere."""
 
+import contextlib
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import rich.console
 import rich.progress
@@ -32,22 +33,23 @@ class Progress:
         )
 
     def __enter__(self) -> "Progress":
-        self._bar.start()
+        with _nobody_may_listen():
+            self._bar.start()
         self._task = self._bar.add_task("first iteration, compiling", total=1.0)
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._bar.stop()
+        with _nobody_may_listen():
+            self._bar.stop()
 
     def say(self, text: str) -> None:
         """Print one line."""
-        self._console.print(text, soft_wrap=True, markup=False)
+        with _nobody_may_listen():
+            self._console.print(text, soft_wrap=True, markup=False)
 
     def warn(self, text: str) -> None:
         """Print one line, even if all else is to be quiet."""
-        rich.console.Console(file=sys.stderr, highlight=False).print(
-            f"mis-render: {text}", soft_wrap=True, markup=False
-        )
+        complain(text)
 
     def update(self, iterations: int, rendering: float, share: float | None = None) -> None:
         """Show that so many iterations are done, after so many seconds of rendering; ``share`` of
@@ -65,11 +67,26 @@ class Progress:
         speed = iterations * self._paths() / max(rendering, 1e-9) / 1e6
         of = "" if self._seconds or not self._planned else f"/{self._planned}"
         text = f"iteration {iterations}{of}, {speed:.2f} M samples/s, {left}"
-        self._bar.update(self._task, completed=min(done, 1.0), description=text)
+        with _nobody_may_listen():
+            self._bar.update(self._task, completed=min(done, 1.0), description=text)
         now = time.monotonic()
         if self._bar.disable and not self._quiet and now - self._last_line >= SECONDS_BETWEEN_LINES:
             self._last_line = now
             self.say(text)
+
+
+def complain(text: str, who: str = "mis-render: ") -> None:
+    """Print one line on standard error, if anybody reads it."""
+    with _nobody_may_listen():
+        print(f"{who}{text}", file=sys.stderr, flush=True)
+
+
+@contextlib.contextmanager
+def _nobody_may_listen() -> Iterator[None]:
+    """Standard error may be closed, or a pipe whose reader has gone (which ends the process, if
+    rich has its way): a render goes on."""
+    with contextlib.suppress(OSError, ValueError, SystemExit):
+        yield
 
 
 def _duration(seconds: float) -> str:

@@ -25,20 +25,15 @@ MITSUBA_INTEGRATORS = (
     "aov",
     "depth",
     "direct",
-    "direct_projective",
     "moment",
     "path",
-    "prb",
-    "prb_basic",
-    "prb_projective",
-    "prbvolpath",
     "ptracer",
     "stokes",
     "volpath",
     "volpathmis",
-    "volprim_rf_basic",
 )
-"""Mitsuba's own integrators: no other names, nor names of files, are taken from a header."""
+"""Mitsuba's own integrators that make images: no other names, nor names of files, are taken from
+a header."""
 _MAGIC = b"\x76\x2f\x31\x01"
 
 
@@ -93,7 +88,7 @@ def read(image: Path) -> Recipe:
     recipe = Recipe(
         {
             "plugin": options.choice("plugin", [None, *_plugins.PLUGINS, *MITSUBA_INTEGRATORS]),
-            "variables": options.assignments("variables"),
+            "variables": options.assignments("variables", of_variables=True),
             "parameters": options.assignments("parameters"),
             "variant": options.choice("variant", mi.variants()),
             "sensor": options.integer("sensor", 0, MOST_SENSORS),

@@ -53,6 +53,8 @@ class Request:
         loaded = loading.load(Path(self.scene), self.variables, self.plugin, self.parameters)
         sensor = _sensor(loaded.scene, self.sensor)
         spp = sensor.sampler().sample_count() if self.spp is None else self.spp
+        if self.spp is None and not spp:
+            raise ValueError('the sampler\'s "sample_count" is 0; ask for samples with --spp')
         if needs_views and not hasattr(loaded.integrator, "views_session"):
             raise ValueError(
                 f'{needs_views}: "{loaded.plugin}" renders one view at a time; use -i '

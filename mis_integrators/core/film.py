@@ -230,9 +230,9 @@ class Accumulator:
             )
         if self.technique_channels:
             tensor = dr.concat([tensor, self.sums["techniques"]], axis=2)
-        film.put_block(
-            mi.ImageBlock(mi.TensorXf(tensor), film.crop_offset(), film.rfilter(), border=True)
-        )
+        # Scaled, so that sums fit into single precision; the weights' sums are scaled alike.
+        tensor = mi.TensorXf(tensor * 2.0 ** -self.iterations.bit_length())
+        film.put_block(mi.ImageBlock(tensor, film.crop_offset(), film.rfilter(), border=True))
 
 
 def variance_channels():

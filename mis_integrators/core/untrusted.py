@@ -4,7 +4,6 @@ and a range; whatever else is there is refused."""
 from __future__ import annotations
 
 import json
-import math
 import sys
 from collections.abc import Iterable
 from typing import Any
@@ -88,16 +87,11 @@ class Fields:
             raise self.refuse(name, f"an integer from {low} to {high}")
         return value
 
-    def number(self, name: str, most: float = math.inf, positive: bool = True) -> float:
-        """A finite number, more than zero (or zero, too, if not ``positive``), and at most
-        ``most``."""
+    def number(self, name: str, most: float = sys.float_info.max, least: float = 0.0) -> float:
+        """A number from ``least`` to ``most``."""
         value = self._get(name)
-        if not is_number(value) or not 0 <= value <= most or (positive and not value):
-            raise self.refuse(
-                name,
-                f"a number, {'more than' if positive else 'at least'} "
-                f"0{'' if math.isinf(most) else f', at most {most:g}'}",
-            )
+        if not is_number(value) or not least <= value <= most:
+            raise self.refuse(name, f"a number from {least:g} to {most:g}")
         return float(value)
 
     def boolean(self, name: str) -> bool:
@@ -128,9 +122,10 @@ class Fields:
             raise self.refuse(name, "one of " + ", ".join(json.dumps(one) for one in allowed))
         return value
 
-    def assignments(self, name: str) -> list[tuple[str, str]]:
-        """A list of pairs of a name (letters, digits, ``_``, ``.``) and a printable text."""
-        value = self._get(name)
+    def assignments(self, name: str, of_variables: bool = False) -> list[tuple[str, str]]:
+        """A list of pairs of a name and a printable text: names of parameters are words, those of a
+        scene's variables anything that can stand before ``=``."""
+        value, is_name = self._get(name), is_printable_name if of_variables else is_word
         if not isinstance(value, list) or not all(
             isinstance(pair, list) and len(pair) == 2 and is_name(pair[0]) and is_text(pair[1])
             for pair in value
@@ -169,11 +164,11 @@ def is_text(value: object) -> bool:
     return isinstance(value, str) and len(value) <= LONGEST_TEXT and value.isprintable()
 
 
-def is_name(value: object) -> bool:
-    """Whether a JSON value can be the name of a variable or of a parameter."""
-    return (
-        isinstance(value, str)
-        and 0 < len(value) <= 100
-        and value.isascii()
-        and value.replace(".", "_").isidentifier()
-    )
+def is_word(value: object) -> bool:
+    """Whether a JSON value is a word of letters, digits, ``_`` and ``.``."""
+    return isinstance(value, str) and value.isascii() and value.replace(".", "_").isidentifier()
+
+
+def is_printable_name(value: object) -> bool:
+    """Whether a JSON value can stand before ``=``."""
+    return is_text(value) and bool(value) and "=" not in str(value)

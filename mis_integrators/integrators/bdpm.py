@@ -21,7 +21,7 @@ from ..photons.queries import trace_camera_paths
 from ..photons.trace import trace_light_paths
 from ..pilot.run import choose_radii
 from .common import MOST_LIGHT_PATHS, IterativeIntegrator, IterativeSession
-from .schedule import read_radius, shrunk
+from .schedule import LARGEST_RADIUS, SMALLEST_RADIUS, read_radius, shrunk
 
 SPARE_PHOTONS = 1 << 20
 """Unused room beyond half of a photon buffer that is worth the time to record the passes anew."""
@@ -397,11 +397,13 @@ class BDPMSession(IterativeSession):
         }
 
     def recall(self, learned):
-        if not learned:
+        if learned == {} and (self.radii is not None or not self.kinds()):
             return
         fields = Fields(learned, "learned")
         radii, corrected = fields.object("radii"), fields.object("corrected")
-        self.radii = {kind: radii.number(kind) for kind in self.kinds()}
+        self.radii = {
+            kind: radii.number(kind, LARGEST_RADIUS, SMALLEST_RADIUS) for kind in self.kinds()
+        }
         self.corrected = {kind: corrected.boolean(kind) for kind in self.kinds()}
         self.send(fields.integer("camera_paths", 1, self.most_camera_paths()))
         for each in (radii, corrected, fields):

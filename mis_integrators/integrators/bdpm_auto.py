@@ -132,15 +132,13 @@ class AutoSession(IterativeSession):
         }
 
     def recall(self, learned):
-        if not learned:
-            return
         fields = Fields(learned, "learned")
         plugin = fields.choice("plugin", [name for name, _ in CANDIDATES])
         parameters = fields.choice(
             "parameters", [given for name, given in CANDIDATES if name == plugin]
         )
         expected = fields.object("errors")
-        errors = {name: expected.number(name, positive=False) for name in expected.names()}
+        errors = {name: expected.number(name) for name in expected.names()}
         reasons, inner = fields.texts("reasons"), fields.any("session")
         fields.finish()
         session = new_session(

@@ -9,6 +9,7 @@ see some of the light are not tried.
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import dataclass, field
 
@@ -203,7 +204,8 @@ def choose(integrator, scene, sensor, seed, iterations, seconds):
     for trial in trials:
         if trial is not best:
             trial.session = None  # its photons' and kernels' memory is free to go
-    errors = {trial.name: float(trial.error(budget)) for trial in trials}
+    predicted = {trial.name: float(trial.error(budget)) for trial in trials}
+    errors = {name: error for name, error in predicted.items() if math.isfinite(error)}
     return Decision(best.plugin, best.parameters, best.session, reasons, errors, trials, usual)
 
 

@@ -167,9 +167,11 @@ class ResampledSession(IterativeSession):
         return {} if self.light_tracing is None else {"light_tracing": self.light_tracing}
 
     def recall(self, learned):
-        if learned:
+        if learned != {}:
             fields = Fields(learned, "learned")
-            self.light_tracing = fields.number("light_tracing", MOST_LIGHT_TRACING)
+            self.light_tracing = fields.number(
+                "light_tracing", MOST_LIGHT_TRACING, LEAST_LIGHT_TRACING
+            )
             fields.finish()
 
     def _wanted_light(self, iteration):

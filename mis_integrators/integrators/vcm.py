@@ -15,7 +15,7 @@ from ..photons.grid import smallest_cell
 from ..photons.merge import merge, vertex_map
 from .bdpt import BDPT, BDPTSession
 from .common import MOST_LIGHT_PATHS
-from .schedule import read_radius, shrunk
+from .schedule import LARGEST_RADIUS, SMALLEST_RADIUS, read_radius, shrunk
 
 RADIUS_SHARE = 0.004
 """The automatic radius, in units of the spread of what the camera sees."""
@@ -131,9 +131,9 @@ class VCMSession(BDPTSession):
         return {} if self.radius is None else {"radius": self.radius}
 
     def recall(self, learned):
-        if learned:
+        if learned != {} or self.radius is None:
             fields = Fields(learned, "learned")
-            self.radius = fields.number("radius")
+            self.radius = fields.number("radius", LARGEST_RADIUS, SMALLEST_RADIUS)
             fields.finish()
 
     def _choose_radius(self, spectral):

@@ -536,3 +536,62 @@ def test_films_of_few_pixels(rgb, plugin, size):
     assert {name: array.shape for name, array in session.sums.arrays().items()} == {
         name: tuple(shape) for name, shape in session.sum_shapes().items()
     }
+
+
+@pytest.mark.parametrize("plugin", ["path", "bdpt"])
+def test_nobody_reads_standard_error(scene, tmp_path, plugin):
+    """A pipe whose reader has gone costs what is said, not what is rendered."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    arguments = ["-D", "size=16", "-i", plugin, "--spp", 8, "--checkpoint", 100]
+    process = subprocess.run(
+        command(scene, *arguments, "-o", tmp_path / "a.exr"), cwd=ROOT, stderr=writer, timeout=100
+    )
+    os.close(writer)
+    assert process.returncode == 0 and read(tmp_path / "a.exr")[0]["spp"] == 8
+    assert checkpoint.read(tmp_path / "a.checkpoint").done.below > 0
+
+
+def test_first_of_two_needed_iterations_is_kept(scene, tmp_path, monkeypatch):
+    """An image that shows its variance needs two; the first one is in the checkpoint."""
+    options = ["-i", "bdpm", "-D", "size=16", "-P", "variance=true", "--checkpoint", 100]
+    with monkeypatch.context() as patched:
+        failing(patched, "bdpm", RuntimeError("gone"), 1)
+        assert render(scene, *options, "--spp", 4, "-o", tmp_path / "a.exr") == 1
+    assert len(checkpoint.read(tmp_path / "a.checkpoint").done) == 1
+    assert not (tmp_path / "a.exr").exists()
+    assert render(scene, *options, "--spp", 4, "-o", tmp_path / "a.exr", "--resume") == 0
+
+
+def test_previews_of_others_stay(scene, tmp_path):
+    (tmp_path / "a.preview.exr").write_text("mine")
+    (tmp_path / "b.preview.exr").mkdir()
+    for name in "ab":
+        image = tmp_path / f"{name}.exr"
+        assert render(scene, "-D", "size=8", "--spp", 1, "-o", image, "--quiet") == 0
+    assert (tmp_path / "a.preview.exr").read_text() == "mine"
+
+
+@pytest.mark.parametrize("plugin", ["bdpt", "bdpm", "path", "bdpm_auto"])
+def test_light_near_the_end_of_single_precision(scene, tmp_path, plugin):
+    """Sums over iterations exceed it; the image does not, and it can be resumed and made again."""
+    lamp = (tmp_path / "lamp.xml").read_text().replace("5, 4, 3", "1e38, 1e38, 1e38")
+    (tmp_path / "lamp.xml").write_text(lamp)
+    options = ["-D", "size=8", "-i", plugin, "--checkpoint", 100, "-o", tmp_path / "a.exr"]
+    assert render(scene, *options, "--spp", 32) == 0
+    assert np.isfinite(read(tmp_path / "a.exr")[1]).all()
+    assert render(scene, *options, "--spp", 48, "--resume") == 0
+    assert render(scene, "--like", tmp_path / "a.exr", "-o", tmp_path / "b.exr") == 0
+
+
+def test_scene_that_asks_for_no_samples(scene, tmp_path, capsys):
+    assert render(scene, "-D", "spp=0", "-o", tmp_path / "a.exr") == 1
+    error = capsys.readouterr().err
+    assert '"sample_count" is 0' in error and error.count("\n") == 1
+
+
+def test_names_that_scenes_give_their_variables(scene, tmp_path):
+    text = scene.read_text().replace('"size"', '"res-x"').replace("$size", "$res-x")
+    scene.write_text(text)
+    assert render(scene, "-D", "res-x=8", "--spp", 1, "-o", tmp_path / "a.exr", "--quiet") == 0
+    assert render(scene, "--like", tmp_path / "a.exr", "-o", tmp_path / "b.exr", "--quiet") == 0

@@ -50,6 +50,7 @@ OPTIONS = {
         "bdpm\n",
         "path\0",
         "independent",
+        "prb",
         "batch",
         True,
         REMOVE,
@@ -60,7 +61,7 @@ OPTIONS = {
         [["size", 8]],
         [["size", "8", "9"]],
         [["", "8"]],
-        [["a b", "8"]],
+        [["a=b", "8"]],
         [["size", "8\x1b[2J"]],
         "size=8",
         None,
@@ -332,9 +333,16 @@ LEARNED = {
         {"light_tracing": 0},
         {"light_tracing": "1"},
         {"light_tracing": 1e30},
+        {"light_tracing": 1e-30},
         {"radius": 1},
     ],
-    "vcm": [{"radius": 0}, {"radius": None}, {"radius": 1, "more": 1}],
+    "vcm": [
+        {"radius": 0},
+        {"radius": None},
+        {"radius": 1e300},
+        {"radius": 1e-300},
+        {"radius": 1, "more": 1},
+    ],
     "volpath_multiview": [{"radius": 1}],
     "path": [
         {"samples_per_iteration": 0},
@@ -359,7 +367,7 @@ def sessions(scene):
 @pytest.mark.parametrize("plugin", LEARNED)
 def test_what_no_session_can_have_learned(scene, sessions, tmp_path, capsys, plugin):
     """By the session itself, by an image, and by a checkpoint."""
-    for learned in [*LEARNED[plugin], [1], "text", 3]:
+    for learned in [*LEARNED[plugin], [1], "text", 3, None, [], 0]:
         with pytest.raises(Malformed) as error:
             sessions(plugin).recall(learned)
         assert str(error.value).isprintable()
@@ -501,6 +509,9 @@ FORGED = {
     "identity files": lambda header: header["identity"].update(files=[1]),
     "identity list": lambda header: header.update(identity=[1]),
     "another field": lambda header: header.update(scheduler="tcp://192.0.2.1:1"),
+    "nothing done": lambda header: header.update(done=[0, []]),
+    "nothing learned": lambda header: header.update(learned={}),
+    "empty": lambda header: header["arrays"].update(total=[0, 2**32 - 1, 2**32 - 1]),
     "shape": lambda header: header["arrays"].update(total=[1, 1, 1]),
     "shapes swapped": lambda header: header["arrays"].update(
         total=list(reversed(header["arrays"]["total"]))
