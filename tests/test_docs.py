@@ -65,9 +65,7 @@ def test_notebook_runs(tmp_path):
     assert "(64, 64, 3)" in result.stdout and result.stdout.count("relMSE without") == 3
     assert (tmp_path / "tutorial.png").stat().st_size > 10_000
     assert (
-        run(
-            [sys.executable, str(ROOT / "tools" / "light_state.py"), "--check"], tmp_path
-        ).returncode
+        run([sys.executable, str(ROOT / "tools" / "notebook.py"), "--check"], tmp_path).returncode
         == 0
     )
 

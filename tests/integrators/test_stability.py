@@ -348,7 +348,7 @@ def photons_a_disk(rooms, n_f):
     session = integrator("bdpm_opt3", **disks(n_f)).session(rooms().set(), seed=5)
     session.mixes()
     return (
-        session.light_paths
+        session.light_path_count
         * math.pi
         * max(session.radii.values()) ** 2
         * session.cache.mean
