@@ -635,7 +635,8 @@ def test_overdue_batches_are_handed_to_others_and_duplicates_dropped(fakes):
         "2: [2]",
         "3: [3]",
     ] and session.sums.done == Iterations()
-    pass_time(session, 10000)  # before the first result nobody knows how long it takes
+    # Before the first result nobody knows how long it takes.
+    pass_time(session, 0.9 * cluster.FIRST_BATCH_SECONDS)
     assert len(client.futures) == 4
     session._watch.now = 10.0
     for batch in session._waiting:
