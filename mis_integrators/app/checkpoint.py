@@ -11,8 +11,6 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import os
-import stat
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from ..core.sums import Iterations
-from ..core.untrusted import Fields, Malformed, is_text, parse, shown
+from ..core.untrusted import Fields, Malformed, is_text, open_regular, parse, shown
 from . import fingerprint, output
 
 MAGIC = b"mis-render checkpoint 1\n"
@@ -88,10 +86,7 @@ def write(path: Path, checkpoint: Checkpoint) -> None:
 def read(path: Path) -> Checkpoint:
     """Read a checkpoint. Raises ``CheckpointError`` if it is damaged or none, ``OSError`` if it
     cannot be read."""
-    # Opening a FIFO would wait for its writer.
-    with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb") as file:
-        if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
-            raise CheckpointError(f"{path} is no checkpoint: it is not a regular file")
+    with open_regular(path) as file:
         if file.read(len(MAGIC)) != MAGIC:
             raise CheckpointError(
                 f"{path} is damaged, or no checkpoint of this version: it does not start as one"

@@ -5,8 +5,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
-import stat
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,7 +14,7 @@ import OpenEXR
 
 from .. import _plugins
 from ..core.session import Session
-from ..core.untrusted import Fields, Malformed, parse, shown
+from ..core.untrusted import Fields, Malformed, open_regular, parse, shown
 from .options import LARGEST_SEED, MOST_SAMPLES, MOST_SENSORS, versions
 
 ATTRIBUTE = "again"
@@ -106,11 +104,8 @@ def read(image: Path) -> Recipe:
 
 def _attribute_of(image: Path, what: str) -> str:
     try:
-        # Opening a FIFO would wait for its writer.
-        descriptor = os.open(image, os.O_RDONLY | os.O_NONBLOCK)
-        with open(descriptor, "rb") as file:
-            regular = stat.S_ISREG(os.fstat(descriptor).st_mode)
-            is_exr = regular and file.read(len(_MAGIC)) == _MAGIC
+        with open_regular(image) as file:
+            is_exr = file.read(len(_MAGIC)) == _MAGIC
         header = OpenEXR.File(str(image), header_only=True).header() if is_exr else {}
     except Exception as error:  # OpenEXR raises errors of many kinds for files that are damaged
         raise Malformed(

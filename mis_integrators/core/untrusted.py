@@ -3,10 +3,14 @@ and a range; whatever else is there is refused."""
 
 from __future__ import annotations
 
+import errno
 import json
+import os
+import stat
 import sys
 from collections.abc import Iterable
-from typing import Any
+from pathlib import Path
+from typing import Any, BinaryIO
 
 LONGEST_JSON = 1 << 24
 """Characters of a JSON text that is read, at most."""
@@ -19,6 +23,16 @@ LONGEST_SHOWN = 200
 class Malformed(ValueError):
     """A value that is missing, of the wrong type or out of range; the message says in one line
     which, and what is allowed."""
+
+
+def open_regular(path: Path) -> BinaryIO:
+    """Open a file to read bytes. Raises ``OSError``, also for what is not a regular file: opening a
+    FIFO would wait for its writer."""
+    file = open(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb")
+    if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+        file.close()
+        raise OSError(errno.EINVAL, "it is not a regular file", str(path))
+    return file
 
 
 def parse(text: object, what: str) -> Any:
@@ -59,9 +73,6 @@ class Fields:
         self._given: dict[str, Any] = value
         self._what = what
         self._asked: set[str] = set()
-
-    def __contains__(self, name: str) -> bool:
-        return name in self._given
 
     def _get(self, name: str) -> Any:
         self._asked.add(name)
