@@ -41,6 +41,30 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
         epilog=_EXIT_CODES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
+    for add_options in (_what, _how_long, _which_image, _what_is_kept, _where):
+        add_options(parser)
+    parser.add_argument("--quiet", action="store_true", help="print errors only")
+    parser.add_argument("--version", action="version", version=versions())
+    options = parser.parse_args(arguments)
+    if options.scene.is_dir():
+        parser.error(f"argument SCENE.xml: {options.scene} is a directory")
+    options.output = options.output or options.scene.with_suffix(".exr")
+    if options.output.suffix != ".exr":
+        parser.error(f"argument -o: {options.output} does not end in .exr")
+    if options.all_views and options.sensor is not None:
+        parser.error("argument --sensor: not allowed with argument --all-views")
+    if options.like:
+        _check_like(parser, options)
+    options.sensor = options.sensor or 0
+    options.seed = options.seed or 0
+    options.variant = options.variant or "llvm_ad_rgb"
+    if options.resume and not options.checkpoint:
+        options.checkpoint = 60.0
+    return options
+
+
+def _what(parser: argparse.ArgumentParser) -> None:
+    """The scene, the image, the integrator."""
     add = parser.add_argument
     add("scene", type=Path, metavar="SCENE.xml")
     add(
@@ -69,6 +93,11 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
             metavar=f"{name}=value",
             help=f"set {what}",
         )
+
+
+def _how_long(parser: argparse.ArgumentParser) -> None:
+    """When rendering ends."""
+    add = parser.add_argument
     length = parser.add_mutually_exclusive_group()
     length.add_argument(
         "--spp",
@@ -91,6 +120,11 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
         "deviation over brightness, without the worst 0.1 %% of the pixels; --spp or --time are "
         "then upper bounds, and there is none without them",
     )
+
+
+def _which_image(parser: argparse.ArgumentParser) -> None:
+    """What decides about the image besides the scene."""
+    add = parser.add_argument
     add(
         "--like",
         type=Path,
@@ -120,6 +154,11 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
         metavar="V",
         help="Mitsuba's variant (default: llvm_ad_rgb)",
     )
+
+
+def _what_is_kept(parser: argparse.ArgumentParser) -> None:
+    """What is written while rendering goes on."""
+    add = parser.add_argument
     add(
         "--checkpoint",
         type=_positive_number,
@@ -140,6 +179,10 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
         help="write the image so far to FILE.preview.exr and .png every so many seconds, until "
         "the image is there",
     )
+
+
+def _where(parser: argparse.ArgumentParser) -> None:
+    """Which processes render."""
     where = parser.add_mutually_exclusive_group()
     where.add_argument(
         "--workers",
@@ -155,40 +198,27 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
         "which must find the scene under "
         "the same path",
     )
-    add("--quiet", action="store_true", help="print errors only")
-    add("--version", action="version", version=versions())
-    options = parser.parse_args(arguments)
-    if options.scene.is_dir():
-        parser.error(f"argument SCENE.xml: {options.scene} is a directory")
-    options.output = options.output or options.scene.with_suffix(".exr")
-    if options.output.suffix != ".exr":
-        parser.error(f"argument -o: {options.output} does not end in .exr")
-    if options.all_views and options.sensor is not None:
-        parser.error("argument --sensor: not allowed with argument --all-views")
-    if options.like:
-        told = {
-            "-i": options.plugin,
-            "-D": options.variables or None,
-            "-P": options.parameters or None,
-            "--spp": options.spp,
-            "--time": options.time,
-            "--target-error": options.target_error,
-            "--seed": options.seed,
-            "--sensor": options.sensor,
-            "--all-views": options.all_views or None,
-            "--variant": options.variant,
-        }
-        for flag, value in told.items():
-            if value is not None:
-                parser.error(f"argument {flag}: not allowed with argument --like")
-        if options.like.resolve() == options.output.resolve():
-            parser.error(f"argument -o: {options.output} is the image of --like")
-    options.sensor = options.sensor or 0
-    options.seed = options.seed or 0
-    options.variant = options.variant or "llvm_ad_rgb"
-    if options.resume and not options.checkpoint:
-        options.checkpoint = 60.0
-    return options
+
+
+def _check_like(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
+    """Refuses what the image of ``--like`` already says."""
+    told = {
+        "-i": options.plugin,
+        "-D": options.variables or None,
+        "-P": options.parameters or None,
+        "--spp": options.spp,
+        "--time": options.time,
+        "--target-error": options.target_error,
+        "--seed": options.seed,
+        "--sensor": options.sensor,
+        "--all-views": options.all_views or None,
+        "--variant": options.variant,
+    }
+    for flag, value in told.items():
+        if value is not None:
+            parser.error(f"argument {flag}: not allowed with argument --like")
+    if options.like.resolve() == options.output.resolve():
+        parser.error(f"argument -o: {options.output} is the image of --like")
 
 
 def versions() -> str:
