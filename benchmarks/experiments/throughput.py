@@ -200,18 +200,10 @@ def radius_for(session, photons_a_gather: float) -> tuple[float, int, int, float
     """
     spectral = session._spectral(0)
     photons = session._photons(0, spectral)
-    seed, first, stride = session._seed(0, 1), mi.UInt32(0), 1
-    *_, vertices, _ = session._trace_camera(
-        session.scene,
-        session.sensor,
-        seed,
-        first,
-        stride,
-        session.chunk,
-        session.camera_paths,
-        session.vertex_capacity,
-        spectral,
+    camera_pass = session.describe_camera_pass(
+        session.sensor, session._seed(0, 1), mi.UInt32(0), spectral
     )
+    *_, vertices, _ = session._trace_camera(camera_pass, session.vertex_capacity, spectral)
     radius = session.integrator.initial_radius
     for _ in range(3):
         opaque = dr.opaque(mi.Float, radius)

@@ -31,10 +31,12 @@ from ..mis.resampling import (
     tabulate,
     uniform_tables,
 )
+from ..paths.camera import with_gaps
 from ..paths.camera_vertices import STEP, hit_layout, sum_before, trace_camera_vertices
 from ..paths.connect import join_sensor, list_draws
 from ..paths.light_starts import sample_light_starts
 from ..paths.sensor import Lens
+from ..paths.setting import World
 from ..paths.subpaths import read_vertices, seen_normal, trace_light_subpaths, vertex_bsdf_of
 from ..paths.vertex import scattered_mean
 from ..resampling.cache_points import CacheGrid
@@ -129,6 +131,7 @@ class ResampledSession(IterativeSession):
         super().__init__(integrator, scene, sensor, seed, iterations)
         self.traits = SceneTraits(scene)
         self.lights = Lights.seen_by(scene, sensor, integrator.plugin)
+        self.world = World(scene, self.lights, self.traits)
         self.split_paths(CHUNK)
         width, height = sensor.film().crop_size()
         self.pixel_paths = width * height * integrator.camera_paths
@@ -227,40 +230,19 @@ class ResampledSession(IterativeSession):
     # ------------------------------------------------------------------ passes
 
     def _trace_light(self, scene, sensor, tables, seed, spectral):
+        light_pass = self.describe_light_pass(sensor, seed, self.light_chunk, spectral)
         return trace_light_subpaths(
-            scene,
-            self.lights,
-            self.traits,
-            self.weights(),
-            seed,
-            self.light_chunk,
-            self.capacity["light"],
-            spectral["wavelengths"],
-            sensor.shutter_open(),
-            sensor.shutter_open_time(),
-            self.integrator.max_depth,
-            self.integrator.rr_depth,
+            self.world, self.limits, light_pass, self.weights(), self.capacity["light"]
         )
 
     def _trace_camera(self, scene, sensor, tables, seed, first, skip, spectral):
-        integrator = self.integrator
+        first = with_gaps(first, skip, self.chunk, self.camera_paths)
         return trace_camera_vertices(
-            scene,
-            sensor,
-            integrator,
-            self.lights,
-            self.traits,
+            self.world,
+            self.limits,
+            self.describe_camera_pass(sensor, seed, first, spectral),
             self.weights(),
-            seed,
-            first,
-            skip,
-            self.chunk,
-            integrator.camera_paths,
-            spectral["sample"],
             self.ratio,
-            integrator.max_depth,
-            integrator.rr_depth,
-            integrator.hide_emitters,
             self.capacity["camera"],
             self.capacity["hits"],
         )

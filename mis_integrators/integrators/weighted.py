@@ -6,8 +6,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..photons.gather import gather_photons, vertex_section
-from ..photons.queries import STATE, trace_camera_paths
-from ..photons.trace import trace_light_paths
+from ..photons.queries import STATE
 from .bdpm import BDPM, BDPMSession
 
 
@@ -107,57 +106,13 @@ class WeightedSession(BDPMSession):
             dr.make_opaque(spectral["merge_settings"])
         return spectral
 
-    def _trace_light(self, scene, sensor, tables, seed, spectral):
-        if not self._weighted:
-            return super()._trace_light(scene, sensor, tables, seed, spectral)
-        light_state = (
-            self.weights(spectral["merge_settings"]).light_state() if self.has_indirect else None
-        )
-        return trace_light_paths(
-            scene,
-            self.lights,
-            self.traits,
-            seed,
-            self.light_path_count,
-            self.photon_capacity,
-            spectral["wavelengths"],
-            sensor.shutter_open(),
-            sensor.shutter_open_time(),
-            self.integrator.max_depth,
-            self.integrator.rr_depth,
-            light_state=light_state,
-        )
+    def _light_state(self, spectral):
+        if not (self._weighted and self.has_indirect):
+            return None
+        return self.weights(spectral["merge_settings"]).light_state()
 
-    def _trace_camera(
-        self, scene, sensor, seed, first, stride, paths, camera_paths, capacity, spectral
-    ):
-        if not self._weighted:
-            return super()._trace_camera(
-                scene, sensor, seed, first, stride, paths, camera_paths, capacity, spectral
-            )
-        integrator = self.integrator
-        return trace_camera_paths(
-            scene,
-            sensor,
-            integrator,
-            self.lights,
-            self.traits,
-            seed,
-            first,
-            stride,
-            paths,
-            camera_paths,
-            spectral["sample"],
-            integrator.first_vertex + integrator.strategies - 1,
-            integrator.max_depth,
-            integrator.rr_depth,
-            integrator.hide_emitters,
-            capacity,
-            self.has_caustics,
-            self.has_indirect,
-            False,
-            self.weights(spectral["merge_settings"]),
-        )
+    def _merge_state(self, spectral):
+        return self.weights(spectral["merge_settings"]) if self._weighted else None
 
     def _gather(self, photon_map, vertices, kind, radii, spectral, grey=False):
         if not self._weighted:

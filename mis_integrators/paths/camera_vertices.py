@@ -13,8 +13,9 @@ import mitsuba as mi
 from ..core.packing import Store
 from ..core.records import Layout
 from ..core.spectra import channel_mean
-from .camera import trace_camera, with_gaps, within_crop
+from .camera import trace_camera, within_crop
 from .sensor import Lens
+from .setting import CameraPass, Limits, World
 from .subpaths import NO_PARENT, keep_vertex, new_vertices, vertex_layout
 from .vertex import VertexBSDF, scattered_mean
 
@@ -103,14 +104,13 @@ class StepVisitor:
     vertex of whichever kind, and what `leave` returns.
     """
 
-    def __init__(
-        self, scene, sensor, lights, traits, soften, ratio, hide_emitters, capacity, hit_capacity
-    ):
-        self.scene, self.film, self.lights, self.traits = scene, sensor.film(), lights, traits
-        self.soften, self.ratio, self.lens = soften, ratio, Lens(sensor)
-        self.hide_emitters = hide_emitters
+    def __init__(self, world, limits, sensor, soften, ratio, capacity, hit_capacity):
+        self.scene, self.lights, self.traits = world.scene, world.lights, world.traits
+        self.film, self.lens = sensor.film(), Lens(sensor)
+        self.soften, self.ratio = soften, ratio
+        self.hide_emitters = limits.hide_emitters
         self.store = Store(
-            vertices=new_vertices(traits, capacity, STEP),
+            vertices=new_vertices(self.traits, capacity, STEP),
             room=dr.opaque(mi.UInt32, capacity),
             count=dr.zeros(mi.UInt32, 1),
             hits=hit_layout().room(hit_capacity),
@@ -163,19 +163,7 @@ class StepVisitor:
         at.vertex_bsdf = VertexBSDF.at(self.traits, si, at.bsdf, smooth)
         wanted = smooth & (dr.max(at.throughput) > 0)
         at.slot = keep_vertex(
-            self.store,
-            at.vertex_bsdf,
-            si,
-            at.hit,
-            at.towards,
-            at.throughput,
-            at.path,
-            at.depth,
-            number,
-            parent,
-            step,
-            STEP,
-            wanted,
+            self.store, at, at.throughput, number, parent, dict(zip(STEP, step)), wanted
         )
         number = dr.select(wanted, number + 1, number)
         return [number, parent, density, origin, left], mi.Spectrum(0)
@@ -191,27 +179,15 @@ class StepVisitor:
 
 
 def trace_camera_vertices(
-    scene,
-    sensor,
-    integrator,
-    lights,
-    traits,
+    world: World,
+    limits: Limits,
+    camera_pass: CameraPass,
     soften,
-    seed,
-    first,
-    skip,
-    n_paths: int,
-    camera_paths: int,
-    wavelength_sample,
     ratio,
-    max_depth: int,
-    rr_depth: int,
-    hide_emitters: bool,
     capacity: int,
     hit_capacity: int,
 ):
-    """Traces `n_paths` camera paths, numbers `first`, `first + 1`, ... of `film_samples`, but
-    without `skip` of them after each pixel's.
+    """Traces the camera paths of a pass.
 
     Returns `(radiance, alpha, splat position, vertices, count, hits, hit count)`: the light that
     the camera's rays meet at once; vertices as of `subpaths.new_vertices` with the fields of
@@ -223,25 +199,8 @@ def trace_camera_vertices(
     `soften.softened(geometry, squared)` may change the geometric term of a step that starts there,
     with its squared distance (infinite for environments).
     """
-    visitor = StepVisitor(
-        scene, sensor, lights, traits, soften, ratio, hide_emitters, capacity, hit_capacity
-    )
-    radiance, alpha, splat = trace_camera(
-        scene,
-        sensor,
-        integrator,
-        traits,
-        visitor,
-        seed,
-        with_gaps(first, skip, n_paths, camera_paths),
-        1,
-        n_paths,
-        camera_paths,
-        wavelength_sample,
-        max_depth,
-        rr_depth,
-        hide_emitters,
-    )
+    visitor = StepVisitor(world, limits, camera_pass.sensor, soften, ratio, capacity, hit_capacity)
+    radiance, alpha, splat = trace_camera(world, limits, camera_pass, visitor)
     store = visitor.store
     return radiance, alpha, splat, store.vertices, store.count, store.hits, store.hit_count
 

@@ -7,6 +7,7 @@ import mitsuba as mi
 
 from ..core.packing import Store, float_bits, pack_direction, pack_surface
 from ..paths.light import trace_light
+from ..paths.setting import LightPass, Limits, World
 
 
 def photon_words():
@@ -74,28 +75,20 @@ class PhotonVisitor:
 
 
 def trace_light_paths(
-    scene,
-    lights,
-    traits,
-    seed,
-    n_paths: int,
+    world: World,
+    limits: Limits,
+    light_pass: LightPass,
     capacity: int,
-    wavelengths,
-    shutter_open: float,
-    shutter_time: float,
-    max_depth: int,
-    rr_depth: int,
     keep_direct: bool = False,
     light_state=None,
 ):
-    """Traces `n_paths` light sub-paths and stores photons on surfaces that scatter smoothly.
+    """Traces the light sub-paths of a pass and stores photons on surfaces that scatter smoothly.
 
     Stored are photons of two or more segments that have scattered smoothly at least once
     ("indirect"), and photons that have met only delta surfaces on the way from the emitter
     ("caustic"); a photon's first smooth vertex straight from the emitter is next-event estimation's
-    business and is stored with `keep_direct` only (of kind "caustic"). `max_depth` counts the
-    segments of a whole path (0 or less: unlimited); a photon's own depth is its number of segments
-    from the emitter.
+    business and is stored with `keep_direct` only (of kind "caustic"). A photon's depth is its
+    number of segments from the emitter.
 
     Returns `(surface, power, count)`: uint32 arrays with four words a photon (position's bits;
     normal, depth and kind packed) and `photon_words()` words a photon (bits of the flux that one
@@ -108,19 +101,7 @@ def trace_light_paths(
     stores with each photon.
     """
     visitor = PhotonVisitor(capacity, keep_direct, light_state)
-    trace_light(
-        scene,
-        lights,
-        traits,
-        visitor,
-        seed,
-        n_paths,
-        wavelengths,
-        shutter_open,
-        shutter_time,
-        max_depth,
-        rr_depth,
-    )
+    trace_light(world, limits, light_pass, visitor)
     store = visitor.store
     photons = store.surface, store.power, store.count
     return photons if light_state is None else (*photons, store.mis_words)

@@ -16,6 +16,7 @@ import numpy as np
 from ..core.recording import lanes
 from ..core.spectra import channel_mean
 from ..paths.camera import film_sample_count, film_size
+from ..paths.setting import CameraPass
 from ..photons.gather import mean_photon_count
 from .radius import (
     LARGEST_SHARE,
@@ -261,13 +262,16 @@ class Pilot:
         ) % 2**32  # from a copy's path after the last pixel to the next copy's of the first one
         self._camera = session.recorded(
             lambda scene, sensor, tables, seed, spectral: session._trace_camera(
-                scene,
-                sensor,
-                seed,
-                lanes(self.paths) // self.pixels * back,
-                self.stride,
-                self.paths,
-                self.pilot_camera_paths,
+                CameraPass(
+                    sensor,
+                    session.integrator,
+                    seed,
+                    lanes(self.paths) // self.pixels * back,
+                    self.paths,
+                    self.pilot_camera_paths,
+                    spectral["sample"],
+                    self.stride,
+                ),
                 capacity,
                 spectral,
             )

@@ -15,6 +15,7 @@ from mis_integrators.lights.lights import Lights
 from mis_integrators.mis.vertex_merging import ConnectionWeights
 from mis_integrators.paths.connect import join, join_sensor
 from mis_integrators.paths.sensor import Lens
+from mis_integrators.paths.setting import CameraPass, LightPass, Limits, World
 from mis_integrators.paths.subpaths import (
     NO_PARENT,
     read_vertices,
@@ -356,27 +357,17 @@ def test_states_of_traced_subpaths(rgb, kind):
     scene, beta = room("rough", "area"), 2
     traits, lights, sensor = SceneTraits(scene), Lights(scene), scene.sensors()[0]
     weights, count, capacity = ConnectionWeights(lights, beta, 1.3), 300, 4000
+    world = World(scene, lights, traits)
     if kind == "light":
         vertices, found, _ = trace_light_subpaths(
-            scene, lights, traits, weights, mi.UInt32(3), count, capacity, [], 0.0, 0.0, 6, 50
+            world, Limits(6, 50), LightPass(mi.UInt32(3), count, []), weights, capacity
         )
     else:
         *_, vertices, found = trace_camera_subpaths(
-            scene,
-            sensor,
-            None,
-            lights,
-            traits,
+            world,
+            Limits(6, 50),
+            CameraPass(sensor, None, mi.UInt32(3), mi.UInt32(0), 64, 1, 0.5),
             weights,
-            mi.UInt32(3),
-            mi.UInt32(0),
-            mi.UInt32(0),
-            64,
-            1,
-            0.5,
-            6,
-            50,
-            False,
             capacity,
         )
     dr.eval(vertices, found)
