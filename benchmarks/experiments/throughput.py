@@ -8,6 +8,7 @@ from pathlib import Path
 from statistics import median
 
 from mis_integrators.photons.gather import mean_photon_count
+from mis_integrators.photons.queries import read_queries
 
 import drjit as dr
 import mitsuba as mi
@@ -204,6 +205,7 @@ def radius_for(session, photons_a_gather: float) -> tuple[float, int, int, float
         session.sensor, session._seed(0, 1), mi.UInt32(0), spectral
     )
     *_, vertices, _ = session._trace_camera(camera_pass, session.vertex_capacity, spectral)
+    vertices = read_queries(vertices)
     radius = session.integrator.initial_radius
     for _ in range(3):
         opaque = dr.opaque(mi.Float, radius)

@@ -1,4 +1,4 @@
-"""Records of mixed fields in one array of 32-bit words, read and written four words at a time:
+"""Records of mixed fields in one array of 32-bit words, read and written a packet at a time:
 neighbours in a record are neighbours in memory."""
 
 from __future__ import annotations
@@ -7,44 +7,87 @@ import drjit as dr
 import mitsuba as mi
 
 PACKET = 4
+"""Words of a packet; records of two words or fewer are packets of two."""
+
+
+def word_count(dtype):
+    """Words of a field: a number, a pointer, a vector, or a structure of these."""
+    if hasattr(dtype, "DRJIT_STRUCT"):
+        return sum(word_count(member) for member in dtype.DRJIT_STRUCT.values())
+    return 1 if dr.depth_v(dtype) == 1 else dr.size_v(dtype)
+
+
+def to_words(dtype, value):
+    """The 32-bit words of a value, a list of arrays."""
+    if hasattr(dtype, "DRJIT_STRUCT"):
+        return [
+            word
+            for name, member in dtype.DRJIT_STRUCT.items()
+            for word in to_words(member, getattr(value, name))
+        ]
+    value = dtype(value)
+    if dr.depth_v(dtype) > 1:
+        return [word for part in value for word in to_words(dr.value_t(dtype), part)]
+    if dr.is_mask_v(dtype):
+        return [dr.select(value, mi.UInt32(1), mi.UInt32(0))]
+    return [value if dtype is mi.UInt32 else dr.reinterpret_array(mi.UInt32, value)]
+
+
+def from_words(dtype, words):
+    """The value of a list of words (inverse of `to_words`)."""
+    if hasattr(dtype, "DRJIT_STRUCT"):
+        value, words = dtype(), list(words)
+        for name, member in dtype.DRJIT_STRUCT.items():
+            mine, words = words[: word_count(member)], words[word_count(member) :]
+            setattr(value, name, from_words(member, mine))
+        return value
+    if dr.depth_v(dtype) > 1:
+        return dtype(*(from_words(dr.value_t(dtype), [word]) for word in words))
+    if dr.is_mask_v(dtype):
+        return words[0] != 0
+    return words[0] if dtype is mi.UInt32 else dr.reinterpret_array(dtype, words[0])
 
 
 class Layout:
-    """Fields of a record: `fields` maps names to types (`mi.Float`, `mi.UInt32`, or vectors of
-    floats), in the order in which they lie."""
+    """Fields of a record: `fields` maps names to types (numbers, pointers, vectors, structures), in
+    the order in which they lie."""
 
     def __init__(self, fields):
         self.fields, self.places, word = dict(fields), {}, 0
         for name, dtype in self.fields.items():
-            size = 1 if dr.depth_v(dtype) == 1 else dr.size_v(dtype)
+            size = word_count(dtype)
             self.places[name] = (word, size)
             word += size
-        self.packets = -(-word // PACKET)
+        self.used = word
+        self.packet = 2 if word <= 2 else PACKET
+        self.packets = -(-word // self.packet)
+
+    @property
+    def words(self):
+        """Words of a record, with what fills up its last packet."""
+        return self.packet * self.packets
 
     def room(self, capacity):
         """An uninitialised array of `capacity` records."""
-        return dr.empty(mi.UInt32, PACKET * self.packets * capacity)
+        return dr.empty(mi.UInt32, self.words * capacity)
 
-    def write(self, words, values, index, active):
+    def capacity(self, words):
+        """Records that an array has room for."""
+        return dr.width(words) // self.words
+
+    def _packet_type(self):
+        return mi.Vector2u if self.packet == 2 else mi.Vector4u
+
+    def write(self, words, values, index, active=True):
         """Writes whole records, `values` by name, to the places `index`."""
-        flat = []
-        for name, dtype in self.fields.items():
-            value = dtype(values[name])
-            parts = [value] if dr.depth_v(dtype) == 1 else list(value)
-            flat += [
-                part
-                if dr.type_v(dtype) == dr.VarType.UInt32
-                else dr.reinterpret_array(mi.UInt32, mi.Float(part))
-                for part in parts
-            ]
-        flat += [mi.UInt32(0)] * (-len(flat) % PACKET)
-        for packet in range(self.packets):
-            dr.scatter(
-                words,
-                mi.Vector4u(*flat[PACKET * packet : PACKET * packet + PACKET]),
-                index * self.packets + packet,
-                active,
-            )
+        flat = [
+            word for name, dtype in self.fields.items() for word in to_words(dtype, values[name])
+        ]
+        flat += [mi.UInt32(0)] * (self.words - len(flat))
+        for number in range(self.packets):
+            packet = flat[self.packet * number : self.packet * (number + 1)]
+            place = index * self.packets + number
+            dr.scatter(words, self._packet_type()(*packet), place, active)
 
     def read(self, words, index, active=True, only=None):
         """Fields (all, or those named in `only`) of the records at places `index`, by name; zero on
@@ -56,16 +99,24 @@ class Layout:
             first, size = self.places[name]
             parts = []
             for word in range(first, first + size):
-                number = word // PACKET
+                number = word // self.packet
                 if number not in packets:
-                    packets[number] = dr.gather(
-                        mi.Vector4u, words, index * self.packets + number, active
-                    )
-                part = packets[number][word % PACKET]
-                parts.append(
-                    part
-                    if dr.type_v(dtype) == dr.VarType.UInt32
-                    else dr.reinterpret_array(mi.Float, part)
-                )
-            result[name] = parts[0] if dr.depth_v(dtype) == 1 else dtype(*parts)
+                    packets[number] = self._read_packet(words, index, number, active)
+                parts.append(packets[number][word % self.packet])
+            result[name] = from_words(dtype, parts)
+        return result
+
+    def _read_packet(self, words, index, number, active):
+        """Packet `number` of records; of one that holds a single word, only that word."""
+        if self.used - self.packet * number == 1:
+            return [dr.gather(mi.UInt32, words, index * self.words + self.packet * number, active)]
+        return dr.gather(self._packet_type(), words, index * self.packets + number, active)
+
+    def move(self, words, index, target, active):
+        """Another array of as many records, with those at places `index` copied to places
+        `target`."""
+        result = dr.empty(mi.UInt32, dr.width(words))
+        for number in range(self.packets):
+            packet = dr.gather(self._packet_type(), words, index * self.packets + number, active)
+            dr.scatter(result, packet, target * self.packets + number, active)
         return result

@@ -18,7 +18,7 @@ from ..paths.setting import World
 from ..photons.coverage import covered_share
 from ..photons.gather import gather_photons
 from ..photons.grid import PhotonMap, build_photon_map, smallest_cell
-from ..photons.queries import Queries, trace_camera_paths
+from ..photons.queries import Queries, read_queries, trace_camera_paths
 from ..photons.trace import trace_light_paths
 from ..pilot.run import choose_radii
 from .common import MOST_LIGHT_PATHS, IterativeIntegrator, IterativeSession
@@ -258,7 +258,7 @@ class BDPMSession(IterativeSession):
         return gather_photons(
             self.traits,
             photon_map,
-            vertices,
+            read_queries(vertices),
             radii,
             spectral["wavelengths"],
             self.light_path_count,
@@ -271,19 +271,18 @@ class BDPMSession(IterativeSession):
         """Share of each vertex' merge disk that holds surface; one where the surface is not
         Lambertian: in a highlight the noise of dividing by an estimate would outweigh what it
         mends."""
+        vertices = read_queries(vertices)
         probed = dr.max(vertices["throughput"]) > 0
         if self.traits.has_rough:
-            shape = dr.select(
-                probed, vertices["hit"].shape, dr.zeros(mi.ShapePtr)
-            )  # unused places hold no pointers
-            probed &= lookup(self.traits.lambertian, shape.bsdf(), mi.Bool, probed)
+            bsdf = vertices["hit"].shape.bsdf()
+            probed &= lookup(self.traits.lambertian, bsdf, mi.Bool, probed)
         return dr.select(probed, covered_share(scene, vertices, radius, seed, probed), 1)
 
     def _per_path(self, values, vertices, paths):
         """Sums values of the vertices for each of `paths` camera paths."""
         if self.one_vertex:
             return values
-        total = dr.zeros(type(values), paths)
+        vertices, total = read_queries(vertices), dr.zeros(type(values), paths)
         dr.scatter_reduce(
             dr.ReduceOp.Add,
             total,

@@ -5,8 +5,8 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from ..photons.gather import gather_photons, vertex_section
-from ..photons.queries import STATE
+from ..photons.gather import gather_photons
+from ..photons.queries import STATE, query_layout, read_queries
 from .bdpm import BDPM, BDPMSession
 
 
@@ -119,9 +119,10 @@ class WeightedSession(BDPMSession):
             return super()._gather(photon_map, vertices, kind, radii, spectral, grey)
         weights = self.weights(spectral["merge_settings"])
         if kind == "caustic":
-            return self._merge(kind, None, photon_map, vertices, weights, radii, spectral, grey)
+            everywhere = read_queries(vertices)
+            return self._merge(kind, None, photon_map, everywhere, weights, radii, spectral, grey)
         integrator = self.integrator
-        width = dr.width(vertices["path"])
+        width = query_layout().capacity(vertices["words"])
         section = width // (integrator.first_vertex + integrator.strategies)
         totals = [dr.zeros(mi.Float if grey else mi.Spectrum, width) for _ in radii]
         for level in range(integrator.strategies):
@@ -130,7 +131,7 @@ class WeightedSession(BDPMSession):
                 kind,
                 level,
                 photon_map,
-                vertex_section(vertices, first, section),
+                read_queries(vertices, first, section),
                 weights,
                 radii,
                 spectral,

@@ -127,7 +127,8 @@ class HeuristicWeights:
         return mi.Float(1)
 
     def stored(self, state):
-        return [mi.Spectrum(x) for x in state]
+        total, p = state
+        return [mi.Spectrum(total), mi.Spectrum(p), mi.Spectrum(0)]  # the last is not needed
 
     # ------------------------------------------------------------------ photons
 

@@ -55,8 +55,8 @@ class CameraPass:
     """`count` camera paths through a `sensor`: numbers `first`, `first + stride`, ... of
     `camera.film_samples`, where each pixel has `camera_paths`.
 
-    `integrator`: what moves rays on behind emitters that are hidden (None: none are); `seed`:
-    uint32 of width one, or one a path; `first`: uint32 of width one, or one a path (`camera.with_gaps`); `wavelength_sample`: in
+    `integrator`: what moves rays on behind emitters that are hidden (None: none are); `seed`,
+    `first`: uint32 of width one, or one a path (see `camera.with_gaps`); `wavelength_sample`: in
     [0, 1), makes the wavelengths that all paths share.
     """
 

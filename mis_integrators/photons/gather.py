@@ -152,12 +152,6 @@ def gather_photons(
     ]
 
 
-def vertex_section(vertices, first, count: int):
-    """`count` vertices of a buffer, those from place `first` on."""
-    index = dr.arange(mi.UInt32, count) + first
-    return {name: dr.gather(type(values), values, index) for name, values in vertices.items()}
-
-
 def mean_photon_count(photon_map, vertices, radius):
     """Photons within `radius` of a vertex, on average over the used vertices (a number; what a
     gather costs)."""

@@ -9,32 +9,59 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.packing import Store
+from ..core.recording import lanes
+from ..core.records import Layout
 from ..lights.lights import mis_power
 from ..paths.camera import trace_camera
 from ..paths.setting import CameraPass, Limits, World
 
-
-def new_vertex_buffer(capacity, weighted=False):
-    """Room for `capacity` camera vertices that wait for photons: what rebuilds the surface
-    interaction there, the path's throughput up to it, its path's number, and its depth in segments
-    with the top bit set where all photons are wanted (else only caustic ones); if `weighted`, the
-    state of the weights there. Unused places have throughput zero."""
-    extra = (
-        {name: dr.empty(mi.Spectrum, capacity) for name in (*STATE, "share")} if weighted else {}
-    )
-    return extra | {
-        "ray_o": dr.empty(mi.Point3f, capacity),
-        "ray_d": dr.empty(mi.Vector3f, capacity),
-        "hit": dr.empty(mi.PreliminaryIntersection3f, capacity),
-        "throughput": dr.zeros(mi.Spectrum, capacity),
-        "path": dr.empty(mi.UInt32, capacity),
-        "depth": dr.empty(mi.UInt32, capacity),
-    }
-
-
 LAST_VERTEX = 1 << 31
+"""Bit of a vertex' depth that says that all photons are wanted there, else only caustic ones."""
 STATE = ("weights.0", "weights.1", "weights.2")
 """What a vertex buffer calls the state of the weights."""
+
+
+def query_layout():
+    """Fields of a camera vertex that waits for photons: the ray that led to it and what it met,
+    from which the surface interaction is made again; the path's throughput up to it, its path's
+    number, and its depth in segments (with `LAST_VERTEX`)."""
+    return Layout(
+        {
+            "ray_o": mi.Point3f,
+            "path": mi.UInt32,
+            "ray_d": mi.Vector3f,
+            "depth": mi.UInt32,
+            "hit": mi.PreliminaryIntersection3f,
+            "throughput": mi.Spectrum,
+        }
+    )
+
+
+def weight_layout():
+    """Fields of the weights there: their `STATE`, and the weight of direct light, `share`."""
+    return Layout(dict.fromkeys((*STATE, "share"), mi.Spectrum))
+
+
+def new_vertex_buffer(capacity, weighted=False):
+    """Room for `capacity` camera vertices, a dictionary: `words` (records of `query_layout`; unused
+    ones are zero) and, if `weighted`, `weights` (records of `weight_layout`)."""
+    buffer = {"words": dr.zeros(mi.UInt32, query_layout().words * capacity)}
+    if weighted:
+        buffer["weights"] = weight_layout().room(capacity)
+    return buffer
+
+
+def read_queries(vertices, first=0, count=None):
+    """The vertices of a buffer, or `count` of them from place `first` on: a dictionary of all
+    their fields. Unused places have throughput zero; their weights are anything."""
+    layout = query_layout()
+    index = lanes(layout.capacity(vertices["words"]) if count is None else count)
+    if count is not None:
+        index += first
+    record = layout.read(vertices["words"], index)
+    if "weights" in vertices:
+        record |= weight_layout().read(vertices["weights"], index)
+    return record
 
 
 @dataclass(frozen=True)
@@ -147,7 +174,7 @@ class QueryVisitor:
             slot += section * queries.capacity
         if not queries.capacity:
             return
-        values = {
+        query = {
             "ray_o": at.ray.o,
             "ray_d": at.ray.d,
             "hit": at.hit,
@@ -155,10 +182,10 @@ class QueryVisitor:
             "path": at.path,
             "depth": at.depth | dr.select(last, mi.UInt32(LAST_VERTEX), mi.UInt32(0)),
         }
+        query_layout().write(store.vertices["words"], query, slot, wants)
         if weights is not None:
-            values |= {**dict(zip(STATE, weights.stored(sums))), "share": share_here}
-        for name, value in values.items():
-            dr.scatter(store.vertices[name], value, slot, wants)
+            state = {**dict(zip(STATE, weights.stored(sums))), "share": share_here}
+            weight_layout().write(store.vertices["weights"], state, slot, wants)
 
     def leave(self, state, at, rng, bs, weight, delta, active):
         vertex, _, scatter_pdf, origin, share_here, sums = state

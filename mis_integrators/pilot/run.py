@@ -18,6 +18,7 @@ from ..core.spectra import channel_mean
 from ..paths.camera import film_sample_count, film_size
 from ..paths.setting import CameraPass
 from ..photons.gather import mean_photon_count
+from ..photons.queries import read_queries
 from .radius import (
     LARGEST_SHARE,
     Expected,
@@ -341,8 +342,9 @@ class Pilot:
     def _prepare(self, photons, vertices):
         """Sets the ladder and counts photons; false if no camera path meets a surface that
         gathers."""
-        points = vertices["ray_o"] + vertices["ray_d"] * vertices["hit"].t
-        self.ladder = ladder(np.array(points), np.array(dr.max(vertices["throughput"])))
+        seen = read_queries(vertices)
+        points = seen["ray_o"] + seen["ray_d"] * seen["hit"].t
+        self.ladder = ladder(np.array(points), np.array(dr.max(seen["throughput"])))
         if self.ladder is None:
             return False
         self._count(photons, vertices)
@@ -359,7 +361,7 @@ class Pilot:
         radius = dr.opaque(mi.Float, float(self.ladder[-1]))
         for kind in self.ways:
             photon_map = self.session._map(photons, kind, radius)
-            self.photons[kind] = mean_photon_count(photon_map, vertices, radius)
+            self.photons[kind] = mean_photon_count(photon_map, read_queries(vertices), radius)
 
     def _cost(self, kind, corrected, radius, camera_paths):
         gather = GATHER_COST * self.gathered(kind, radius) + PROBE_COST * corrected
