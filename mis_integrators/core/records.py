@@ -48,6 +48,21 @@ def from_words(dtype, words):
     return words[0] if dtype is mi.UInt32 else dr.reinterpret_array(dtype, words[0])
 
 
+def packet_type(size):
+    """A vector of two or four words."""
+    return mi.Vector2u if size == 2 else mi.Vector4u
+
+
+def write_packets(words, flat, index, active=True):
+    """Writes records, given as a list of words (two, or a multiple of four), to the places
+    `index`."""
+    size = min(len(flat), PACKET)
+    packets = len(flat) // size
+    for number in range(packets):
+        packet = packet_type(size)(*flat[size * number : size * (number + 1)])
+        dr.scatter(words, packet, index * packets + number, active)
+
+
 class Layout:
     """Fields of a record: `fields` maps names to types (numbers, pointers, vectors, structures), in
     the order in which they lie."""
@@ -75,19 +90,16 @@ class Layout:
         """Records that an array has room for."""
         return dr.width(words) // self.words
 
-    def _packet_type(self):
-        return mi.Vector2u if self.packet == 2 else mi.Vector4u
-
-    def write(self, words, values, index, active=True):
-        """Writes whole records, `values` by name, to the places `index`."""
+    def flat(self, values):
+        """The words of records, `values` by name: a list of arrays."""
         flat = [
             word for name, dtype in self.fields.items() for word in to_words(dtype, values[name])
         ]
-        flat += [mi.UInt32(0)] * (self.words - len(flat))
-        for number in range(self.packets):
-            packet = flat[self.packet * number : self.packet * (number + 1)]
-            place = index * self.packets + number
-            dr.scatter(words, self._packet_type()(*packet), place, active)
+        return flat + [mi.UInt32(0)] * (self.words - len(flat))
+
+    def write(self, words, values, index, active=True):
+        """Writes whole records, `values` by name, to the places `index`."""
+        write_packets(words, self.flat(values), index, active)
 
     def read(self, words, index, active=True, only=None):
         """Fields (all, or those named in `only`) of the records at places `index`, by name; zero on
@@ -110,13 +122,15 @@ class Layout:
         """Packet `number` of records; of one that holds a single word, only that word."""
         if self.used - self.packet * number == 1:
             return [dr.gather(mi.UInt32, words, index * self.words + self.packet * number, active)]
-        return dr.gather(self._packet_type(), words, index * self.packets + number, active)
+        return dr.gather(packet_type(self.packet), words, index * self.packets + number, active)
 
     def move(self, words, index, target, active):
         """Another array of as many records, with those at places `index` copied to places
         `target`."""
         result = dr.empty(mi.UInt32, dr.width(words))
         for number in range(self.packets):
-            packet = dr.gather(self._packet_type(), words, index * self.packets + number, active)
+            packet = dr.gather(
+                packet_type(self.packet), words, index * self.packets + number, active
+            )
             dr.scatter(result, packet, target * self.packets + number, active)
         return result

@@ -16,7 +16,7 @@ from ..lights.lights import Lights
 from ..paths.camera import film_sample_count
 from ..paths.setting import World
 from ..photons.coverage import covered_share
-from ..photons.gather import gather_photons
+from ..photons.gather import QueryVertices, gather_photons
 from ..photons.grid import PhotonMap, build_photon_map, smallest_cell
 from ..photons.queries import Queries, read_queries, trace_camera_paths
 from ..photons.trace import trace_light_paths
@@ -255,16 +255,12 @@ class BDPMSession(IterativeSession):
 
     def _gather(self, photon_map, vertices, kind, radii, spectral, grey=False):
         """What photons of one kind bring to each vertex, for each radius."""
+        queries = QueryVertices(
+            self.traits, read_queries(vertices), spectral["wavelengths"], kind == "indirect"
+        )
+        max_depth = self.integrator.max_depth
         return gather_photons(
-            self.traits,
-            photon_map,
-            read_queries(vertices),
-            radii,
-            spectral["wavelengths"],
-            self.light_path_count,
-            self.integrator.max_depth,
-            only_last=kind == "indirect",
-            grey=grey,
+            photon_map, queries, radii, self.light_path_count, max_depth, grey=grey
         )
 
     def _covered(self, scene, tables, vertices, radius, seed):

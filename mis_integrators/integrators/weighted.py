@@ -5,7 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from ..photons.gather import gather_photons
+from ..photons.gather import QueryVertices, gather_photons
 from ..photons.queries import STATE, query_layout, read_queries
 from .bdpm import BDPM, BDPMSession
 
@@ -144,28 +144,14 @@ class WeightedSession(BDPMSession):
 
     def _merge(self, kind, level, photon_map, vertices, weights, radii, spectral, grey):
         """Weighted radiance that photons of one kind bring to the vertices of one strategy."""
-        weigh = self.weigher(weights, kind, level, vertices, photon_map)
+        weigh, scale = self.weigher(weights, kind, level, vertices, photon_map), 1
         if weigh is None:
-            vertices = _scaled(vertices, "share" if kind == "caustic" else STATE[0])
-        return gather_photons(
-            self.traits,
-            photon_map,
-            vertices,
-            radii,
-            spectral["wavelengths"],
-            self.light_path_count,
-            self.integrator.max_depth,
-            only_last=kind == "indirect",
-            grey=grey,
-            weigh=weigh,
+            weight = vertices["share" if kind == "caustic" else STATE[0]]
+            scale = dr.select(dr.max(vertices["throughput"]) > 0, weight, 0)
+        queries = QueryVertices(
+            self.traits, vertices, spectral["wavelengths"], kind == "indirect", scale
         )
-
-
-def _scaled(vertices, weight):
-    """The vertices with one of their weights as a scale of what they gather."""
-    used = dr.max(vertices["throughput"]) > 0
-    return {
-        **vertices,
-        "throughput": dr.select(used, vertices["throughput"], 0),
-        "scale": dr.select(used, vertices[weight], 0),
-    }
+        max_depth = self.integrator.max_depth
+        return gather_photons(
+            photon_map, queries, radii, self.light_path_count, max_depth, weigh, grey
+        )

@@ -24,7 +24,8 @@ from mis_integrators.paths.subpaths import (
     vertex_layout,
 )
 from mis_integrators.paths.vertex import VertexBSDF
-from mis_integrators.photons.merge import merge, vertex_map
+from mis_integrators.photons.gather import KeptVertices, gather_photons
+from mis_integrators.photons.vertex_map import state_of, vertex_map
 
 import drjit as dr
 import mitsuba as mi
@@ -313,9 +314,18 @@ class JointPaths:
             {"words": words}, mi.UInt32(self.COUNT), self.COUNT, self.traits.bounds, mi.Float(0.01)
         )
         brought = []
-        for weigh in (lambda *args: weights.merged(z, *args), lambda *args: mi.Float(1)):
-            radiance = merge(
-                self.traits, photons, z, dr.opaque(mi.Float, 1e-4), [], 1, -1, weigh, self.valid
+
+        def merged(index, f, p, back, active):
+            return weights.merged(z, state_of(photons, index, active), p, back())
+
+        for weigh in (merged, None):
+            (radiance,) = gather_photons(
+                photons,
+                KeptVertices(self.traits, z, [], self.valid),
+                [dr.opaque(mi.Float, 1e-4)],
+                1,
+                -1,
+                weigh,
             )
             brought.append(np.array(dr.mean(radiance)))
         self.valid &= mi.Bool(brought[1] > 0)
