@@ -26,7 +26,7 @@ from ..paths.camera import with_gaps
 from ..paths.connect import by_path, join, join_sensor, list_pairs, visible
 from ..paths.sensor import Lens
 from ..paths.setting import World
-from ..paths.subpaths import read_vertices, trace_camera_subpaths, trace_light_subpaths
+from ..paths.subpaths import Kept, read_vertices, trace_camera_subpaths, trace_light_subpaths
 from .common import MOST_LIGHT_PATHS, IterativeIntegrator, IterativeSession
 from .pyramid import Ledger, camera_images, sensor_images, technique_channels, with_rest
 
@@ -218,20 +218,15 @@ class BDPTSession(IterativeSession):
 
     def _list_pairs(self, tables, light, radiance, camera, camera_count, seed, spectral):
         vertices, count, lengths = light
-        start, order = by_path(vertices, count, lengths, self.capacity["light"])
+        ordered = by_path(Kept(vertices, count, self.capacity["light"]), lengths)
         thinning = THINNING if self.integrator.technique_weights else 0
         level = dr.zeros(mi.Float, self.chunk) + dr.mean(channel_mean(radiance)) * thinning
-        dr.eval(level, start, order)
+        dr.eval(level)
         return list_pairs(
             self.traits,
             self.weights(spectral),
-            camera,
-            camera_count,
-            self.capacity["camera"],
-            vertices,
-            start,
-            order,
-            lengths,
+            Kept(camera, camera_count, self.capacity["camera"]),
+            ordered,
             self.integrator.max_depth,
             self.capacity["pairs"],
             level,
@@ -266,15 +261,13 @@ class BDPTSession(IterativeSession):
         rng = vertex_streams(y["path"], y["number"], seed)
         aperture = next_2d(rng) if sensor.needs_aperture_sample() else mi.Point2f(0.5)
         joined = join_sensor(
-            scene,
+            self.world,
+            self.limits,
             self.integrator,
-            self.traits,
             Lens(sensor),
             y,
             aperture,
-            mi.Float(sensor.shutter_open()),
             spectral["wavelengths"],
-            self.integrator.hide_emitters,
             active,
         )
         value = joined.value * (self.pixel_paths / self.light_path_count)

@@ -7,6 +7,8 @@ A vertex remembers the step that led to it, from the last vertex that scattered 
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import drjit as dr
 import mitsuba as mi
 
@@ -205,29 +207,43 @@ def trace_camera_vertices(
     return radiance, alpha, splat, store.vertices, store.count, store.hits, store.hit_count
 
 
+@dataclass(frozen=True)
+class LightEnd:
+    """What the light's side of a joint path is at the camera's last vertex, or at the light that it
+    met.
+
+    `p_made` [1/m^2]: the density with which the light's side makes that; `strength`: flux, over the
+    density of that; `scattered`, `back`: BSDF there, and density per projected solid angle with
+    which the light's side goes on to the parent; `segments`: of the joint path.
+    """
+
+    p_made: mi.Float
+    strength: mi.Float
+    scattered: mi.Float
+    back: mi.Float
+    segments: mi.UInt32
+
+
 @dr.syntax
-def sum_before(
-    vertices, step, parent, p_made, strength, scattered, back, segments, weights, active
-):
+def sum_before(vertices, step, parent, end: LightEnd, weights, active):
     """Sum over the techniques nearer to the camera than the one at hand, of their samples times
     densities, over the density of the latter.
 
-    `step`, `parent`: those of the vertex, or hit, at the camera's end; `p_made` [1/m^2]: the
-    density with which the light's side makes it; `strength`: flux, over the density of that;
-    `scattered`, `back`: BSDF there, and density per projected solid angle with which the light's
-    side goes on to the parent; `segments`: of the joint path. `weights.gain(r, row, s, active)`:
-    what resampling makes of the technique that joins a light sub-path of s vertices, which sends r
-    = q*/p, to a vertex of that row. Joining to the sensor (the last step, without a parent) has the
-    gain one.
+    `step`, `parent`: those of the vertex, or hit, at the camera's end. `weights.gain(r, row, s,
+    active)`: what resampling makes of the technique that joins a light sub-path of s vertices,
+    which sends r = q*/p, to a vertex of that row. Joining to the sensor (the last step, without a
+    parent) has the gain one.
     """
     layout = vertex_layout(STEP)
     d_vcm, geometry, forward, back_there, scattered_there, row = (
         mi.Float(step[name]) for name in STEP
     )
     parent = mi.UInt32(parent)
-    ratio = mi.Float(p_made)
-    strength = mi.Float(strength)
-    scattered, back = mi.Float(scattered), mi.Float(back)
+    # What the loop reads must be plain variables: Dr.Jit would take a dataclass for its state.
+    segments = end.segments
+    ratio = mi.Float(end.p_made)
+    strength = mi.Float(end.strength)
+    scattered, back = mi.Float(end.scattered), mi.Float(end.back)
     active = mi.Bool(active)
     total = mi.Float(0)
     while dr.hint(active, label="techniques"):

@@ -10,6 +10,9 @@ What weights must know of a sub-path travels with it as a state, a list of float
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
 
@@ -20,6 +23,8 @@ from .light import trace_light
 from .sensor import Lens
 from .setting import CameraPass, LightPass, Limits, World
 from .vertex import VertexBSDF, scattered_mean
+
+Array = Any
 
 NO_PARENT = 0xFFFFFFFF
 STATES = ("d_vcm", "d_vc")
@@ -48,17 +53,32 @@ def vertex_layout(states=STATES):
     )
 
 
+def hit_record():
+    """The record of what a ray has met, apart from the other fields: few passes read it."""
+    return Layout({"hit": mi.PreliminaryIntersection3f})
+
+
+@dataclass(frozen=True)
+class Kept:
+    """Kept vertices: their buffer (`new_vertices`), how many there are (width one), and how many
+    there is room for."""
+
+    vertices: dict[str, Array]
+    count: Array
+    capacity: int
+
+
 def new_vertices(traits, capacity, states=STATES):
     """Room for `capacity` vertices, a dictionary: `words` (records of `vertex_layout`), `parent`
     (the place of the vertex before, or `NO_PARENT`), and where surfaces are not all Lambertian
-    `hit`, from which the surface interaction is made again. Only the places below the count are
-    valid."""
+    `hit` (records of `hit_record`), from which the surface interaction is made again. Only the
+    places below the count are valid."""
     buffer = {
         "words": vertex_layout(states).room(capacity),
         "parent": dr.empty(mi.UInt32, capacity),
     }
     if traits.has_rough:
-        buffer["hit"] = dr.empty(mi.PreliminaryIntersection3f, capacity)
+        buffer["hit"] = hit_record().room(capacity)
     return buffer
 
 
@@ -86,7 +106,7 @@ def keep_vertex(store, at, throughput, number, parent, state, keep):
     vertex_layout(tuple(state)).write(store.vertices["words"], values, slot, keep)
     dr.scatter(store.vertices["parent"], parent, slot, keep)
     if "hit" in store.vertices:
-        dr.scatter(store.vertices["hit"], at.hit, slot, keep)
+        hit_record().write(store.vertices["hit"], {"hit": at.hit}, slot, keep)
     return slot
 
 
@@ -94,9 +114,10 @@ def read_vertices(vertices, index, active, only=None, states=STATES):
     """The vertices at places `index`, a dictionary of all their fields (or those named in `only`);
     zero on inactive lanes."""
     record = vertex_layout(states).read(vertices["words"], index, active, only)
-    for name in ("parent", "hit"):
-        if name in vertices and (only is None or name in only):
-            record[name] = dr.gather(type(vertices[name]), vertices[name], index, active)
+    if "parent" in vertices and (only is None or "parent" in only):
+        record["parent"] = dr.gather(mi.UInt32, vertices["parent"], index, active)
+    if "hit" in vertices and (only is None or "hit" in only):
+        record |= hit_record().read(vertices["hit"], index, active)
     return record
 
 

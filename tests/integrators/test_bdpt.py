@@ -270,15 +270,13 @@ class JointPaths:
             )
         y = self.record(0, "light", light[0])
         seen = join_sensor(
-            self.scene,
+            World(self.scene, self.lights, self.traits),
+            Limits(-1, 5),
             None,
-            self.traits,
             self.lens,
             y,
             self.aperture,
-            mi.Float(0),
             [],
-            False,
             self.valid,
         )
         self.valid &= seen.active | mi.Bool(delta[0])
