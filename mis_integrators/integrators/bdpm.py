@@ -255,12 +255,21 @@ class BDPMSession(IterativeSession):
 
     def _gather(self, photon_map, vertices, kind, radii, spectral, grey=False):
         """What photons of one kind bring to each vertex, for each radius."""
-        queries = QueryVertices(
-            self.traits, read_queries(vertices), spectral["wavelengths"], kind == "indirect"
+        return self._merge(photon_map, read_queries(vertices), kind, radii, spectral, grey)
+
+    def _merge(self, photon_map, record, kind, radii, spectral, grey=False, weigh=None, scale=1):
+        """`gather_photons` of one kind at vertices as of `read_queries`."""
+        vertices = QueryVertices(
+            self.traits, record, spectral["wavelengths"], kind == "indirect", scale
         )
-        max_depth = self.integrator.max_depth
         return gather_photons(
-            photon_map, queries, radii, self.light_path_count, max_depth, grey=grey
+            photon_map,
+            vertices,
+            radii,
+            self.light_path_count,
+            self.integrator.max_depth,
+            weigh,
+            grey,
         )
 
     def _covered(self, scene, tables, vertices, radius, seed):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from ..photons.gather import QueryVertices, gather_photons
 from ..photons.queries import STATE, query_layout, read_queries
 from .bdpm import BDPM, BDPMSession
 
@@ -117,41 +116,27 @@ class WeightedSession(BDPMSession):
     def _gather(self, photon_map, vertices, kind, radii, spectral, grey=False):
         if not self._weighted:
             return super()._gather(photon_map, vertices, kind, radii, spectral, grey)
-        weights = self.weights(spectral["merge_settings"])
         if kind == "caustic":
-            everywhere = read_queries(vertices)
-            return self._merge(kind, None, photon_map, everywhere, weights, radii, spectral, grey)
+            record = read_queries(vertices)
+            return self._merge_weighted(photon_map, record, kind, None, radii, spectral, grey)
         integrator = self.integrator
         width = query_layout().capacity(vertices["words"])
         section = width // (integrator.first_vertex + integrator.strategies)
         totals = [dr.zeros(mi.Float if grey else mi.Spectrum, width) for _ in radii]
         for level in range(integrator.strategies):
             first = (level + integrator.first_vertex) * section
-            merged = self._merge(
-                kind,
-                level,
-                photon_map,
-                read_queries(vertices, first, section),
-                weights,
-                radii,
-                spectral,
-                grey,
-            )
+            record = read_queries(vertices, first, section)
+            merged = self._merge_weighted(photon_map, record, kind, level, radii, spectral, grey)
             for total, values in zip(totals, merged):
                 dr.scatter(total, values, dr.arange(mi.UInt32, section) + first)
         dr.eval(totals)
         return totals
 
-    def _merge(self, kind, level, photon_map, vertices, weights, radii, spectral, grey):
-        """Weighted radiance that photons of one kind bring to the vertices of one strategy."""
-        weigh, scale = self.weigher(weights, kind, level, vertices, photon_map), 1
+    def _merge_weighted(self, photon_map, record, kind, level, radii, spectral, grey):
+        """`_merge` at the vertices of one strategy, weighted."""
+        weights = self.weights(spectral["merge_settings"])
+        weigh, scale = self.weigher(weights, kind, level, record, photon_map), 1
         if weigh is None:
-            weight = vertices["share" if kind == "caustic" else STATE[0]]
-            scale = dr.select(dr.max(vertices["throughput"]) > 0, weight, 0)
-        queries = QueryVertices(
-            self.traits, vertices, spectral["wavelengths"], kind == "indirect", scale
-        )
-        max_depth = self.integrator.max_depth
-        return gather_photons(
-            photon_map, queries, radii, self.light_path_count, max_depth, weigh, grey
-        )
+            weight = record["share" if kind == "caustic" else STATE[0]]
+            scale = dr.select(dr.max(record["throughput"]) > 0, weight, 0)
+        return self._merge(photon_map, record, kind, radii, spectral, grey, weigh, scale)
