@@ -1,5 +1,8 @@
 """Records of mixed fields in one array of 32-bit words, read and written a packet at a time:
-neighbours in a record are neighbours in memory."""
+neighbours in a record are neighbours in memory.
+
+Pointers are words, too. A recorded function that reads them back must have the scene among its
+arguments: from words Dr.Jit does not know that objects are called."""
 
 from __future__ import annotations
 

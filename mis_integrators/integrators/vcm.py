@@ -168,7 +168,7 @@ class VCMSession(BDPTSession):
         eta = dr.pi * dr.square(spectral["radius"]) * self.light_chunk
         return ConnectionWeights(self.lights, plain.beta, plain.ratio, eta)
 
-    def _merge_vertices(self, tables, radiance, camera, count, light, spectral):
+    def _merge_vertices(self, scene, tables, radiance, camera, count, light, spectral):
         vertices, light_count, _ = light
         cell = dr.maximum(
             spectral["radius"],
@@ -198,4 +198,4 @@ class VCMSession(BDPTSession):
         return total
 
     def _merge(self, radiance, camera, count, light, spectral):
-        return self._merge_pass(self._tables, radiance, camera, count, light, spectral)
+        return self._merge_pass(self.scene, self._tables, radiance, camera, count, light, spectral)
