@@ -138,14 +138,16 @@ class KeptVertices:
         return Scattering(towards, shading, value, f, p, lambda: back)
 
 
-def same_surface(landing, offset, n, radius):
-    """Whether photons landed on the surface of vertices with normals `n`; `offset`: from there."""
+def same_surface(landing, n):
+    """Whether photons landed on a surface like that of vertices with normals `n`."""
     alike = dr.dot(landing.n, n)
-    return (
-        (alike > 0)
-        & (dr.square(alike) > SAME_SURFACE_COSINE**2 * dr.squared_norm(landing.n))
-        & (dr.abs(dr.dot(offset, n)) < SAME_SURFACE_OFFSET * radius)
-    )
+    return (alike > 0) & (dr.square(alike) > SAME_SURFACE_COSINE**2 * dr.squared_norm(landing.n))
+
+
+def within_disk(offset, distance_squared, n, radius):
+    """Whether photons, `offset` from vertices, lie within a radius and close to their plane."""
+    height = dr.abs(dr.dot(offset, n))
+    return (distance_squared < dr.square(radius)) & (height < SAME_SURFACE_OFFSET * radius)
 
 
 def landing_cosine(normal, scattering, plane):
@@ -190,19 +192,14 @@ def gather_photons(
     """
 
     def visit(index, landing, offset, distance_squared, hit, totals):
-        hit &= same_surface(landing, offset, vertices.n, radii[-1])
+        hit &= same_surface(landing, vertices.n)
         if max_depth > 0:
             hit &= landing.depth + vertices.depth <= max_depth
         value = _contribution(photon_map, vertices, index, landing, weigh, hit)
         if grey:
             value = channel_mean(value * vertices.factor)
-        inside = [hit]  # of the largest radius, as all photons visited are
-        if len(radii) > 1:
-            height = dr.abs(dr.dot(offset, vertices.n))
-            inside = [
-                hit & (distance_squared < dr.square(r)) & (height < SAME_SURFACE_OFFSET * r)
-                for r in radii
-            ]
+        # The largest radius is tested again, too: without, kernels are slower by some per cent.
+        inside = [hit & within_disk(offset, distance_squared, vertices.n, r) for r in radii]
         return tuple(total + dr.select(i, value, 0) for total, i in zip(totals, inside))
 
     zeros = tuple(mi.Float(0) if grey else mi.Spectrum(0) for _ in radii)

@@ -12,7 +12,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from .photon import power_layout, read_landing, surface_layout
+from .photon import landing_of, power_layout, read_landing, surface_layout
 
 RUN = 32
 """Photons of a row that a query tests at once: one bit of a word each."""
@@ -109,7 +109,8 @@ def build_photon_map(surface, power, count, bbox, cell, capacity: int, kind: str
     grid = Grid(bbox, cell, size)
     index = dr.arange(mi.UInt32, capacity)
     active = index < dr.gather(mi.UInt32, count, 0)
-    landing = read_landing(surface, index, active)
+    record = surface_layout().read(surface, index, active)
+    landing = landing_of(record)
     if kind != "all":
         active &= landing.caustic == (kind == "caustic")
     coordinates = grid.coordinates(landing.p)
@@ -122,7 +123,8 @@ def build_photon_map(surface, power, count, bbox, cell, capacity: int, kind: str
     start = dr.prefix_sum(counts)
     dr.eval(start)
     target = dr.gather(mi.UInt32, start, slot, active) + rank
-    sorted_surface = surface_layout().move(surface, index, target, active)
+    sorted_surface = surface_layout().room(capacity)
+    surface_layout().write(sorted_surface, record, target, active)
     sorted_power = power_layout().move(power, index, target, active)
     place = None
     if mis_words is not None:

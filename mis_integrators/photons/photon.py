@@ -55,7 +55,11 @@ class Landing:
 
 def read_landing(surface, index, active=True):
     """The `Landing` of photons `index`."""
-    record = surface_layout().read(surface, index, active)
+    return landing_of(surface_layout().read(surface, index, active))
+
+
+def landing_of(record):
+    """The `Landing` that a record of `surface_layout` describes."""
     word = record["surface"]
     return Landing(record["p"], unpack_normal(word), unpack_depth(word), unpack_caustic(word))
 
