@@ -8,6 +8,7 @@ from pathlib import Path
 from statistics import median
 
 from mis_integrators.photons.gather import mean_photon_count
+from mis_integrators.photons.queries import read_queries
 
 import drjit as dr
 import mitsuba as mi
@@ -200,18 +201,11 @@ def radius_for(session, photons_a_gather: float) -> tuple[float, int, int, float
     """
     spectral = session._spectral(0)
     photons = session._photons(0, spectral)
-    seed, first, stride = session._seed(0, 1), mi.UInt32(0), 1
-    *_, vertices, _ = session._trace_camera(
-        session.scene,
-        session.sensor,
-        seed,
-        first,
-        stride,
-        session.chunk,
-        session.camera_paths,
-        session.vertex_capacity,
-        spectral,
+    camera_pass = session.describe_camera_pass(
+        session.sensor, session._seed(0, 1), mi.UInt32(0), spectral
     )
+    *_, vertices, _ = session._trace_camera(camera_pass, session.vertex_capacity, spectral)
+    vertices = read_queries(vertices)
     radius = session.integrator.initial_radius
     for _ in range(3):
         opaque = dr.opaque(mi.Float, radius)

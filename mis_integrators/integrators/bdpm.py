@@ -14,10 +14,11 @@ from ..core.traits import SceneTraits, lookup
 from ..core.untrusted import Fields
 from ..lights.lights import Lights
 from ..paths.camera import film_sample_count
+from ..paths.setting import World
 from ..photons.coverage import covered_share
-from ..photons.gather import gather_photons
+from ..photons.gather import QueryVertices, gather_photons
 from ..photons.grid import PhotonMap, build_photon_map, smallest_cell
-from ..photons.queries import trace_camera_paths
+from ..photons.queries import Queries, read_queries, trace_camera_paths
 from ..photons.trace import trace_light_paths
 from ..pilot.run import choose_radii
 from .common import MOST_LIGHT_PATHS, IterativeIntegrator, IterativeSession
@@ -138,6 +139,7 @@ class BDPMSession(IterativeSession):
             SceneTraits(scene),
             Lights.seen_by(scene, sensor, integrator.plugin),
         )
+        self.world = World(scene, self.lights, self.traits)
         self.split_paths(CAMERA_CHUNK)
         self.light_path_count = integrator.photon_count or min(
             film_sample_count(sensor), MOST_LIGHT_PATHS
@@ -227,78 +229,65 @@ class BDPMSession(IterativeSession):
 
     def _trace_light(self, scene, sensor, tables, seed, spectral):
         return trace_light_paths(
-            scene,
-            self.lights,
-            self.traits,
-            seed,
-            self.light_path_count,
+            self.world,
+            self.limits,
+            self.describe_light_pass(sensor, seed, self.light_path_count, spectral),
             self.photon_capacity,
-            spectral["wavelengths"],
-            sensor.shutter_open(),
-            sensor.shutter_open_time(),
-            self.integrator.max_depth,
-            self.integrator.rr_depth,
+            light_state=self._light_state(spectral),
         )
 
-    def _trace_camera(
-        self, scene, sensor, seed, first, stride, paths, camera_paths, capacity, spectral
-    ):
-        """Traces `paths` camera paths, those with numbers `first`, `first + stride`, ..., of which
-        each pixel has so many `camera_paths`."""
-        integrator = self.integrator
+    def _light_state(self, spectral):
+        """What photons carry for the weights; None where there are none."""
+        return None
+
+    def _merge_state(self, spectral):
+        """The weights of camera paths (a `mis.state.MergeState`); None where there are none."""
+        return None
+
+    def _trace_camera(self, camera_pass, capacity, spectral):
+        """Traces the paths of a `CameraPass`, with room for so many vertices."""
+        queries = Queries(
+            self.last_vertex, capacity, self.has_caustics, self.has_indirect, self.one_vertex
+        )
         return trace_camera_paths(
-            scene,
-            sensor,
-            integrator,
-            self.lights,
-            self.traits,
-            seed,
-            first,
-            stride,
-            paths,
-            camera_paths,
-            spectral["sample"],
-            integrator.bdd,
-            integrator.max_depth,
-            integrator.rr_depth,
-            integrator.hide_emitters,
-            capacity,
-            self.has_caustics,
-            self.has_indirect,
-            self.one_vertex,
+            self.world, self.limits, camera_pass, queries, self._merge_state(spectral)
         )
 
     def _gather(self, photon_map, vertices, kind, radii, spectral, grey=False):
         """What photons of one kind bring to each vertex, for each radius."""
+        return self._merge(photon_map, read_queries(vertices), kind, radii, spectral, grey)
+
+    def _merge(self, photon_map, record, kind, radii, spectral, grey=False, weigh=None, scale=1):
+        """`gather_photons` of one kind at vertices as of `read_queries`."""
+        vertices = QueryVertices(
+            self.traits, record, spectral["wavelengths"], kind == "indirect", scale
+        )
         return gather_photons(
-            self.traits,
             photon_map,
             vertices,
             radii,
-            spectral["wavelengths"],
             self.light_path_count,
             self.integrator.max_depth,
-            only_last=kind == "indirect",
-            grey=grey,
+            weigh,
+            grey,
         )
 
     def _covered(self, scene, tables, vertices, radius, seed):
         """Share of each vertex' merge disk that holds surface; one where the surface is not
         Lambertian: in a highlight the noise of dividing by an estimate would outweigh what it
         mends."""
+        vertices = read_queries(vertices)
         probed = dr.max(vertices["throughput"]) > 0
         if self.traits.has_rough:
-            shape = dr.select(
-                probed, vertices["hit"].shape, dr.zeros(mi.ShapePtr)
-            )  # unused places hold no pointers
-            probed &= lookup(self.traits.lambertian, shape.bsdf(), mi.Bool, probed)
+            bsdf = vertices["hit"].shape.bsdf()
+            probed &= lookup(self.traits.lambertian, bsdf, mi.Bool, probed)
         return dr.select(probed, covered_share(scene, vertices, radius, seed, probed), 1)
 
     def _per_path(self, values, vertices, paths):
         """Sums values of the vertices for each of `paths` camera paths."""
         if self.one_vertex:
             return values
-        total = dr.zeros(type(values), paths)
+        vertices, total = read_queries(vertices), dr.zeros(type(values), paths)
         dr.scatter_reduce(
             dr.ReduceOp.Add,
             total,
@@ -328,13 +317,7 @@ class BDPMSession(IterativeSession):
 
     def _render_chunk(self, scene, sensor, tables, maps, seed, first, spectral, radii):
         radiance, alpha, position, vertices, count = self._trace_camera(
-            scene,
-            sensor,
-            seed,
-            first,
-            1,
-            self.chunk,
-            self.camera_paths,
+            self.describe_camera_pass(sensor, seed, first, spectral),
             self.vertex_capacity,
             spectral,
         )

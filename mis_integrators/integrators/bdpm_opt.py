@@ -185,19 +185,11 @@ class BDPMOptSession(WeightedSession):
         capacity, found = 0, PHOTONS_A_PATH * paths
         while found > capacity:
             capacity = found
+            light_pass = self.describe_light_pass(
+                self.sensor, self._seed(0, FROZEN), paths, spectral
+            )
             photons = trace_light_paths(
-                self.scene,
-                self.lights,
-                self.traits,
-                self._seed(0, FROZEN),
-                paths,
-                capacity,
-                spectral["wavelengths"],
-                self.sensor.shutter_open(),
-                self.sensor.shutter_open_time(),
-                integrator.max_depth,
-                integrator.rr_depth,
-                keep_direct=True,
+                self.world, self.limits, light_pass, capacity, keep_direct=True
             )
             dr.eval(photons)
             found = int(photons[2][0])

@@ -22,9 +22,11 @@ from ..core.spectra import channel_mean
 from ..core.traits import SceneTraits
 from ..lights.lights import Lights
 from ..mis.vertex_merging import ConnectionWeights
+from ..paths.camera import with_gaps
 from ..paths.connect import by_path, join, join_sensor, list_pairs, visible
 from ..paths.sensor import Lens
-from ..paths.subpaths import read_vertices, trace_camera_subpaths, trace_light_subpaths
+from ..paths.setting import World
+from ..paths.subpaths import Kept, read_vertices, trace_camera_subpaths, trace_light_subpaths
 from .common import MOST_LIGHT_PATHS, IterativeIntegrator, IterativeSession
 from .pyramid import Ledger, camera_images, sensor_images, technique_channels, with_rest
 
@@ -151,6 +153,7 @@ class BDPTSession(IterativeSession):
         super().__init__(integrator, scene, sensor, seed, iterations)
         self.traits = SceneTraits(scene)
         self.lights = Lights.seen_by(scene, sensor, integrator.plugin)
+        self.world = World(scene, self.lights, self.traits)
         self.split_paths(CHUNK)
         self.light_chunk = self.light_count()
         self.light_path_count = self.chunks * self.light_chunk
@@ -189,40 +192,19 @@ class BDPTSession(IterativeSession):
     # ------------------------------------------------------------------ passes
 
     def _trace_light(self, scene, sensor, tables, seed, spectral):
+        light_pass = self.describe_light_pass(sensor, seed, self.light_chunk, spectral)
         return trace_light_subpaths(
-            scene,
-            self.lights,
-            self.traits,
-            self.weights(spectral),
-            seed,
-            self.light_chunk,
-            self.capacity["light"],
-            spectral["wavelengths"],
-            sensor.shutter_open(),
-            sensor.shutter_open_time(),
-            self.integrator.max_depth,
-            self.integrator.rr_depth,
+            self.world, self.limits, light_pass, self.weights(spectral), self.capacity["light"]
         )
 
     def _trace_camera(self, scene, sensor, tables, seed, first, skip, spectral):
-        integrator = self.integrator
-        ledger = self._ledger() if integrator.techniques else None
+        ledger = self._ledger() if self.integrator.techniques else None
+        first = with_gaps(first, skip, self.chunk, self.camera_paths)
         radiance, alpha, position, vertices, count = trace_camera_subpaths(
-            scene,
-            sensor,
-            integrator,
-            self.lights,
-            self.traits,
+            self.world,
+            self.limits,
+            self.describe_camera_pass(sensor, seed, first, spectral),
             self.weights(spectral),
-            seed,
-            first,
-            skip,
-            self.chunk,
-            integrator.camera_paths,
-            spectral["sample"],
-            integrator.max_depth,
-            integrator.rr_depth,
-            integrator.hide_emitters,
             self.capacity["camera"],
             ledger,
             self.shortest,
@@ -236,20 +218,15 @@ class BDPTSession(IterativeSession):
 
     def _list_pairs(self, tables, light, radiance, camera, camera_count, seed, spectral):
         vertices, count, lengths = light
-        start, order = by_path(vertices, count, lengths, self.capacity["light"])
+        ordered = by_path(Kept(vertices, count, self.capacity["light"]), lengths)
         thinning = THINNING if self.integrator.technique_weights else 0
         level = dr.zeros(mi.Float, self.chunk) + dr.mean(channel_mean(radiance)) * thinning
-        dr.eval(level, start, order)
+        dr.eval(level)
         return list_pairs(
             self.traits,
             self.weights(spectral),
-            camera,
-            camera_count,
-            self.capacity["camera"],
-            vertices,
-            start,
-            order,
-            lengths,
+            Kept(camera, camera_count, self.capacity["camera"]),
+            ordered,
             self.integrator.max_depth,
             self.capacity["pairs"],
             level,
@@ -284,15 +261,13 @@ class BDPTSession(IterativeSession):
         rng = vertex_streams(y["path"], y["number"], seed)
         aperture = next_2d(rng) if sensor.needs_aperture_sample() else mi.Point2f(0.5)
         joined = join_sensor(
-            scene,
+            self.world,
+            self.limits,
             self.integrator,
-            self.traits,
             Lens(sensor),
             y,
             aperture,
-            mi.Float(sensor.shutter_open()),
             spectral["wavelengths"],
-            self.integrator.hide_emitters,
             active,
         )
         value = joined.value * (self.pixel_paths / self.light_path_count)

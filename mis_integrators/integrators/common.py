@@ -17,6 +17,7 @@ from ..core.render_lock import RENDER_LOCK, under_render_lock
 from ..core.traits import UnsupportedScene, check_film, check_scene, check_variant, unfinite_data
 from ..core.untrusted import Fields
 from ..paths.camera import film_sample_count, with_gaps
+from ..paths.setting import CameraPass, LightPass, Limits
 from .parameters import Parameters
 
 MOST_PATHS = 2**32 - 1
@@ -190,6 +191,7 @@ class IterativeSession:
 
     def __init__(self, integrator, scene, sensor, seed, iterations):
         self.integrator, self.scene, self.sensor, self.seed = integrator, scene, sensor, seed
+        self.limits = Limits(integrator.max_depth, integrator.rr_depth, integrator.hide_emitters)
         self.iterations_planned = iterations
         self.camera_paths = integrator.initial_camera_paths
         self.accumulator = Accumulator(sensor.film(), integrator.variance)
@@ -300,6 +302,24 @@ class IterativeSession:
         self.chunks = -(-self.path_count // largest)
         self.chunk = -(-self.path_count // (self.chunks * self.camera_paths)) * self.camera_paths
 
+    @staticmethod
+    def describe_light_pass(sensor, seed, count, spectral):
+        """`count` light sub-paths under the wavelengths of an iteration."""
+        shutter = sensor.shutter_open(), sensor.shutter_open_time()
+        return LightPass(seed, count, spectral["wavelengths"], *shutter)
+
+    def describe_camera_pass(self, sensor, seed, first, spectral):
+        """The camera paths of a part, from number `first` on."""
+        return CameraPass(
+            sensor,
+            self.integrator,
+            seed,
+            first,
+            self.chunk,
+            self.camera_paths,
+            spectral["sample"],
+        )
+
     def sum_of_chunks(self, render):
         """What `render(chunk, first)` returns, a tuple of tensors or `None`s, summed over all
         parts; `first`: the number of the part's first path."""
@@ -314,8 +334,8 @@ class IterativeSession:
         return total
 
     def all_over_the_film(self, chunk=0):
-        """Numbers `first` and `skip` of a part's camera paths that see all of the film, as of
-        `trace_camera_vertices`: for pilots, or for all parts."""
+        """Numbers `first` and `skip` (see `with_gaps`) of a part's camera paths that see all of the
+        film: for pilots, or for all parts."""
         paths = self.camera_paths
         return dr.opaque(mi.UInt32, chunk * paths), dr.opaque(mi.UInt32, paths * (self.chunks - 1))
 

@@ -31,11 +31,13 @@ from ..mis.resampling import (
     tabulate,
     uniform_tables,
 )
-from ..paths.camera_vertices import STEP, hit_layout, sum_before, trace_camera_vertices
+from ..paths.camera import with_gaps
+from ..paths.camera_vertices import STEP, LightEnd, hit_layout, sum_before, trace_camera_vertices
 from ..paths.connect import join_sensor, list_draws
 from ..paths.light_starts import sample_light_starts
 from ..paths.sensor import Lens
-from ..paths.subpaths import read_vertices, seen_normal, trace_light_subpaths, vertex_bsdf_of
+from ..paths.setting import World
+from ..paths.subpaths import Kept, read_vertices, seen_normal, trace_light_subpaths, vertex_bsdf_of
 from ..paths.vertex import scattered_mean
 from ..resampling.cache_points import CacheGrid
 from ..resampling.light_vertices import END, LightVertices, list_light_vertices
@@ -129,6 +131,7 @@ class ResampledSession(IterativeSession):
         super().__init__(integrator, scene, sensor, seed, iterations)
         self.traits = SceneTraits(scene)
         self.lights = Lights.seen_by(scene, sensor, integrator.plugin)
+        self.world = World(scene, self.lights, self.traits)
         self.split_paths(CHUNK)
         width, height = sensor.film().crop_size()
         self.pixel_paths = width * height * integrator.camera_paths
@@ -227,40 +230,19 @@ class ResampledSession(IterativeSession):
     # ------------------------------------------------------------------ passes
 
     def _trace_light(self, scene, sensor, tables, seed, spectral):
+        light_pass = self.describe_light_pass(sensor, seed, self.light_chunk, spectral)
         return trace_light_subpaths(
-            scene,
-            self.lights,
-            self.traits,
-            self.weights(),
-            seed,
-            self.light_chunk,
-            self.capacity["light"],
-            spectral["wavelengths"],
-            sensor.shutter_open(),
-            sensor.shutter_open_time(),
-            self.integrator.max_depth,
-            self.integrator.rr_depth,
+            self.world, self.limits, light_pass, self.weights(), self.capacity["light"]
         )
 
     def _trace_camera(self, scene, sensor, tables, seed, first, skip, spectral):
-        integrator = self.integrator
+        first = with_gaps(first, skip, self.chunk, self.camera_paths)
         return trace_camera_vertices(
-            scene,
-            sensor,
-            integrator,
-            self.lights,
-            self.traits,
+            self.world,
+            self.limits,
+            self.describe_camera_pass(sensor, seed, first, spectral),
             self.weights(),
-            seed,
-            first,
-            skip,
-            self.chunk,
-            integrator.camera_paths,
-            spectral["sample"],
             self.ratio,
-            integrator.max_depth,
-            integrator.rr_depth,
-            integrator.hide_emitters,
             self.capacity["camera"],
             self.capacity["hits"],
         )
@@ -281,12 +263,12 @@ class ResampledSession(IterativeSession):
             self.traits, self.lights, starts, M, light, places, kept + M, self.reach
         )
 
-    def _targets(
-        self, scene, sensor, tables, seed, light, count, lengths, first, cache, spectral, target
-    ):
+    def _targets(self, scene, sensor, tables, seed, subpaths, first, cache, spectral, target):
         """q*/p of every light vertex of M sub-paths (from the number `first` on) at every cache
         point if nothing stood between, row by row; whether nothing does; what makes their
-        `LightVertices`; how many vertices they have; `guessed_weight`."""
+        `LightVertices`; how many vertices they have; `guessed_weight`. `subpaths`: as of
+        `trace_light_subpaths`."""
+        light, count, lengths = subpaths
         room, M = self.capacity["ends"], self.integrator.resampled_light_paths
         places, found = list_light_vertices(
             light, count, lengths, first, M, self.capacity["light"], room
@@ -326,7 +308,7 @@ class ResampledSession(IterativeSession):
             guessed_weight(z, sent),
         )
 
-    def _own_targets(self, scene, sensor, tables, seed, light, count, lengths, cache, spectral):
+    def _own_targets(self, scene, sensor, tables, seed, subpaths, cache, spectral):
         """What pmfs are made of: q*/p of the first M sub-paths for the target at hand, times the
         guessed weight; then as of `_targets`."""
         target = self.integrator.target
@@ -335,9 +317,7 @@ class ResampledSession(IterativeSession):
             sensor,
             tables,
             seed,
-            light,
-            count,
-            lengths,
+            subpaths,
             mi.UInt32(0),
             cache,
             spectral,
@@ -345,17 +325,13 @@ class ResampledSession(IterativeSession):
         )
         return dr.select(r > 0, r * guess, 0), *others
 
-    def _pilot_targets(
-        self, scene, sensor, tables, seed, light, count, lengths, first, cache, spectral
-    ):
+    def _pilot_targets(self, scene, sensor, tables, seed, subpaths, first, cache, spectral):
         return self._targets(
             scene,
             sensor,
             tables,
             seed,
-            light,
-            count,
-            lengths,
+            subpaths,
             first,
             cache,
             spectral,
@@ -374,9 +350,7 @@ class ResampledSession(IterativeSession):
         return list_draws(
             self.grid,
             expected,
-            camera,
-            count,
-            self.capacity["camera"],
+            Kept(camera, count, self.capacity["camera"]),
             self.chunk,
             STEP,
             self.capacity["draws"],
@@ -391,19 +365,16 @@ class ResampledSession(IterativeSession):
         radiance,
         camera,
         draws,
-        light,
-        starts,
-        places,
-        found,
-        pmfs,
+        proposals,
         seed,
         spectral,
     ):
         """Radiance of camera paths with that of connections to drawn light sub-paths added.
-        `draws`: as of `list_draws`."""
+        `draws`: as of `list_draws`; `proposals`: as of `_proposals`."""
+        light, starts, places, found, pmfs = proposals
         integrator, weights = self.integrator, self.weights()
         ends = self._ends(starts, light, places, found)
-        proposals = Proposals(
+        pmf = Proposals(
             self.grid,
             *pmfs[:2],
             ends.count,
@@ -418,9 +389,9 @@ class ResampledSession(IterativeSession):
             z["path"] * integrator.resamples + index % integrator.resamples, z["number"], seed
         )
         row = self.grid.row(z["p"], seen_normal(z))
-        drawn = proposals.draw(row, rng, active)
+        drawn = pmf.draw(row, rng, active)
         active &= drawn < dr.gather(mi.UInt32, ends.count, 0)
-        probability = proposals.probability(row, drawn, active)
+        probability = pmf.probability(row, drawn, active)
 
         sent = ends.send(
             z["p"], drawn, mi.Float(sensor.shutter_open()), spectral["wavelengths"], active
@@ -459,18 +430,14 @@ class ResampledSession(IterativeSession):
             sent.vertices,
             active,
         )
-        nearer = sum_before(
-            camera,
-            z,
-            z["parent"],
+        end = LightEnd(
             sent.pdf_area * cosine,
             sent.mean * dr.rcp(dr.maximum(sent.pdf_area, 1e-20)),
             scattered_mean(value, z["n"], sent.d),
             back,
             segments,
-            weights,
-            active,
         )
+        nearer = sum_before(camera, z, z["parent"], end, weights, active)
         return own * dr.rcp(dr.maximum(own + forward * cosine * sent.mis_sum + nearer, 1e-20))
 
     def _meet(self, tables, radiance, camera, hits, hit_count):
@@ -479,18 +446,8 @@ class ResampledSession(IterativeSession):
         index = lanes(self.capacity["hits"])
         active = index < dr.gather(mi.UInt32, hit_count, 0)
         hit = hit_layout().read(hits, index, active)
-        nearer = sum_before(
-            camera,
-            hit,
-            hit["parent"],
-            hit["start"],
-            hit["light_mean"],
-            mi.Float(1),
-            hit["across"],
-            hit["depth"],
-            self.weights(),
-            active,
-        )
+        end = LightEnd(hit["start"], hit["light_mean"], mi.Float(1), hit["across"], hit["depth"])
+        nearer = sum_before(camera, hit, hit["parent"], end, self.weights(), active)
         total = radiance + dr.zeros(mi.Spectrum, self.chunk)  # radiance may be a single zero
         dr.scatter_reduce(
             dr.ReduceOp.Add, total, hit["value"] * dr.rcp(1 + nearer), hit["path"], active
@@ -508,15 +465,13 @@ class ResampledSession(IterativeSession):
             else mi.Point2f(0.5)
         )
         joined = join_sensor(
-            scene,
+            self.world,
+            self.limits,
             self.integrator,
-            self.traits,
             Lens(sensor),
             y,
             aperture,
-            mi.Float(sensor.shutter_open()),
             spectral["wavelengths"],
-            self.integrator.hide_emitters,
             active,
         )
         value = joined.value * (self.weights().seen_by_sensor(joined, y) / self.ratio)
@@ -650,7 +605,7 @@ class ResampledSession(IterativeSession):
                     self.sensor,
                     self._tables,
                     self._seed(PILOT, START, k),
-                    *light,
+                    light,
                     dr.opaque(mi.UInt32, k * M),
                     cache,
                     spectral,
@@ -712,7 +667,7 @@ class ResampledSession(IterativeSession):
                 self.sensor,
                 self._tables,
                 self._seed(iteration, START),
-                *light,
+                light,
                 self.cache,
                 spectral,
             )
@@ -739,7 +694,7 @@ class ResampledSession(IterativeSession):
             radiance,
             camera,
             draws,
-            *proposals,
+            proposals,
             self._seed(iteration, DRAW, chunk),
             spectral,
         )

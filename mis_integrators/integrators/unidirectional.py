@@ -9,6 +9,7 @@ import mitsuba as mi
 from ..core.film import splat_samples
 from ..core.untrusted import Fields
 from ..paths.camera import film_sample_count, start_camera_paths
+from ..paths.setting import CameraPass
 from .common import IterativeSession
 
 BUSY = 1 << 19
@@ -60,9 +61,10 @@ class PathSession(IterativeSession):
         the film. Where `first` and `variation` are arrays, each lane has its own, and the paths of
         one number differ with the variation."""
         seed = self._seed(iteration, PATHS) + variation
-        _, active, _, ray, weight, position, _ = start_camera_paths(
-            self.sensor, seed, first, stride, paths, self.camera_paths, spectral["sample"]
+        camera_pass = CameraPass(
+            self.sensor, None, seed, first, paths, self.camera_paths, spectral["sample"], stride
         )
+        _, active, _, ray, weight, position, _ = start_camera_paths(camera_pass)
         differential = mi.RayDifferential3f(ray)
         self.sampler.seed(self._seed(iteration, SAMPLER, chunk), paths)
         radiance, valid, _ = self.path_integrator.sample(

@@ -11,8 +11,9 @@ from ..core.recording import lanes
 from ..core.untrusted import Fields
 from ..mis.vertex_merging import ConnectionWeights
 from ..paths.subpaths import read_vertices
+from ..photons.gather import KeptVertices, gather_photons
 from ..photons.grid import smallest_cell
-from ..photons.merge import merge, vertex_map
+from ..photons.vertex_map import state_of, vertex_map
 from .bdpt import BDPT, BDPTSession
 from .common import MOST_LIGHT_PATHS
 from .schedule import LARGEST_RADIUS, SMALLEST_RADIUS, read_radius, shrunk
@@ -167,7 +168,7 @@ class VCMSession(BDPTSession):
         eta = dr.pi * dr.square(spectral["radius"]) * self.light_chunk
         return ConnectionWeights(self.lights, plain.beta, plain.ratio, eta)
 
-    def _merge_vertices(self, tables, radiance, camera, count, light, spectral):
+    def _merge_vertices(self, scene, tables, radiance, camera, count, light, spectral):
         vertices, light_count, _ = light
         cell = dr.maximum(
             spectral["radius"],
@@ -181,23 +182,20 @@ class VCMSession(BDPTSession):
         z = read_vertices(camera, index, active)
         weights = self.weights(spectral)
 
-        def weigh(state, back_at_light, back_at_camera):
-            return weights.merged(z, state, back_at_light, back_at_camera)
+        def weigh(index, f, p, back, active):
+            return weights.merged(z, state_of(photon_map, index, active), p, back())
 
-        merged = merge(
-            self.traits,
+        (merged,) = gather_photons(
             photon_map,
-            z,
-            spectral["radius"],
-            spectral["wavelengths"],
+            KeptVertices(self.traits, z, spectral["wavelengths"], active),
+            [spectral["radius"]],
             self.light_chunk,
             self.integrator.max_depth,
             weigh,
-            active,
         )
         total = mi.Spectrum(radiance)
         dr.scatter_reduce(dr.ReduceOp.Add, total, merged, z["path"], active)
         return total
 
     def _merge(self, radiance, camera, count, light, spectral):
-        return self._merge_pass(self._tables, radiance, camera, count, light, spectral)
+        return self._merge_pass(self.scene, self._tables, radiance, camera, count, light, spectral)

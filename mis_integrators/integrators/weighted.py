@@ -5,9 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from ..photons.gather import gather_photons, vertex_section
-from ..photons.queries import STATE, trace_camera_paths
-from ..photons.trace import trace_light_paths
+from ..photons.queries import STATE, query_layout, read_queries
 from .bdpm import BDPM, BDPMSession
 
 
@@ -107,109 +105,38 @@ class WeightedSession(BDPMSession):
             dr.make_opaque(spectral["merge_settings"])
         return spectral
 
-    def _trace_light(self, scene, sensor, tables, seed, spectral):
-        if not self._weighted:
-            return super()._trace_light(scene, sensor, tables, seed, spectral)
-        light_state = (
-            self.weights(spectral["merge_settings"]).light_state() if self.has_indirect else None
-        )
-        return trace_light_paths(
-            scene,
-            self.lights,
-            self.traits,
-            seed,
-            self.light_path_count,
-            self.photon_capacity,
-            spectral["wavelengths"],
-            sensor.shutter_open(),
-            sensor.shutter_open_time(),
-            self.integrator.max_depth,
-            self.integrator.rr_depth,
-            light_state=light_state,
-        )
+    def _light_state(self, spectral):
+        if not (self._weighted and self.has_indirect):
+            return None
+        return self.weights(spectral["merge_settings"]).light_state()
 
-    def _trace_camera(
-        self, scene, sensor, seed, first, stride, paths, camera_paths, capacity, spectral
-    ):
-        if not self._weighted:
-            return super()._trace_camera(
-                scene, sensor, seed, first, stride, paths, camera_paths, capacity, spectral
-            )
-        integrator = self.integrator
-        return trace_camera_paths(
-            scene,
-            sensor,
-            integrator,
-            self.lights,
-            self.traits,
-            seed,
-            first,
-            stride,
-            paths,
-            camera_paths,
-            spectral["sample"],
-            integrator.first_vertex + integrator.strategies - 1,
-            integrator.max_depth,
-            integrator.rr_depth,
-            integrator.hide_emitters,
-            capacity,
-            self.has_caustics,
-            self.has_indirect,
-            False,
-            self.weights(spectral["merge_settings"]),
-        )
+    def _merge_state(self, spectral):
+        return self.weights(spectral["merge_settings"]) if self._weighted else None
 
     def _gather(self, photon_map, vertices, kind, radii, spectral, grey=False):
         if not self._weighted:
             return super()._gather(photon_map, vertices, kind, radii, spectral, grey)
-        weights = self.weights(spectral["merge_settings"])
         if kind == "caustic":
-            return self._merge(kind, None, photon_map, vertices, weights, radii, spectral, grey)
+            record = read_queries(vertices)
+            return self._merge_weighted(photon_map, record, kind, None, radii, spectral, grey)
         integrator = self.integrator
-        width = dr.width(vertices["path"])
+        width = query_layout().capacity(vertices["words"])
         section = width // (integrator.first_vertex + integrator.strategies)
         totals = [dr.zeros(mi.Float if grey else mi.Spectrum, width) for _ in radii]
         for level in range(integrator.strategies):
             first = (level + integrator.first_vertex) * section
-            merged = self._merge(
-                kind,
-                level,
-                photon_map,
-                vertex_section(vertices, first, section),
-                weights,
-                radii,
-                spectral,
-                grey,
-            )
+            record = read_queries(vertices, first, section)
+            merged = self._merge_weighted(photon_map, record, kind, level, radii, spectral, grey)
             for total, values in zip(totals, merged):
                 dr.scatter(total, values, dr.arange(mi.UInt32, section) + first)
         dr.eval(totals)
         return totals
 
-    def _merge(self, kind, level, photon_map, vertices, weights, radii, spectral, grey):
-        """Weighted radiance that photons of one kind bring to the vertices of one strategy."""
-        weigh = self.weigher(weights, kind, level, vertices, photon_map)
+    def _merge_weighted(self, photon_map, record, kind, level, radii, spectral, grey):
+        """`_merge` at the vertices of one strategy, weighted."""
+        weights = self.weights(spectral["merge_settings"])
+        weigh, scale = self.weigher(weights, kind, level, record, photon_map), 1
         if weigh is None:
-            vertices = _scaled(vertices, "share" if kind == "caustic" else STATE[0])
-        return gather_photons(
-            self.traits,
-            photon_map,
-            vertices,
-            radii,
-            spectral["wavelengths"],
-            self.light_path_count,
-            self.integrator.max_depth,
-            only_last=kind == "indirect",
-            grey=grey,
-            weigh=weigh,
-        )
-
-
-def _scaled(vertices, weight):
-    """The vertices with one of their weights as a scale of what they gather."""
-    used = dr.max(vertices["throughput"]) > 0
-    return {
-        **vertices,
-        "throughput": dr.select(used, vertices["throughput"], 0),
-        "scale": dr.select(used, vertices[weight], 0),
-    }
+            weight = record["share" if kind == "caustic" else STATE[0]]
+            scale = dr.select(dr.max(record["throughput"]) > 0, weight, 0)
+        return self._merge(photon_map, record, kind, radii, spectral, grey, weigh, scale)

@@ -34,7 +34,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from ..core.packing import bits_float, float_bits
+from ..core.records import Layout
 from ..paths.light_starts import seen_from
 from ..photons.queries import STATE
 from ..weights.heuristics import add_ratio, bounded_power, weight
@@ -127,7 +127,8 @@ class HeuristicWeights:
         return mi.Float(1)
 
     def stored(self, state):
-        return [mi.Spectrum(x) for x in state]
+        total, p = state
+        return [mi.Spectrum(total), mi.Spectrum(p), mi.Spectrum(0)]  # the last is not needed
 
     # ------------------------------------------------------------------ photons
 
@@ -169,6 +170,8 @@ class LightState:
     def __init__(self, weights):
         self.weights = weights
         self.levels = weights.strategies - 2
+        sums = [f"sum.{level}" for level in range(self.levels)]
+        self.layout = Layout(dict.fromkeys(["q", *sums], mi.Float))
 
     def init(self):
         """That factor, q (zero: has not scattered yet), the sums."""
@@ -208,14 +211,11 @@ class LightState:
         ]
 
     def words(self, state):
-        words = [float_bits(x) for x in state[1:]]
-        return words + [mi.UInt32(0)] * ((2 - len(words)) if len(words) <= 2 else -len(words) % 4)
+        return self.layout.flat(dict(zip(self.layout.fields, state[1:])))
 
     def read(self, level, mis_words, index, active):
         """q_level of photon `index`, merged at z_level, and the sum of the strategies after
         z_{level + 1}."""
-        count = len(self.words(self.init()))
-        q = bits_float(dr.gather(mi.UInt32, mis_words, count * index, active))
-        if level >= self.levels:
-            return q, mi.Float(0)
-        return q, bits_float(dr.gather(mi.UInt32, mis_words, count * index + 1 + level, active))
+        wanted = ("q",) if level >= self.levels else ("q", f"sum.{level}")
+        record = self.layout.read(mis_words, index, active, wanted)
+        return record["q"], record.get(f"sum.{level}", mi.Float(0))

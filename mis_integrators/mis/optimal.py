@@ -13,7 +13,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from ..core.packing import bits_float, float_bits
+from ..core.records import Layout
 from ..core.spectra import channel_mean
 from ..core.traits import lookup
 from ..weights import recursion
@@ -399,14 +399,25 @@ class OptimalWeights:
         return dr.select(node.indirectly, dr.select(node.last, final, here + deeper), direct)
 
 
+FIELDS_OF_THE_LAST = 4
+"""Fields of the farthest vertex: what `Node.final_response` and its weights ask for."""
+
+
 class LightState:
     """Sums of light sub-paths: what is known of the last `strategies - 1` vertices that scattered
     smoothly, nearest first (hooks of `trace_light_paths`). Of the farthest, at which strategies
-    end, only what `Node.final_response` and its weights ask for."""
+    end, only `FIELDS_OF_THE_LAST`. Fields are named by vertex and number."""
 
     def __init__(self, weights):
         self.weights = weights
         self.whole = weights.strategies - 2
+        self.layout = Layout(
+            {
+                (node, field): type(value)
+                for node, fields in enumerate(self.init())
+                for field, value in enumerate(fields)
+            }
+        )
 
     def _fields(self, node):
         """A node's fields, those of the farthest one first. The kernel is negative where strategies
@@ -459,7 +470,7 @@ class LightState:
             )
 
         return [[type(x)(x) for x in nothing()] for _ in range(self.whole)] + [
-            [type(x)(x) for x in nothing()[:4]]
+            [type(x)(x) for x in nothing()[:FIELDS_OF_THE_LAST]]
         ]
 
     @staticmethod
@@ -480,45 +491,21 @@ class LightState:
         return result
 
     def words(self, state):
-        words = []
-        for fields in state:
-            for field in fields:
-                words += [float_bits(x) for x in (field if dr.depth_v(field) > 1 else [field])]
-        return words + [mi.UInt32(0)] * ((2 - len(words)) if len(words) <= 2 else -len(words) % 4)
+        values = [field for fields in state for field in fields]
+        return self.layout.flat(dict(zip(self.layout.fields, values)))
 
     def read(self, level, mis_words, index, active):
         """The vertices that photon `index`, merged at z_level, has passed: `Node`s, nearest first,
         as many as there are strategies beyond that level. Those that do not exist come after one
         that direct light ends."""
-        template = self.init()
-        count = len(self.words(template))
-        template = template[: self.whole + 1 - level]
-        template[-1] = template[-1][:4]
-        needed = sum(
-            dr.size_v(mi.Spectrum) if dr.depth_v(field) > 1 else 1
-            for fields in template
-            for field in fields
-        )
-        words = []
-        for part in range(-(-needed // 4)):
-            words += list(
-                dr.gather(
-                    mi.Vector2u if count == 2 else mi.Vector4u,
-                    mis_words,
-                    max(count // 4, 1) * index + part,
-                    active,
-                )
-            )
-        passed = []
-        for fields in template:
-            values = []
-            for field in fields:
-                size = dr.size_v(mi.Spectrum) if dr.depth_v(field) > 1 else 1
-                mine, words = words[:size], words[size:]
-                values.append(
-                    mi.Spectrum([bits_float(w) for w in mine])
-                    if dr.depth_v(field) > 1
-                    else bits_float(mine[0])
-                )
-            passed.append(self._node(*values))
-        return passed
+        last = self.whole - level
+        wanted = [
+            (node, field)
+            for node, field in self.layout.fields
+            if node < last or (node == last and field < FIELDS_OF_THE_LAST)
+        ]
+        record = self.layout.read(mis_words, index, active, wanted)
+        return [
+            self._node(*(record[place] for place in wanted if place[0] == node))
+            for node in range(last + 1)
+        ]

@@ -21,6 +21,8 @@ from __future__ import annotations
 
 from typing import Any, Protocol
 
+from ..core.records import Layout
+
 Array = Any
 State = list[Any]
 
@@ -121,7 +123,12 @@ class MergeState(Protocol):
 
 
 class LightState(Protocol):
-    """Sums of light sub-paths whose photons are gathered under weights."""
+    """Sums of light sub-paths whose photons are gathered under weights.
+
+    `layout`: the record that each photon has of them (`core.records`).
+    """
+
+    layout: Layout
 
     def init(self) -> State:
         """Before the first vertex."""
@@ -134,7 +141,7 @@ class LightState(Protocol):
         """After a smooth scattering into the local direction `wo`."""
 
     def words(self, state: State) -> list[Array]:
-        """32-bit words that are stored with a photon: two, or a multiple of four."""
+        """What is stored with a photon: the words of a record of the `layout`."""
 
     def read(self, level: int, mis_words: Array, index: Array, active: Array) -> Any:
         """What the words say about photons `index` that are merged at the vertex `level`."""

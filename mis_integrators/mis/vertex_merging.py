@@ -86,8 +86,9 @@ class ConnectionWeights:
         )
 
     def merged(self, camera, state, back_at_light, back_at_camera):
-        """Weight of merging a camera vertex with a light vertex of that `state` (arguments as of
-        `weigh` of `photons.merge.merge`)."""
+        """Weight of merging a camera vertex with a light vertex of that `state`. `back_at_light`,
+        `back_at_camera`: densities per projected solid angle with which the camera's side goes on
+        to the vertex before it, and the light's side to the camera's."""
         a_light = theory.nearer(*state, back_at_light, self.beta)
         a_camera = theory.nearer(camera["d_vcm"], camera["d_vc"], back_at_camera, self.beta)
         return theory.merge_weight(a_light, a_camera, self.eta, self.beta)

@@ -11,6 +11,7 @@ import mitsuba as mi
 from ..core.random import next_2d, streams
 from .camera_rays import sample_camera_ray
 from .roulette import russian_roulette
+from .setting import CameraPass, Limits, World
 
 Array = Any
 
@@ -64,31 +65,32 @@ def within_crop(film, splat):
     return dr.all((splat >= offset) & (splat < offset + size))
 
 
-def start_camera_paths(
-    sensor, seed, first, stride: int, n_paths: int, camera_paths: int, wavelength_sample
-):
-    """Camera rays of `n_paths` paths, numbers `first`, `first + stride`, ... of `film_samples`.
+def start_camera_paths(camera_pass: CameraPass):
+    """Camera rays of a pass.
 
     Returns `(path, active, rng, ray, weight, splat, aperture)`: the index of each, whether there is
     a path of that number, its random numbers, the ray and its weight, the position for splatting,
     and the sample that chose the point of the lens.
     """
-    path = dr.arange(mi.UInt32, n_paths)
-    number = path * stride + first
+    sensor, camera_paths = camera_pass.sensor, camera_pass.camera_paths
+    path = dr.arange(mi.UInt32, camera_pass.count)
+    number = path * camera_pass.stride + camera_pass.first
     active = number < film_sample_count(sensor) * camera_paths
-    rng = streams(number, seed)
+    rng = streams(number, camera_pass.seed)
     unit, splat = film_samples(sensor, number, camera_paths, rng)
     aperture = next_2d(rng) if sensor.needs_aperture_sample() else mi.Point2f(0.5)
     time = mi.Float(sensor.shutter_open())
     if sensor.shutter_open_time() > 0:
         time += rng.next_float32() * sensor.shutter_open_time()
-    ray, weight = sample_camera_ray(sensor, time, wavelength_sample, unit, aperture, active)
+    ray, weight = sample_camera_ray(
+        sensor, time, camera_pass.wavelength_sample, unit, aperture, active
+    )
     return path, active, rng, mi.Ray3f(ray), weight, splat, aperture
 
 
 def with_gaps(first, skip, n_paths: int, camera_paths: int):
-    """What `start_camera_paths`, with a `stride` of one, takes as `first` to leave out `skip`
-    numbers after each pixel's `camera_paths`."""
+    """What a `CameraPass` with a `stride` of one takes as `first` to leave out `skip` numbers after
+    each pixel's `camera_paths`."""
     return first + dr.arange(mi.UInt32, n_paths) // camera_paths * skip
 
 
@@ -157,43 +159,29 @@ class CameraVisitor(Protocol):
 
 
 @dr.syntax
-def trace_camera(
-    scene,
-    sensor,
-    integrator,
-    traits,
-    visitor,
-    seed,
-    first,
-    stride: int,
-    n_paths: int,
-    camera_paths: int,
-    wavelength_sample,
-    max_depth: int,
-    rr_depth: int,
-    hide_emitters: bool,
-):
-    """Traces `n_paths` camera paths, numbers `first`, `first + stride`, ... of `film_samples`, and
-    shows what they meet to the `visitor`, a `CameraVisitor`.
+def trace_camera(world: World, limits: Limits, camera_pass: CameraPass, visitor: CameraVisitor):
+    """Traces the camera paths of a pass and shows what they meet to the `visitor`.
 
     Returns `(radiance, alpha, splat position)` of each path.
     """
-    path, active, rng, ray, sensor_weight, splat, aperture = start_camera_paths(
-        sensor, seed, first, stride, n_paths, camera_paths, wavelength_sample
-    )
+    # What the loop reads must be plain variables: Dr.Jit would take a dataclass for its state.
+    scene, traits = world.scene, world.traits
+    max_depth, rr_depth = limits.max_depth, limits.rr_depth
+    hide_emitters = limits.hide_emitters
+    path, active, rng, ray, sensor_weight, splat, aperture = start_camera_paths(camera_pass)
     throughput = mi.Spectrum(sensor_weight)
     radiance = mi.Spectrum(0)
     depth = mi.UInt32(0)
     eta = mi.Float(1)
     context = mi.BSDFContext()
-    state = visitor.begin(n_paths, splat, aperture)
+    state = visitor.begin(camera_pass.count, splat, aperture)
     visible = mi.Bool((scene.environment() is not None) and not hide_emitters)
     if dr.hint(max_depth == 0, mode="scalar"):
         active &= False
 
     hit = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
     if dr.hint(hide_emitters, mode="scalar"):
-        hit, ray = behind_emitters(scene, integrator, hit, ray, active)
+        hit, ray = behind_emitters(scene, camera_pass.integrator, hit, ray, active)
 
     while dr.hint(active, label="camera sub-paths"):
         si = hit.compute_surface_interaction(ray, mi.RayFlags.All, active=active)

@@ -7,14 +7,17 @@ A vertex remembers the step that led to it, from the last vertex that scattered 
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import drjit as dr
 import mitsuba as mi
 
 from ..core.packing import Store
 from ..core.records import Layout
 from ..core.spectra import channel_mean
-from .camera import trace_camera, with_gaps, within_crop
+from .camera import trace_camera, within_crop
 from .sensor import Lens
+from .setting import CameraPass, Limits, World
 from .subpaths import NO_PARENT, keep_vertex, new_vertices, vertex_layout
 from .vertex import VertexBSDF, scattered_mean
 
@@ -103,14 +106,13 @@ class StepVisitor:
     vertex of whichever kind, and what `leave` returns.
     """
 
-    def __init__(
-        self, scene, sensor, lights, traits, soften, ratio, hide_emitters, capacity, hit_capacity
-    ):
-        self.scene, self.film, self.lights, self.traits = scene, sensor.film(), lights, traits
-        self.soften, self.ratio, self.lens = soften, ratio, Lens(sensor)
-        self.hide_emitters = hide_emitters
+    def __init__(self, world, limits, sensor, soften, ratio, capacity, hit_capacity):
+        self.scene, self.lights, self.traits = world.scene, world.lights, world.traits
+        self.film, self.lens = sensor.film(), Lens(sensor)
+        self.soften, self.ratio = soften, ratio
+        self.hide_emitters = limits.hide_emitters
         self.store = Store(
-            vertices=new_vertices(traits, capacity, STEP),
+            vertices=new_vertices(self.traits, capacity, STEP),
             room=dr.opaque(mi.UInt32, capacity),
             count=dr.zeros(mi.UInt32, 1),
             hits=hit_layout().room(hit_capacity),
@@ -163,19 +165,7 @@ class StepVisitor:
         at.vertex_bsdf = VertexBSDF.at(self.traits, si, at.bsdf, smooth)
         wanted = smooth & (dr.max(at.throughput) > 0)
         at.slot = keep_vertex(
-            self.store,
-            at.vertex_bsdf,
-            si,
-            at.hit,
-            at.towards,
-            at.throughput,
-            at.path,
-            at.depth,
-            number,
-            parent,
-            step,
-            STEP,
-            wanted,
+            self.store, at, at.throughput, number, parent, dict(zip(STEP, step)), wanted
         )
         number = dr.select(wanted, number + 1, number)
         return [number, parent, density, origin, left], mi.Spectrum(0)
@@ -191,27 +181,15 @@ class StepVisitor:
 
 
 def trace_camera_vertices(
-    scene,
-    sensor,
-    integrator,
-    lights,
-    traits,
+    world: World,
+    limits: Limits,
+    camera_pass: CameraPass,
     soften,
-    seed,
-    first,
-    skip,
-    n_paths: int,
-    camera_paths: int,
-    wavelength_sample,
     ratio,
-    max_depth: int,
-    rr_depth: int,
-    hide_emitters: bool,
     capacity: int,
     hit_capacity: int,
 ):
-    """Traces `n_paths` camera paths, numbers `first`, `first + 1`, ... of `film_samples`, but
-    without `skip` of them after each pixel's.
+    """Traces the camera paths of a pass.
 
     Returns `(radiance, alpha, splat position, vertices, count, hits, hit count)`: the light that
     the camera's rays meet at once; vertices as of `subpaths.new_vertices` with the fields of
@@ -223,52 +201,49 @@ def trace_camera_vertices(
     `soften.softened(geometry, squared)` may change the geometric term of a step that starts there,
     with its squared distance (infinite for environments).
     """
-    visitor = StepVisitor(
-        scene, sensor, lights, traits, soften, ratio, hide_emitters, capacity, hit_capacity
-    )
-    radiance, alpha, splat = trace_camera(
-        scene,
-        sensor,
-        integrator,
-        traits,
-        visitor,
-        seed,
-        with_gaps(first, skip, n_paths, camera_paths),
-        1,
-        n_paths,
-        camera_paths,
-        wavelength_sample,
-        max_depth,
-        rr_depth,
-        hide_emitters,
-    )
+    visitor = StepVisitor(world, limits, camera_pass.sensor, soften, ratio, capacity, hit_capacity)
+    radiance, alpha, splat = trace_camera(world, limits, camera_pass, visitor)
     store = visitor.store
     return radiance, alpha, splat, store.vertices, store.count, store.hits, store.hit_count
 
 
+@dataclass(frozen=True)
+class LightEnd:
+    """What the light's side of a joint path is at the camera's last vertex, or at the light that it
+    met.
+
+    `p_made` [1/m^2]: the density with which the light's side makes that; `strength`: flux, over the
+    density of that; `scattered`, `back`: BSDF there, and density per projected solid angle with
+    which the light's side goes on to the parent; `segments`: of the joint path.
+    """
+
+    p_made: mi.Float
+    strength: mi.Float
+    scattered: mi.Float
+    back: mi.Float
+    segments: mi.UInt32
+
+
 @dr.syntax
-def sum_before(
-    vertices, step, parent, p_made, strength, scattered, back, segments, weights, active
-):
+def sum_before(vertices, step, parent, end: LightEnd, weights, active):
     """Sum over the techniques nearer to the camera than the one at hand, of their samples times
     densities, over the density of the latter.
 
-    `step`, `parent`: those of the vertex, or hit, at the camera's end; `p_made` [1/m^2]: the
-    density with which the light's side makes it; `strength`: flux, over the density of that;
-    `scattered`, `back`: BSDF there, and density per projected solid angle with which the light's
-    side goes on to the parent; `segments`: of the joint path. `weights.gain(r, row, s, active)`:
-    what resampling makes of the technique that joins a light sub-path of s vertices, which sends r
-    = q*/p, to a vertex of that row. Joining to the sensor (the last step, without a parent) has the
-    gain one.
+    `step`, `parent`: those of the vertex, or hit, at the camera's end. `weights.gain(r, row, s,
+    active)`: what resampling makes of the technique that joins a light sub-path of s vertices,
+    which sends r = q*/p, to a vertex of that row. Joining to the sensor (the last step, without a
+    parent) has the gain one.
     """
     layout = vertex_layout(STEP)
     d_vcm, geometry, forward, back_there, scattered_there, row = (
         mi.Float(step[name]) for name in STEP
     )
     parent = mi.UInt32(parent)
-    ratio = mi.Float(p_made)
-    strength = mi.Float(strength)
-    scattered, back = mi.Float(scattered), mi.Float(back)
+    # What the loop reads must be plain variables: Dr.Jit would take a dataclass for its state.
+    segments = end.segments
+    ratio = mi.Float(end.p_made)
+    strength = mi.Float(end.strength)
+    scattered, back = mi.Float(end.scattered), mi.Float(end.back)
     active = mi.Bool(active)
     total = mi.Float(0)
     while dr.hint(active, label="techniques"):

@@ -8,6 +8,7 @@ every lane has one.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -17,8 +18,11 @@ from ..core.random import vertex_streams
 from ..core.recording import lanes
 from ..core.spectra import channel_mean
 from .sensor import unblocked, unblocked_by_visible
-from .subpaths import STATES, read_vertices, seen_normal, vertex_bsdf_of
+from .setting import Limits, World
+from .subpaths import STATES, Kept, read_vertices, seen_normal, vertex_bsdf_of
 from .vertex import SMALLEST_COSINE
+
+Array = Any
 
 
 @dataclass
@@ -72,19 +76,30 @@ def join(traits, camera, light, wavelengths, active):
     )
 
 
-def by_path(vertices, count, lengths, capacity: int):
-    """`(start, order)`: the kept vertices of sub-path i, in the order of their `number`, are at the
-    places `order[start[i]]`, `order[start[i] + 1]`, ..."""
+@dataclass(frozen=True)
+class ByPath:
+    """Kept `vertices` in the order of their paths: those of path i, `lengths[i]` of them, are at
+    the places `order[start[i]]`, `order[start[i] + 1]`, ..., in the order of their `number`."""
+
+    vertices: dict[str, Array]
+    start: mi.UInt32
+    order: mi.UInt32
+    lengths: mi.UInt32
+
+
+def by_path(light: Kept, lengths):
+    """`ByPath` of kept vertices of sub-paths that have so many each."""
     start = dr.prefix_sum(lengths)
     dr.eval(start)
-    index = dr.arange(mi.UInt32, capacity)
-    active = index < dr.gather(mi.UInt32, count, 0)
-    order = dr.zeros(mi.UInt32, capacity)
-    vertex = read_vertices(vertices, index, active, ("path", "number"))
+    index = dr.arange(mi.UInt32, light.capacity)
+    active = index < dr.gather(mi.UInt32, light.count, 0)
+    order = dr.zeros(mi.UInt32, light.capacity)
+    vertex = read_vertices(light.vertices, index, active, ("path", "number"))
     dr.scatter(
         order, index, dr.gather(mi.UInt32, start, vertex["path"], active) + vertex["number"], active
     )
-    return start, order
+    dr.eval(start, order)
+    return ByPath(light.vertices, start, order, lengths)
 
 
 LAMBERTIAN = (
@@ -105,19 +120,7 @@ LAMBERTIAN = (
 
 @dr.syntax
 def list_pairs(
-    traits,
-    weights,
-    camera,
-    camera_count,
-    camera_capacity: int,
-    light,
-    start,
-    order,
-    lengths,
-    max_depth: int,
-    capacity: int,
-    level,
-    seed,
+    traits, weights, camera: Kept, light: ByPath, max_depth: int, capacity: int, level, seed
 ):
     """Every camera vertex with every vertex of the light sub-path of its own number (modulo
     theirs), as far as `max_depth` lets them.
@@ -134,9 +137,11 @@ def list_pairs(
         room=dr.opaque(mi.UInt32, capacity),
         count=dr.zeros(mi.UInt32, 1),
     )
-    index = dr.arange(mi.UInt32, camera_capacity)
-    active = index < dr.gather(mi.UInt32, camera_count, 0)
-    z = read_vertices(camera, index, active, LAMBERTIAN)
+    # What the loop reads must be plain variables: Dr.Jit would take a dataclass for its state.
+    vertices, start, order, lengths = light.vertices, light.start, light.order, light.lengths
+    index = dr.arange(mi.UInt32, camera.capacity)
+    active = index < dr.gather(mi.UInt32, camera.count, 0)
+    z = read_vertices(camera.vertices, index, active, LAMBERTIAN)
     rng = vertex_streams(z["path"], z["number"], seed)
     level = dr.gather(mi.Float, level, z["path"], active)
     partner = z["path"] % dr.width(lengths)
@@ -145,7 +150,7 @@ def list_pairs(
 
     while dr.hint(left > 0, label="pairs"):
         vertex = dr.gather(mi.UInt32, order, place)
-        y = read_vertices(light, vertex, True, LAMBERTIAN)
+        y = read_vertices(vertices, vertex, True, LAMBERTIAN)
         keep = mi.Bool(True)
         if dr.hint(max_depth > 0, mode="scalar"):
             keep &= y["depth"] + z["depth"] + 1 <= max_depth
@@ -171,17 +176,7 @@ SLIGHT, LEAST_CHANCE = 0.2, 0.2
 are thinned out, at most to that share of them: the promise is one of cache points some way off."""
 
 
-def list_draws(
-    grid,
-    expected,
-    camera,
-    camera_count,
-    camera_capacity: int,
-    paths: int,
-    states,
-    capacity: int,
-    seed,
-):
+def list_draws(grid, expected, camera: Kept, paths: int, states, capacity: int, seed):
     """The camera vertices (of `paths` sub-paths, with `states`) that are to be joined to light
     vertices drawn for them.
 
@@ -190,10 +185,10 @@ def list_draws(
     `cumulative_sums`): what each cache point of the `CacheGrid` promises. Returns `(places, one
     over the probability of staying, count)`.
     """
-    index = lanes(camera_capacity)
-    active = index < dr.gather(mi.UInt32, camera_count, 0)
+    index = lanes(camera.capacity)
+    active = index < dr.gather(mi.UInt32, camera.count, 0)
     z = read_vertices(
-        camera,
+        camera.vertices,
         index,
         active,
         ("p", "path", "throughput", "density", "towards", "number", "value", "n"),
@@ -255,16 +250,18 @@ class LensConnection:
 
 
 def join_sensor(
-    scene, integrator, traits, lens, light, aperture, time, wavelengths, hide_emitters, active
+    world: World, limits: Limits, integrator, lens, light, aperture, wavelengths, active
 ):
-    """The `LensConnection` of light vertices (records as of `read_vertices`)."""
+    """The `LensConnection` of light vertices (records as of `read_vertices`). `integrator`: as of
+    `CameraPass`."""
+    scene, time = world.scene, mi.Float(lens.sensor.shutter_open())
     d, distance, film, density, active = lens.connect(light["p"], time, aperture, active)
-    vertex_bsdf = vertex_bsdf_of(traits, light, wavelengths, active)
+    vertex_bsdf = vertex_bsdf_of(world.traits, light, wavelengths, active)
     value, back, _ = vertex_bsdf.f_and_pdfs(d, light["towards"], active)
     leaving = dr.abs(dr.dot(light["n"], d))
     landing = dr.maximum(dr.abs(dr.dot(light["n"], light["towards"])), SMALLEST_COSINE)
     active = active & (dr.max(value) > 0)
-    if hide_emitters:
+    if limits.hide_emitters:
         active &= unblocked_by_visible(scene, integrator, light["p"], d, distance, active)
     else:
         active &= unblocked(scene, light["p"], light["n"], d, distance, active)

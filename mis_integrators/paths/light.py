@@ -11,6 +11,7 @@ import mitsuba as mi
 from ..core.random import next_2d, streams
 from ..core.traits import lookup
 from .roulette import russian_roulette
+from .setting import LightPass, Limits, World
 
 Array = Any
 
@@ -140,29 +141,22 @@ class LightVisitor(Protocol):
 
 
 @dr.syntax
-def trace_light(
-    scene,
-    lights,
-    traits,
-    visitor,
-    seed,
-    n_paths: int,
-    wavelengths,
-    shutter_open: float,
-    shutter_time: float,
-    max_depth: int,
-    rr_depth: int,
-):
-    """Traces `n_paths` light sub-paths and shows each surface that they meet to the `visitor`, a
-    `LightVisitor`, which stores what is to be kept.
+def trace_light(world: World, limits: Limits, light_pass: LightPass, visitor: LightVisitor):
+    """Traces the light sub-paths of a pass and shows each surface that they meet to the `visitor`,
+    which stores what is to be kept.
 
-    `max_depth` counts the segments of a whole path (0 or less: unlimited): a sub-path goes on only
-    where another segment and one to the camera fit. Shading normals: Veach 1997, section 5.3.
+    A sub-path goes on only where another segment and one to the camera fit into
+    `limits.max_depth`. Shading normals: Veach 1997, section 5.3.
     """
-    lanes = lane_count(n_paths)
+    # What the loop reads must be plain variables: Dr.Jit would take a dataclass for its state.
+    scene, lights, traits = world.scene, world.lights, world.traits
+    max_depth, rr_depth = limits.max_depth, limits.rr_depth
+    wavelengths = light_pass.wavelengths
+    shutter_open, shutter_time = light_pass.shutter_open, light_pass.shutter_time
+    lanes = lane_count(light_pass.count)
     lane = dr.arange(mi.UInt32, lanes)
-    rng = streams(lane, seed)
-    count, stride = dr.opaque(mi.UInt32, n_paths), dr.opaque(mi.UInt32, lanes)
+    rng = streams(lane, light_pass.seed)
+    count, stride = dr.opaque(mi.UInt32, light_pass.count), dr.opaque(mi.UInt32, lanes)
     next_path = mi.UInt32(lane)
     path = mi.UInt32(lane)
     ray = dr.zeros(mi.Ray3f, lanes)

@@ -11,6 +11,7 @@ from ..core.packing import Store
 from ..core.random import next_2d
 from .camera import start_camera_paths
 from .roulette import russian_roulette
+from .setting import CameraPass
 
 SMOOTH_VERTICES = 4
 """Smooth vertices that are told apart; later ones count with the last."""
@@ -21,9 +22,8 @@ def count_segments(scene, sensor, seed, stride: int, paths: int, max_depth: int,
     """Segments of BSDF-sampled camera paths that end as those of Mitsuba's `path` do: an array
     (`SMOOTH_VERTICES` + 1,), mean over `paths` paths, numbers 0, `stride`, ...; entry k counts the
     segments that follow k smooth vertices (the last entry: or more)."""
-    _, active, rng, ray, weight, _, _ = start_camera_paths(
-        sensor, seed, mi.UInt32(0), stride, paths, 1, mi.Float(0.5)
-    )
+    camera_pass = CameraPass(sensor, None, seed, mi.UInt32(0), paths, 1, mi.Float(0.5), stride)
+    _, active, rng, ray, weight, _, _ = start_camera_paths(camera_pass)
     throughput = mi.Spectrum(weight)
     eta = mi.Float(1)
     depth, vertex = mi.UInt32(0), mi.UInt32(0)

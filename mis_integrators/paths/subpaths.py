@@ -10,15 +10,21 @@ What weights must know of a sub-path travels with it as a state, a list of float
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
 
 from ..core.packing import Store
 from ..core.records import Layout
-from .camera import trace_camera, with_gaps, within_crop
+from .camera import trace_camera, within_crop
 from .light import trace_light
 from .sensor import Lens
+from .setting import CameraPass, LightPass, Limits, World
 from .vertex import VertexBSDF, scattered_mean
+
+Array = Any
 
 NO_PARENT = 0xFFFFFFFF
 STATES = ("d_vcm", "d_vc")
@@ -47,55 +53,60 @@ def vertex_layout(states=STATES):
     )
 
 
+def hit_record():
+    """The record of what a ray has met, apart from the other fields: few passes read it."""
+    return Layout({"hit": mi.PreliminaryIntersection3f})
+
+
+@dataclass(frozen=True)
+class Kept:
+    """Kept vertices: their buffer (`new_vertices`), how many there are (width one), and how many
+    there is room for."""
+
+    vertices: dict[str, Array]
+    count: Array
+    capacity: int
+
+
 def new_vertices(traits, capacity, states=STATES):
     """Room for `capacity` vertices, a dictionary: `words` (records of `vertex_layout`), `parent`
     (the place of the vertex before, or `NO_PARENT`), and where surfaces are not all Lambertian
-    `hit`, from which the surface interaction is made again. Only the places below the count are
-    valid."""
+    `hit` (records of `hit_record`), from which the surface interaction is made again. Only the
+    places below the count are valid."""
     buffer = {
         "words": vertex_layout(states).room(capacity),
         "parent": dr.empty(mi.UInt32, capacity),
     }
     if traits.has_rough:
-        buffer["hit"] = dr.empty(mi.PreliminaryIntersection3f, capacity)
+        buffer["hit"] = hit_record().room(capacity)
     return buffer
 
 
-def keep_vertex(
-    store,
-    vertex_bsdf,
-    si,
-    hit,
-    towards,
-    throughput,
-    path,
-    depth,
-    number,
-    parent,
-    state,
-    states,
-    keep,
-):
-    """Writes a vertex into the buffer; returns the place (valid if there was room for it)."""
+def keep_vertex(store, at, throughput, number, parent, state, keep):
+    """Writes the vertex at which sub-paths have arrived into the buffer; returns the place (valid
+    if there was room for it).
+
+    `at`: a `LightArrival` or `CameraArrival`, with the `vertex_bsdf` there; `state`: by name.
+    """
     slot = dr.scatter_inc(store.count, mi.UInt32(0), keep)
     keep = keep & (slot < store.room)
     values = {
-        "p": si.p,
-        "n": vertex_bsdf.n,
-        "ns": vertex_bsdf.ns,
-        "towards": towards,
+        "p": at.si.p,
+        "n": at.vertex_bsdf.n,
+        "ns": at.vertex_bsdf.ns,
+        "towards": at.towards,
         "throughput": throughput,
-        "value": vertex_bsdf.value,
-        "density": vertex_bsdf.density,
-        "path": path,
-        "depth": depth,
+        "value": at.vertex_bsdf.value,
+        "density": at.vertex_bsdf.density,
+        "path": at.path,
+        "depth": at.depth,
         "number": number,
-        **dict(zip(states, state)),
+        **state,
     }
-    vertex_layout(states).write(store.vertices["words"], values, slot, keep)
+    vertex_layout(tuple(state)).write(store.vertices["words"], values, slot, keep)
     dr.scatter(store.vertices["parent"], parent, slot, keep)
     if "hit" in store.vertices:
-        dr.scatter(store.vertices["hit"], hit, slot, keep)
+        hit_record().write(store.vertices["hit"], {"hit": at.hit}, slot, keep)
     return slot
 
 
@@ -103,9 +114,10 @@ def read_vertices(vertices, index, active, only=None, states=STATES):
     """The vertices at places `index`, a dictionary of all their fields (or those named in `only`);
     zero on inactive lanes."""
     record = vertex_layout(states).read(vertices["words"], index, active, only)
-    for name in ("parent", "hit"):
-        if name in vertices and (only is None or name in only):
-            record[name] = dr.gather(type(vertices[name]), vertices[name], index, active)
+    if "parent" in vertices and (only is None or "parent" in only):
+        record["parent"] = dr.gather(mi.UInt32, vertices["parent"], index, active)
+    if "hit" in vertices and (only is None or "hit" in only):
+        record |= hit_record().read(vertices["hit"], index, active)
     return record
 
 
@@ -176,19 +188,7 @@ class VertexVisitor:
         smooth = active & mi.has_flag(at.bsdf.flags(), mi.BSDFFlags.Smooth)
         at.vertex_bsdf = VertexBSDF.at(self.traits, si, at.bsdf, smooth)
         slot = keep_vertex(
-            self.store,
-            at.vertex_bsdf,
-            si,
-            at.hit,
-            at.towards,
-            at.flux,
-            at.path,
-            at.depth,
-            number,
-            parent,
-            sums,
-            weights.states,
-            smooth,
+            self.store, at, at.flux, number, parent, dict(zip(weights.states, sums)), smooth
         )
         number = dr.select(smooth, number + 1, number)
         dr.scatter(self.store.lengths, number, at.path, smooth)
@@ -205,39 +205,16 @@ class VertexVisitor:
 
 
 def trace_light_subpaths(
-    scene,
-    lights,
-    traits,
-    weights,
-    seed,
-    n_paths: int,
-    capacity: int,
-    wavelengths,
-    shutter_open: float,
-    shutter_time: float,
-    max_depth: int,
-    rr_depth: int,
+    world: World, limits: Limits, light_pass: LightPass, weights, capacity: int
 ):
-    """Traces `n_paths` light sub-paths.
+    """Traces the light sub-paths of a pass.
 
     Returns `(vertices, count, lengths)`: the kept vertices, how many there were (width one; more
     than `capacity`: the surplus is missing), and the number of kept vertices of each path.
     `throughput` is flux through the surface, for one sub-path.
     """
-    visitor = VertexVisitor(traits, weights, n_paths, capacity)
-    trace_light(
-        scene,
-        lights,
-        traits,
-        visitor,
-        seed,
-        n_paths,
-        wavelengths,
-        shutter_open,
-        shutter_time,
-        max_depth,
-        rr_depth,
-    )
+    visitor = VertexVisitor(world.traits, weights, light_pass.count, capacity)
+    trace_light(world, limits, light_pass, visitor)
     store = visitor.store
     return store.vertices, store.count, store.lengths
 
@@ -251,25 +228,14 @@ class CameraVertexVisitor:
     and the state of `weights`.
     """
 
-    def __init__(
-        self,
-        scene,
-        sensor,
-        lights,
-        traits,
-        weights,
-        max_depth,
-        hide_emitters,
-        capacity,
-        ledger,
-        shortest,
-    ):
-        self.scene, self.film, self.lights, self.traits = scene, sensor.film(), lights, traits
-        self.weights, self.ledger, self.lens = weights, ledger, Lens(sensor)
-        self.hide_emitters = hide_emitters
-        self.deepest = max_depth - shortest if max_depth > 0 else None
+    def __init__(self, world, limits, sensor, weights, capacity, ledger, shortest):
+        self.scene, self.lights, self.traits = world.scene, world.lights, world.traits
+        self.film, self.lens = sensor.film(), Lens(sensor)
+        self.weights, self.ledger = weights, ledger
+        self.hide_emitters = limits.hide_emitters
+        self.deepest = limits.max_depth - shortest if limits.max_depth > 0 else None
         self.store = Store(
-            vertices=new_vertices(traits, capacity, weights.states),
+            vertices=new_vertices(self.traits, capacity, weights.states),
             room=dr.opaque(mi.UInt32, capacity),
             count=dr.zeros(mi.UInt32, 1),
         )
@@ -327,19 +293,7 @@ class CameraVertexVisitor:
         if self.deepest is not None:
             wanted &= mi.Int32(at.depth) <= self.deepest
         slot = keep_vertex(
-            self.store,
-            at.vertex_bsdf,
-            si,
-            at.hit,
-            at.towards,
-            at.throughput,
-            at.path,
-            at.depth,
-            number,
-            parent,
-            sums,
-            weights.states,
-            wanted,
+            self.store, at, at.throughput, number, parent, dict(zip(weights.states, sums)), wanted
         )
         number = dr.select(wanted, number + 1, number)
         return [number, dr.select(wanted, slot, parent), density, origin, sums], direct
@@ -377,27 +331,15 @@ class CameraVertexVisitor:
 
 
 def trace_camera_subpaths(
-    scene,
-    sensor,
-    integrator,
-    lights,
-    traits,
+    world: World,
+    limits: Limits,
+    camera_pass: CameraPass,
     weights,
-    seed,
-    first,
-    skip,
-    n_paths: int,
-    camera_paths: int,
-    wavelength_sample,
-    max_depth: int,
-    rr_depth: int,
-    hide_emitters: bool,
     capacity: int,
     ledger=None,
     shortest: int = 2,
 ):
-    """Traces `n_paths` camera paths, numbers `first`, `first + 1`, ... of `film_samples`, but
-    without `skip` of them after each pixel's, with the light that they meet and that next-event
+    """Traces the camera paths of a pass, with the light that they meet and that next-event
     estimation finds at each smooth vertex, weighted.
 
     Returns `(radiance, alpha, splat position, vertices, count)`: the kept vertices are those that a
@@ -407,22 +349,7 @@ def trace_camera_subpaths(
     and the weight apart.
     """
     visitor = CameraVertexVisitor(
-        scene, sensor, lights, traits, weights, max_depth, hide_emitters, capacity, ledger, shortest
+        world, limits, camera_pass.sensor, weights, capacity, ledger, shortest
     )
-    radiance, alpha, splat = trace_camera(
-        scene,
-        sensor,
-        integrator,
-        traits,
-        visitor,
-        seed,
-        with_gaps(first, skip, n_paths, camera_paths),
-        1,
-        n_paths,
-        camera_paths,
-        wavelength_sample,
-        max_depth,
-        rr_depth,
-        hide_emitters,
-    )
+    radiance, alpha, splat = trace_camera(world, limits, camera_pass, visitor)
     return radiance, alpha, splat, visitor.store.vertices, visitor.store.count

@@ -30,8 +30,8 @@ OWN_STREAM = 0x70726F62
 @dr.syntax
 def covered_share(scene, vertices, radius, seed, active):
     """Estimated share, in [0.4, 1], of the disk of `radius` around each vertex that lies on surface
-    seen from just above the vertex and like its own (same tests as for photons). `vertices` as in
-    `new_vertex_buffer`; width as theirs."""
+    seen from just above the vertex and like its own (same tests as for photons). `vertices` as of
+    `read_queries`; width as theirs."""
     ray = mi.Ray3f(vertices["ray_o"], vertices["ray_d"])
     si = vertices["hit"].compute_surface_interaction(ray, mi.RayFlags.Minimal, active)
     normal = mi.Vector3f(dr.mulsign(si.n, -dr.dot(si.n, ray.d)))

@@ -1,15 +1,24 @@
-"""Density estimation: radiance that photons bring to stored camera vertices."""
+"""Density estimation: radiance that photons bring to camera vertices.
+
+Photons near a vertex count as if they had met it (Jensen 1996, Realistic image synthesis using
+photon mapping). One visit of them serves all plugins that merge; these differ in how a vertex
+scatters (`QueryVertices`, `KeptVertices`) and in the weight of each photon.
+"""
 
 from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
 
-from ..core.packing import unpack_depth, unpack_direction, unpack_normal
 from ..core.spectra import channel_mean
 from ..core.traits import lookup
-from ..photons.queries import LAST_VERTEX
-from .grid import for_each_photon, read_power
+from ..paths.subpaths import vertex_bsdf_of
+from .grid import for_each_photon
+from .photon import read_power
+from .queries import LAST_VERTEX
 
 SAME_SURFACE_COSINE = 0.7
 """Photons merge only with vertices whose geometric normals differ by less than 45 degrees."""
@@ -19,148 +28,206 @@ SAME_PLANE_COSINE_SQUARED = 0.9999
 LARGEST_COSINE_RATIO = 4.0
 """Bound on shading over geometric cosine of a photon's direction, which grazing light on smoothed
 meshes would exceed."""
+SMALLEST_COSINE = 1e-6
+
+
+@dataclass
+class Scattering:
+    """How vertices scatter the light of one photon each.
+
+    `towards`: direction to where the photon came from; `shading`: its shading cosine; `value`: BSDF
+    times that cosine, without what is in the vertices' `factor`; `f`: the BSDF [1/sr]; `p`: density
+    per projected solid angle with which a camera path goes on there; `back()`: the same of a light
+    sub-path that goes on to the vertex before.
+    """
+
+    towards: mi.Vector3f
+    shading: mi.Float
+    value: mi.Spectrum
+    f: mi.Spectrum
+    p: mi.Float
+    back: Callable[[], mi.Float]
+
+
+class QueryVertices:
+    """Vertices that wait for photons (fields as of `queries.read_queries`).
+
+    Lambertian ones scatter every photon alike, but for its cosine: their BSDF is evaluated once,
+    and in scenes that have no others none is evaluated for a photon.
+
+    `only_last`: the others take no photons; `scale` (a spectrum): a weight that all photons of a
+    vertex have.
+    """
+
+    def __init__(self, traits, record, wavelengths, only_last=False, scale=1):
+        throughput, depth = record["throughput"], record["depth"]
+        active = dr.max(throughput) > 0
+        if only_last:
+            active &= (depth & LAST_VERTEX) != 0
+        ray = mi.Ray3f(record["ray_o"], record["ray_d"], 0, wavelengths)
+        si = record["hit"].compute_surface_interaction(ray, mi.RayFlags.All, active)
+        self.traits, self.si, self.bsdf, self.active = traits, si, si.bsdf(), active
+        self.p, self.n, self.plane, self.depth = si.p, si.n, si.n, depth & (LAST_VERTEX - 1)
+        self.facing = mi.Frame3f.cos_theta(si.wi)
+        self.side = dr.dot(si.n, -ray.d)
+        self.factor = mi.Spectrum(throughput) * scale
+        self.lambertian, self.f, self.pdf = mi.Bool(True), mi.Spectrum(0), mi.Float(0)
+        if traits.has_rough:
+            self.lambertian = lookup(traits.lambertian, self.bsdf, mi.Bool, active)
+        if traits.has_lambertian:
+            upright = mi.Vector3f(0, 0, dr.select(self.facing > 0, mi.Float(1), mi.Float(-1)))
+            constant, self.pdf = self.bsdf.eval_pdf(
+                mi.BSDFContext(), si, upright, active & self.lambertian
+            )
+            self.f = mi.Spectrum(constant)
+            self.factor *= dr.select(self.lambertian, constant, 1)
+
+    def scatter(self, towards, weighted, active):
+        """The `Scattering` of light from `towards` (any length); if not `weighted`, its `f` and `p`
+        are none."""
+        if self.traits.has_rough:
+            towards = dr.normalize(towards)  # a Lambertian needs only the ratio of cosines
+        wo = self.si.to_local(towards)
+        value, f, p = mi.Spectrum(0), self.f, self.pdf
+        if self.traits.has_lambertian:
+            front = (wo.z * self.facing > 0) & (dr.dot(self.n, towards) * self.side > 0)
+            value = mi.Spectrum(dr.select(front & self.lambertian, dr.abs(wo.z), 0))
+        if self.traits.has_rough:
+            rough = active & ~self.lambertian
+            if weighted:
+                rough_value, pdf = self.bsdf.eval_pdf(mi.BSDFContext(), self.si, wo, rough)
+                scale = dr.rcp(dr.maximum(dr.abs(wo.z), SMALLEST_COSINE))
+                f = dr.select(self.lambertian, f, rough_value * scale)
+                p = dr.select(self.lambertian, p, pdf * scale)
+            else:
+                rough_value = self.bsdf.eval(mi.BSDFContext(), self.si, wo, rough)
+            value = dr.select(self.lambertian, value, rough_value)
+        return Scattering(
+            towards, dr.abs(wo.z), value, f, p, lambda: self._density_back(wo, active)
+        )
+
+    def _density_back(self, wo, active):
+        """Density per projected solid angle with which light from `wo` goes on to where the camera
+        path came from."""
+        if not self.traits.has_rough:
+            return self.pdf
+        view = mi.SurfaceInteraction3f(self.si)
+        view.wi = mi.Vector3f(wo)
+        context = mi.BSDFContext(mi.TransportMode.Importance)
+        pdf = self.bsdf.pdf(context, view, self.si.wi, active & ~self.lambertian)
+        pdf *= dr.rcp(dr.maximum(dr.abs(self.facing), SMALLEST_COSINE))
+        return dr.select(self.lambertian, self.pdf, pdf)
+
+
+class KeptVertices:
+    """Kept vertices of camera sub-paths (records as of `subpaths.read_vertices`)."""
+
+    plane = None
+
+    def __init__(self, traits, record, wavelengths, active):
+        self.bsdf = vertex_bsdf_of(traits, record, wavelengths, active)
+        self.p, self.n, self.depth = record["p"], record["n"], record["depth"]
+        self.towards, self.factor, self.active = record["towards"], record["throughput"], active
+
+    def scatter(self, towards, weighted, active):
+        """The `Scattering` of light from `towards` (any length)."""
+        towards = dr.normalize(towards)
+        value, p, back = self.bsdf.f_and_pdfs(self.towards, towards, active)
+        shading = dr.abs(dr.dot(self.bsdf.ns, towards))
+        f = value * dr.rcp(dr.maximum(shading, SMALLEST_COSINE))
+        return Scattering(towards, shading, value, f, p, lambda: back)
+
+
+def same_surface(landing, n):
+    """Whether photons landed on a surface like that of vertices with normals `n`."""
+    alike = dr.dot(landing.n, n)
+    return (alike > 0) & (dr.square(alike) > SAME_SURFACE_COSINE**2 * dr.squared_norm(landing.n))
+
+
+def within_disk(offset, distance_squared, n, radius):
+    """Whether photons, `offset` from vertices, lie within a radius and close to their plane."""
+    height = dr.abs(dr.dot(offset, n))
+    return (distance_squared < dr.square(radius)) & (height < SAME_SURFACE_OFFSET * radius)
+
+
+def landing_cosine(normal, scattering, plane):
+    """Geometric cosine of photons where they landed, bounded below; `normal`: the one stored there,
+    of any length. Where it is that of the `plane` through the vertex (None: unknown), but for its
+    rounding, the plane's cosine."""
+    towards = scattering.towards
+    length_squared = dr.squared_norm(normal)
+    cosine = dr.abs(dr.dot(normal, towards)) * dr.rsqrt(length_squared)
+    if plane is not None:
+        alike_squared = dr.square(dr.dot(normal, plane))
+        flat = alike_squared > SAME_PLANE_COSINE_SQUARED * length_squared
+        cosine = dr.select(flat, dr.abs(dr.dot(plane, towards)), cosine)
+    least = scattering.shading * (1 / LARGEST_COSINE_RATIO)
+    return dr.maximum(dr.maximum(cosine, least), SMALLEST_COSINE)
 
 
 def gather_photons(
-    traits,
-    photon_map,
-    vertices,
-    radii,
-    wavelengths,
-    light_path_count,
-    max_depth: int,
-    only_last: bool,
-    grey: bool = False,
-    weigh=None,
+    photon_map, vertices, radii, light_path_count, max_depth: int, weigh=None, grey: bool = False
 ):
-    """Radiance that the photons of `photon_map` bring to the camera paths of `vertices`, for each
-    radius of the list `radii` (ascending; each of width one, or one a vertex), from one visit of
-    the photons within the largest.
+    """Radiance that photons bring to camera paths, for each radius of a list, from one visit of
+    those within the largest.
 
-    Constant kernel on a disk: the sum over photons of f x flux, over (pi radius^2 x light
+    Constant kernel on a disk: the sum over photons of BSDF x flux, over (pi radius^2 x light
     sub-paths). Flux through the surface carries the geometric cosine where the photon landed,
     `path`'s scattering integral the shading one at the vertex, hence the ratio of the two.
-    `weigh(index, f, p, back, active)`, if given, is the weight (a spectrum) of photon `index` of
-    the map where the vertex scatters it with value f (a spectrum, without cosine) and a camera path
-    would go there with density p per projected solid angle; `back()` computes the density with
-    which a light sub-path would go on from there to the vertex before. Returns a list with a
-    `Spectrum` of the vertices' width for each radius, throughput included; with `grey` the mean
-    over its channels (fewer sums to keep for many radii).
+
+    Parameters
+    ----------
+    photon_map : PhotonMap
+    vertices : QueryVertices or KeptVertices
+    radii : ascending; each of width one, or one a vertex
+    light_path_count : light sub-paths that made the photons
+    max_depth : segments of a whole path (0 or less: unlimited)
+    weigh : None, or the weight of a photon, ``weigh(index, f, p, back, active)``, a spectrum or a
+        number: its index in the map, and what its `Scattering` says
+    grey : sums the mean over channels only (fewer sums to keep for many radii)
+
+    Returns
+    -------
+    For each radius a `Spectrum` (`grey`: a `Float`) of the vertices' width, throughput included.
     """
-    ray = mi.Ray3f(vertices["ray_o"], vertices["ray_d"], 0, wavelengths)
-    throughput, depth = vertices["throughput"], vertices["depth"]
-    active = dr.max(throughput) > 0
-    if only_last:
-        active &= (depth & LAST_VERTEX) != 0
-    depth = depth & (LAST_VERTEX - 1)
-    si = vertices["hit"].compute_surface_interaction(ray, mi.RayFlags.All, active)
-    bsdf = si.bsdf()
-    context = mi.BSDFContext()
-    facing = mi.Frame3f.cos_theta(si.wi)
-    lambertian = mi.Bool(True)
-    if traits.has_rough:
-        lambertian = lookup(traits.lambertian, bsdf, mi.Bool, active)
-    geometric_side = dr.dot(si.n, -ray.d)
-    factor = mi.Spectrum(throughput) * vertices.get("scale", 1)
-    lambert_f, lambert_p = mi.Spectrum(0), mi.Float(0)
-    if traits.has_lambertian:
-        upright = mi.Vector3f(0, 0, dr.select(facing > 0, mi.Float(1), mi.Float(-1)))
-        if weigh is None:
-            constant = bsdf.eval(context, si, upright, active & lambertian)
-        else:
-            constant, lambert_p = bsdf.eval_pdf(context, si, upright, active & lambertian)
-            lambert_f = mi.Spectrum(constant)
-        factor *= dr.select(lambertian, constant, 1)
 
-    def visit(index, record, offset, distance_squared, hit, totals):
-        normal = unpack_normal(record.w)
-        alike = dr.dot(normal, si.n)
-        hit &= (alike > 0) & (dr.square(alike) > SAME_SURFACE_COSINE**2 * dr.squared_norm(normal))
+    def visit(index, landing, offset, distance_squared, hit, totals):
+        hit &= same_surface(landing, vertices.n)
         if max_depth > 0:
-            hit &= unpack_depth(record.w) + depth <= max_depth
-        flux, packed = read_power(photon_map.power, index, hit)
-        towards = unpack_direction(packed)
-        if traits.has_rough:
-            towards = dr.normalize(towards)
-        wo = si.to_local(towards)  # a Lambertian needs only the ratio of its cosines
-        cosine = dr.dot(si.n, towards)
-        length_squared = dr.squared_norm(normal)
-        flat = (
-            dr.square(alike) > SAME_PLANE_COSINE_SQUARED * length_squared
-        )  # then without the stored normal's rounding
-        landing = dr.select(
-            flat, dr.abs(cosine), dr.abs(dr.dot(normal, towards)) * dr.rsqrt(length_squared)
-        )
-        landing = dr.maximum(dr.maximum(landing, dr.abs(wo.z) * (1 / LARGEST_COSINE_RATIO)), 1e-6)
-        value = mi.Spectrum(0)
-        if traits.has_lambertian:
-            front = (wo.z * facing > 0) & (cosine * geometric_side > 0)
-            value = mi.Spectrum(dr.select(front & lambertian, dr.abs(wo.z), 0))
-        if traits.has_rough and weigh is None:
-            value = dr.select(lambertian, value, bsdf.eval(context, si, wo, hit & ~lambertian))
-        if weigh is not None:
-            f, p = lambert_f, lambert_p
-            if traits.has_rough:
-                rough, pdf = bsdf.eval_pdf(context, si, wo, hit & ~lambertian)
-                scale = dr.rcp(dr.maximum(dr.abs(wo.z), 1e-6))
-                value = dr.select(lambertian, value, rough)
-                f, p = (
-                    dr.select(lambertian, lambert_f, rough * scale),
-                    dr.select(lambertian, lambert_p, pdf * scale),
-                )
-
-            def back():
-                if not traits.has_rough:
-                    return lambert_p
-                view = mi.SurfaceInteraction3f(si)
-                view.wi = mi.Vector3f(wo)
-                pdf = bsdf.pdf(
-                    mi.BSDFContext(mi.TransportMode.Importance), view, si.wi, hit & ~lambertian
-                )
-                return dr.select(
-                    lambertian, lambert_p, pdf * dr.rcp(dr.maximum(dr.abs(facing), 1e-6))
-                )
-
-            value *= dr.select(dr.max(value) > 0, weigh(index, f, p, back, hit), 0)
-        value *= flux * dr.rcp(landing)
+            hit &= landing.depth + vertices.depth <= max_depth
+        value = _contribution(photon_map, vertices, index, landing, weigh, hit)
         if grey:
-            value = channel_mean(value * factor)
-        height = dr.abs(dr.dot(offset, si.n))
-        return tuple(
-            total
-            + dr.select(
-                hit
-                & (distance_squared < dr.square(radius))
-                & (height < SAME_SURFACE_OFFSET * radius),
-                value,
-                0,
-            )
-            for total, radius in zip(totals, radii)
-        )
+            value = channel_mean(value * vertices.factor)
+        # The largest radius is tested again, too: without, kernels are slower by some per cent.
+        inside = [hit & within_disk(offset, distance_squared, vertices.n, r) for r in radii]
+        return tuple(total + dr.select(i, value, 0) for total, i in zip(totals, inside))
 
-    zero = mi.Float(0) if grey else mi.Spectrum(0)
-    totals = for_each_photon(
-        photon_map, si.p, radii[-1], active, visit, tuple(type(zero)(zero) for _ in radii)
-    )
+    zeros = tuple(mi.Float(0) if grey else mi.Spectrum(0) for _ in radii)
+    totals = for_each_photon(photon_map, vertices.p, radii[-1], vertices.active, visit, zeros)
+    factor = 1 if grey else vertices.factor
     return [
         dr.select(
-            active,
-            (total if grey else total * factor) / (dr.pi * dr.square(radius) * light_path_count),
-            0,
+            vertices.active, total * factor / (dr.pi * dr.square(radius) * light_path_count), 0
         )
         for total, radius in zip(totals, radii)
     ]
 
 
-def vertex_section(vertices, first, count: int):
-    """`count` vertices of a buffer, those from place `first` on."""
-    index = dr.arange(mi.UInt32, count) + first
-    return {name: dr.gather(type(values), values, index) for name, values in vertices.items()}
+def _contribution(photon_map, vertices, index, landing, weigh, active):
+    """What photons `index` bring: BSDF x flux x weight, over the cosine where they landed."""
+    flux, towards = read_power(photon_map.power, index, active)
+    scattering = vertices.scatter(towards, weigh is not None, active)
+    value = scattering.value
+    if weigh is not None:
+        lit = active & (dr.max(value) > 0)
+        weight = weigh(index, scattering.f, scattering.p, scattering.back, lit)
+        value *= dr.select(lit, weight, 0)
+    return value * flux * dr.rcp(landing_cosine(landing.n, scattering, vertices.plane))
 
 
 def mean_photon_count(photon_map, vertices, radius):
     """Photons within `radius` of a vertex, on average over the used vertices (a number; what a
-    gather costs)."""
+    gather costs). `vertices`: as of `read_queries`."""
     active = dr.max(vertices["throughput"]) > 0
     p = vertices["ray_o"] + vertices["ray_d"] * vertices["hit"].t
     (count,) = for_each_photon(
@@ -168,7 +235,7 @@ def mean_photon_count(photon_map, vertices, radius):
         p,
         radius,
         active,
-        lambda index, record, offset, distance_squared, hit, counts: (
+        lambda index, landing, offset, distance_squared, hit, counts: (
             counts[0] + dr.select(hit, mi.UInt32(1), 0),
         ),
         (mi.UInt32(0),),

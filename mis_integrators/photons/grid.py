@@ -12,8 +12,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from ..core.packing import bits_float, unpack_caustic
-from .trace import photon_words
+from .photon import landing_of, power_layout, read_landing, surface_layout
 
 RUN = 32
 """Photons of a row that a query tests at once: one bit of a word each."""
@@ -110,11 +109,11 @@ def build_photon_map(surface, power, count, bbox, cell, capacity: int, kind: str
     grid = Grid(bbox, cell, size)
     index = dr.arange(mi.UInt32, capacity)
     active = index < dr.gather(mi.UInt32, count, 0)
-    record = dr.gather(mi.Vector4u, surface, index, active)
+    record = surface_layout().read(surface, index, active)
+    landing = landing_of(record)
     if kind != "all":
-        active &= unpack_caustic(record.w) == (kind == "caustic")
-    p = mi.Point3f(bits_float(record.x), bits_float(record.y), bits_float(record.z))
-    coordinates = grid.coordinates(p)
+        active &= landing.caustic == (kind == "caustic")
+    coordinates = grid.coordinates(landing.p)
     slot = grid.row(coordinates.y, coordinates.z) + dr.minimum(
         mi.UInt32(coordinates.x), longest_row(size) - 4
     )
@@ -124,10 +123,9 @@ def build_photon_map(surface, power, count, bbox, cell, capacity: int, kind: str
     start = dr.prefix_sum(counts)
     dr.eval(start)
     target = dr.gather(mi.UInt32, start, slot, active) + rank
-    sorted_surface = dr.empty(mi.UInt32, 4 * capacity)
-    dr.scatter(sorted_surface, record, target, active)
-    words = photon_words()
-    sorted_power = _moved(power, words, capacity, index, target, active)
+    sorted_surface = surface_layout().room(capacity)
+    surface_layout().write(sorted_surface, record, target, active)
+    sorted_power = power_layout().move(power, index, target, active)
     place = None
     if mis_words is not None:
         place = dr.empty(mi.UInt32, capacity)
@@ -136,41 +134,8 @@ def build_photon_map(surface, power, count, bbox, cell, capacity: int, kind: str
     return PhotonMap(grid, start, sorted_surface, sorted_power, mis_words, place)
 
 
-def _moved(source, words, capacity, index, target, active):
-    """Records of `words` words (2, or a multiple of 4) copied from places `index` to places
-    `target`."""
-    result = dr.empty(mi.UInt32, words * capacity)
-    packet = mi.Vector2u if words == 2 else mi.Vector4u
-    parts = max(words // 4, 1)
-    for part in range(parts):
-        dr.scatter(
-            result,
-            dr.gather(packet, source, parts * index + part, active),
-            parts * target + part,
-            active,
-        )
-    return result
-
-
-def read_power(power, index, active):
-    """Flux (a `Spectrum`, for one light sub-path) and packed direction of the photons `index` of an
-    array of power records."""
-    words = photon_words()
-    if words == 2:
-        record = dr.gather(mi.Vector2u, power, index, active)
-        return mi.Spectrum(bits_float(record.x)), record.y
-    if words == 4:
-        record = dr.gather(mi.Vector4u, power, index, active)
-        return mi.Spectrum(
-            bits_float(record.x), bits_float(record.y), bits_float(record.z)
-        ), record.w
-    record = dr.gather(mi.Vector4u, power, 2 * index, active)
-    direction = dr.gather(mi.UInt32, power, 8 * index + 4, active)
-    return mi.Spectrum(*[bits_float(record[i]) for i in range(4)]), direction
-
-
 def for_each_photon(photon_map, p, radius, active, visit, state):
-    """Calls `visit(index, record, offset, distance_squared, hit, state) -> state` for photons
+    """Calls `visit(index, landing, offset, distance_squared, hit, state) -> state` for photons
     within `radius` of `p`.
 
     Lanes of a CPU's SIMD unit wait for one another in every loop, and two photons in three of the
@@ -178,84 +143,110 @@ def for_each_photon(photon_map, p, radius, active, visit, state):
     by row of cells, runs of up to `RUN` photons are tested for distance only; the hits of a run are
     kept as a word of bits. Once a lane keeps `KEPT_RUNS` runs with hits, or has seen all rows, the
     hits of all of these are visited. `hit` marks the lanes whose photon belongs to the row that has
-    been read (another one may share its place); `record` holds the photon's surface words, `offset`
-    is its position minus `p`. `state` is a tuple of Dr.Jit arrays.
+    been read (another one may share its place); `landing` is the photon's `Landing`, `offset` its
+    position minus `p`. `state` is a tuple of Dr.Jit arrays.
     """
-    grid = photon_map.grid
-    inverse = dr.rcp(grid.cell)
-    local = (p - grid.origin) * inverse
-    reach = radius * inverse * 1.0001
-    first_y, last_y = (
-        mi.Int32(dr.floor(local.y - reach)) + 2,
-        mi.Int32(dr.floor(local.y + reach)) + 2,
-    )
-    first_z, last_z = (
-        mi.Int32(dr.floor(local.z - reach)) + 2,
-        mi.Int32(dr.floor(local.z + reach)) + 2,
-    )
-    last_z = dr.select(active, last_z, first_z - 1)
-    radius_squared = dr.square(radius)
+    query = _Query(photon_map, p, radius, active)
 
-    def read(index):
-        record = dr.gather(mi.Vector4u, photon_map.surface, index)
-        position = mi.Point3f(bits_float(record.x), bits_float(record.y), bits_float(record.z))
-        return record, position, position - p
+    def meet(runs, state):
+        start, hits, row = runs[0]
+        index = start + dr.tzcnt(hits)
+        landing, offset = query.read(index)
+        own = query.row_of(landing.p) == row
+        state = visit(index, landing, offset, dr.squared_norm(offset), own, state)
+        hits &= hits - 1
+        return _chosen(hits == 0, [*runs[1:], _no_run()], [(start, hits, row), *runs[1:]]), state
 
-    def test(index, bit, hits):
-        _, _, offset = read(index)
-        return (
-            index + 1,
-            bit << 1,
-            hits | dr.select(dr.squared_norm(offset) < radius_squared, bit, 0),
+    def search_and_meet(place, state):
+        place, runs = dr.while_loop(
+            (place, [_no_run() for _ in range(KEPT_RUNS)]),
+            lambda place, runs: query.unfinished(place) & (runs[-1][1] == 0),
+            query.search,
+            label="rows",
         )
+        _, state = dr.while_loop(
+            (runs, state), lambda runs, state: runs[0][1] != 0, meet, label="photons met"
+        )
+        return place, state
 
-    def search(y, z, start, end, runs):
-        first, last = _photons_of_row(photon_map, y, z, local, reach)
+    return dr.while_loop(
+        (query.begin(), state),
+        lambda place, state: query.unfinished(place),
+        search_and_meet,
+        label="photons",
+    )[-1]
+
+
+class _Query:
+    """The rows of cells within `radius` of points `p`, one after the other.
+
+    A place among them is the row (y, z), and where in a row longer than a run the query has
+    stopped: the next photon and the row's end (0, 0 before the row).
+    """
+
+    def __init__(self, photon_map, p, radius, active):
+        self.photon_map, self.grid, self.p = photon_map, photon_map.grid, p
+        self.radius_squared = dr.square(radius)
+        inverse = dr.rcp(self.grid.cell)
+        self.local = (p - self.grid.origin) * inverse
+        self.reach = radius * inverse * 1.0001
+        self.first_y, self.last_y = self._cells(self.local.y)
+        self.first_z, self.last_z = self._cells(self.local.z)
+        self.last_z = dr.select(active, self.last_z, self.first_z - 1)
+
+    def _cells(self, center):
+        """First and last cell along an axis."""
+        first, last = dr.floor(center - self.reach), dr.floor(center + self.reach)
+        return mi.Int32(first) + 2, mi.Int32(last) + 2
+
+    def begin(self):
+        """The first place."""
+        return mi.Int32(self.first_y), mi.Int32(self.first_z), mi.UInt32(0), mi.UInt32(0)
+
+    def unfinished(self, place):
+        """Whether there are rows left."""
+        return place[1] <= self.last_z
+
+    def read(self, index):
+        """The `Landing` of photons `index`, and its offset from the points."""
+        landing = read_landing(self.photon_map.surface, index)
+        return landing, landing.p - self.p
+
+    def row_of(self, position):
+        """Number of the row in which photons lie."""
+        own = self.grid.coordinates(position)
+        return self.grid.row_number(own.y, own.z)
+
+    def search(self, place, runs):
+        """Tests one run of photons: the next place, and the kept runs with this one before them if
+        it has hits."""
+        y, z, start, end = place
+        first, last = _photons_of_row(self.photon_map, y, z, self.local, self.reach)
         on = start < end  # still in a row that is longer than a run
         start, end = dr.select(on, start, first), dr.select(on, end, last)
         until = dr.minimum(start + RUN, end)
+        run = start, self._hits(start, until), self.grid.row_number(y, z)
+        runs = _chosen(run[1] != 0, [run, *runs[:-1]], runs)
+        done, wrap = until >= end, y >= self.last_y
+        z = dr.select(done & wrap, z + 1, z)
+        y = dr.select(done, dr.select(wrap, self.first_y, y + 1), y)
+        return (y, z, dr.select(done, 0, until), dr.select(done, 0, end)), runs
+
+    def _hits(self, start, until):
+        """Which photons of a run lie within the radius: a bit each."""
+
+        def test(index, bit, hits):
+            _, offset = self.read(index)
+            hit = dr.squared_norm(offset) < self.radius_squared
+            return index + 1, bit << 1, hits | dr.select(hit, bit, 0)
+
         *_, hits = dr.while_loop(
             (mi.UInt32(start), mi.UInt32(1), mi.UInt32(0)),
             lambda index, bit, hits: index < until,
             test,
             label="photons tested",
         )
-        runs = _chosen(hits != 0, [(start, hits, grid.row_number(y, z)), *runs[:-1]], runs)
-        done, wrap = until >= end, y >= last_y
-        y, z = dr.select(done, dr.select(wrap, first_y, y + 1), y), dr.select(done & wrap, z + 1, z)
-        return y, z, dr.select(done, 0, until), dr.select(done, 0, end), runs
-
-    def meet(runs, state):
-        start, hits, row = runs[0]
-        index = start + dr.tzcnt(hits)
-        record, position, offset = read(index)
-        own = grid.coordinates(position)
-        state = visit(
-            index,
-            record,
-            offset,
-            dr.squared_norm(offset),
-            grid.row_number(own.y, own.z) == row,
-            state,
-        )
-        hits &= hits - 1
-        return _chosen(hits == 0, [*runs[1:], _no_run()], [(start, hits, row), *runs[1:]]), state
-
-    def search_and_meet(y, z, start, end, state):
-        runs = [_no_run() for _ in range(KEPT_RUNS)]
-        y, z, start, end, runs = dr.while_loop(
-            (y, z, start, end, runs),
-            lambda y, z, start, end, runs: (z <= last_z) & (runs[-1][1] == 0),
-            search,
-            label="rows",
-        )
-        _, state = dr.while_loop(
-            (runs, state), lambda runs, state: runs[0][1] != 0, meet, label="photons met"
-        )
-        return y, z, start, end, state
-
-    begin = mi.Int32(first_y), mi.Int32(first_z), mi.UInt32(0), mi.UInt32(0), state
-    return dr.while_loop(begin, lambda y, z, *_: z <= last_z, search_and_meet, label="photons")[-1]
+        return hits
 
 
 def _no_run():

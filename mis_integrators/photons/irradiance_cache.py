@@ -17,15 +17,12 @@ from ..core.packing import (
     float_bits,
     gather_words,
     rounded_up,
-    unpack_caustic,
-    unpack_depth,
-    unpack_direction,
-    unpack_normal,
 )
 from ..core.random import streams
 from ..core.spectra import channel_mean
 from .gather import SAME_SURFACE_COSINE
-from .grid import build_photon_map, for_each_photon, read_power, smallest_cell
+from .grid import build_photon_map, for_each_photon, smallest_cell
+from .photon import read_landing, read_power, surface_layout
 
 PHOTONS_A_CELL = 32
 GATHER_RADIUS = 2.0
@@ -89,29 +86,25 @@ class IrradianceCache:
         (empty in rgb and mono variants)."""
         self.origin, self.wavelengths = mi.Point3f(bounds.min), wavelengths
         self.words = 12 if colours() == 1 else 16
-        capacity = dr.width(surface) // 4
+        capacity = surface_layout().capacity(surface)
         index = dr.arange(mi.UInt32, capacity)
         stored = index < count
-        record = dr.gather(mi.Vector4u, surface, index, stored)
-        position = mi.Point3f(bits_float(record.x), bits_float(record.y), bits_float(record.z))
-        flux, packed = read_power(power, index, stored)
-        normal = unpack_normal(record.w)
-        normal = mi.Normal3f(
-            dr.normalize(dr.mulsign(normal, dr.dot(normal, unpack_direction(packed))))
-        )
-        straight = unpack_caustic(record.w)
+        landing = read_landing(surface, index, stored)
+        flux, towards = read_power(power, index, stored)
+        normal = mi.Normal3f(dr.normalize(dr.mulsign(landing.n, dr.dot(landing.n, towards))))
+        straight = landing.caustic
         flux_of = {
             kind: [_typical(dr.select(stored & mask, value, 0)) for value in self._channels(flux)]
             for kind, mask in (
                 ("indirect", ~straight),
-                ("caustic", straight & (unpack_depth(record.w) > 1)),
+                ("caustic", straight & (landing.depth > 1)),
             )
         }
         self.photon_flux = flux_of["indirect"] if any(flux_of["indirect"]) else flux_of["caustic"]
         self.caustic_flux = flux_of["caustic"]
         self.typical_flux = sum(self.photon_flux) / len(self.photon_flux)
-        place = self._choose_cells(position, normal, stored, int(count[0]), bounds)
-        self._sum_cells(position, normal, place, stored)
+        place = self._choose_cells(landing.p, normal, stored, int(count[0]), bounds)
+        self._sum_cells(landing.p, normal, place, stored)
         self.table = dr.zeros(mi.Float, self.words * (dr.width(self.center) + 1))
         self.mean, self.level = 0.0, dr.opaque(mi.Float, 0)
         if dr.width(self.center):
@@ -182,22 +175,21 @@ class IrradianceCache:
         facing = self.facing
         channels = colours()
 
-        def visit(index, record, offset, distance_squared, hit, totals):
-            flux, packed = read_power(photon_map.power, index, hit)
-            towards = dr.normalize(unpack_direction(packed))
-            normal = unpack_normal(record.w)
+        def visit(index, landing, offset, distance_squared, hit, totals):
+            flux, towards = read_power(photon_map.power, index, hit)
+            towards, normal = dr.normalize(towards), landing.n
             hit &= (dr.dot(towards, facing) > 0) & (
                 dr.square(dr.dot(normal, facing)) > SAME_SURFACE_COSINE**2 * dr.squared_norm(normal)
             )
-            straight = hit & unpack_caustic(record.w)
-            soon = hit & ~straight & (unpack_depth(record.w) <= 2)
+            straight = hit & landing.caustic
+            soon = hit & ~straight & (landing.depth <= 2)
             added = [
                 dr.select(kind, value, 0)
                 for kind in (straight, soon, hit & ~straight & ~soon)
                 for value in self._channels(flux)
             ]
             added += [dr.select(straight, channel_mean(flux) * x, 0) for x in towards]
-            added += [dr.select(straight & (unpack_depth(record.w) > 1), channel_mean(flux), 0)]
+            added += [dr.select(straight & (landing.depth > 1), channel_mean(flux), 0)]
             return tuple(old + new for old, new in zip(totals, added))
 
         totals = for_each_photon(

@@ -3,35 +3,81 @@ are to be gathered."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import drjit as dr
 import mitsuba as mi
 
 from ..core.packing import Store
+from ..core.recording import lanes
+from ..core.records import Layout
 from ..lights.lights import mis_power
 from ..paths.camera import trace_camera
+from ..paths.setting import CameraPass, Limits, World
+
+LAST_VERTEX = 1 << 31
+"""Bit of a vertex' depth that says that all photons are wanted there, else only caustic ones."""
+STATE = ("weights.0", "weights.1", "weights.2")
+"""What a vertex buffer calls the state of the weights."""
+
+
+def query_layout():
+    """Fields of a camera vertex that waits for photons: the ray that led to it and what it met,
+    from which the surface interaction is made again; the path's throughput up to it, its path's
+    number, and its depth in segments (with `LAST_VERTEX`)."""
+    return Layout(
+        {
+            "ray_o": mi.Point3f,
+            "path": mi.UInt32,
+            "ray_d": mi.Vector3f,
+            "depth": mi.UInt32,
+            "hit": mi.PreliminaryIntersection3f,
+            "throughput": mi.Spectrum,
+        }
+    )
+
+
+def weight_layout():
+    """Fields of the weights there: their `STATE`, and the weight of direct light, `share`."""
+    return Layout(dict.fromkeys((*STATE, "share"), mi.Spectrum))
 
 
 def new_vertex_buffer(capacity, weighted=False):
-    """Room for `capacity` camera vertices that wait for photons: what rebuilds the surface
-    interaction there, the path's throughput up to it, its path's number, and its depth in segments
-    with the top bit set where all photons are wanted (else only caustic ones); if `weighted`, the
-    state of the weights there. Unused places have throughput zero."""
-    extra = (
-        {name: dr.empty(mi.Spectrum, capacity) for name in (*STATE, "share")} if weighted else {}
-    )
-    return extra | {
-        "ray_o": dr.empty(mi.Point3f, capacity),
-        "ray_d": dr.empty(mi.Vector3f, capacity),
-        "hit": dr.empty(mi.PreliminaryIntersection3f, capacity),
-        "throughput": dr.zeros(mi.Spectrum, capacity),
-        "path": dr.empty(mi.UInt32, capacity),
-        "depth": dr.empty(mi.UInt32, capacity),
-    }
+    """Room for `capacity` camera vertices, a dictionary: `words` (records of `query_layout`; unused
+    ones are zero) and, if `weighted`, `weights` (records of `weight_layout`)."""
+    buffer = {"words": dr.zeros(mi.UInt32, query_layout().words * capacity)}
+    if weighted:
+        buffer["weights"] = weight_layout().room(capacity)
+    return buffer
 
 
-LAST_VERTEX = 1 << 31
-STATE = ("weights.0", "weights.1", "weights.2")
-"""What a vertex buffer calls the state of the weights."""
+def read_queries(vertices, first=0, count=None):
+    """The vertices of a buffer, or `count` of them from place `first` on: a dictionary of all
+    their fields. Unused places have throughput zero; their weights are anything."""
+    layout = query_layout()
+    index = lanes(layout.capacity(vertices["words"]) if count is None else count)
+    if count is not None:
+        index += first
+    record = layout.read(vertices["words"], index)
+    if "weights" in vertices:
+        record |= weight_layout().read(vertices["weights"], index)
+    return record
+
+
+@dataclass(frozen=True)
+class Queries:
+    """Where photons are asked for.
+
+    `bdd`: the last smooth camera vertex, counted from 0; `capacity`: vertices that there is room
+    for (under weights, in each section); `has_caustics`, `has_indirect`: kinds of photons that
+    there are; `one_vertex`: no path asks twice, and each owns the place of its number.
+    """
+
+    bdd: int
+    capacity: int
+    has_caustics: bool
+    has_indirect: bool
+    one_vertex: bool
 
 
 class QueryVisitor:
@@ -42,27 +88,14 @@ class QueryVisitor:
     there; and the state of `weights`.
     """
 
-    def __init__(
-        self,
-        scene,
-        lights,
-        traits,
-        bdd,
-        hide_emitters,
-        capacity,
-        has_caustics,
-        has_indirect,
-        one_vertex,
-        weights,
-    ):
-        self.scene, self.lights, self.traits, self.weights = scene, lights, traits, weights
-        self.bdd, self.hide_emitters, self.capacity = bdd, hide_emitters, capacity
-        self.has_caustics, self.has_indirect = has_caustics, has_indirect
-        self.one_vertex = one_vertex
-        self.sections = 1 if weights is None else bdd + 1
+    def __init__(self, world, limits, queries, weights):
+        self.scene, self.lights, self.traits = world.scene, world.lights, world.traits
+        self.hide_emitters, self.queries, self.weights = limits.hide_emitters, queries, weights
+        self.bdd = queries.bdd
+        self.sections = 1 if weights is None else self.bdd + 1
         self.by_light = weights is not None and weights.weighs_points_of_lights
         self.store = Store(
-            vertices=new_vertex_buffer(capacity * self.sections, weights is not None),
+            vertices=new_vertex_buffer(queries.capacity * self.sections, weights is not None),
             count=dr.zeros(mi.UInt32, self.sections),
         )
 
@@ -122,26 +155,26 @@ class QueryVisitor:
     def _ask_for_photons(self, state, at, rng, smooth):
         """Stores the vertices at which photons are to be gathered."""
         vertex, _, _, _, share_here, sums = state
-        weights, store = self.weights, self.store
+        weights, store, queries = self.weights, self.store, self.queries
         last = (vertex == self.bdd) | (weights is not None)
         wants = smooth & (dr.max(at.throughput) > 0)
         kept = mi.Float(1)
         if self.sections > 1:
             kept = weights.merge_probability(sums, share_here, vertex, at.ends)
             wants &= rng.next_float32(wants) < kept
-        if not self.has_caustics:
-            wants &= last & self.has_indirect
+        if not queries.has_caustics:
+            wants &= last & queries.has_indirect
         slot = mi.UInt32(at.path)
-        if not self.one_vertex:
+        if not queries.one_vertex:
             section = mi.UInt32(0)
             if weights is not None:
                 section = dr.select(at.ends, mi.UInt32(self.bdd), vertex)
             slot = dr.scatter_inc(store.count, section, wants)
-            wants &= slot < self.capacity
-            slot += section * self.capacity
-        if not self.capacity:
+            wants &= slot < queries.capacity
+            slot += section * queries.capacity
+        if not queries.capacity:
             return
-        values = {
+        query = {
             "ray_o": at.ray.o,
             "ray_d": at.ray.d,
             "hit": at.hit,
@@ -149,10 +182,10 @@ class QueryVisitor:
             "path": at.path,
             "depth": at.depth | dr.select(last, mi.UInt32(LAST_VERTEX), mi.UInt32(0)),
         }
+        query_layout().write(store.vertices["words"], query, slot, wants)
         if weights is not None:
-            values |= {**dict(zip(STATE, weights.stored(sums))), "share": share_here}
-        for name, value in values.items():
-            dr.scatter(store.vertices[name], value, slot, wants)
+            state = {**dict(zip(STATE, weights.stored(sums))), "share": share_here}
+            weight_layout().write(store.vertices["weights"], state, slot, wants)
 
     def leave(self, state, at, rng, bs, weight, delta, active):
         vertex, _, scatter_pdf, origin, share_here, sums = state
@@ -180,29 +213,9 @@ class QueryVisitor:
 
 
 def trace_camera_paths(
-    scene,
-    sensor,
-    integrator,
-    lights,
-    traits,
-    seed,
-    first,
-    stride: int,
-    n_paths: int,
-    camera_paths: int,
-    wavelength_sample,
-    bdd: int,
-    max_depth: int,
-    rr_depth: int,
-    hide_emitters: bool,
-    capacity: int,
-    has_caustics: bool,
-    has_indirect: bool,
-    one_vertex: bool,
-    weights=None,
+    world: World, limits: Limits, camera_pass: CameraPass, queries: Queries, weights=None
 ):
-    """Traces `n_paths` camera paths, numbers `first`, `first + stride`, ... of `film_samples`, to
-    their `bdd`-th smooth vertex.
+    """Traces the camera paths of a pass to their `queries.bdd`-th smooth vertex.
 
     On the way: emission seen directly or through delta surfaces; at every smooth vertex up to the
     `bdd`-th, direct light by next-event estimation combined with BSDF sampling (power heuristic).
@@ -212,39 +225,12 @@ def trace_camera_paths(
 
     Returns `(radiance, alpha, splat position, vertices, count)`: the vertices at which photons are
     to be gathered, as made by `new_vertex_buffer`, and how many wanted a place in it (width one).
-    With `one_vertex` each path owns the place of its number.
 
     With `weights` (a `mis.state.MergeState`) all photons are wanted at every smooth vertex, and
     direct light at each is weighted. The vertex buffer is then one section for each smooth vertex
     of the path, of `capacity` each (a path's last vertex in the last section), and `count` has one
     entry for each.
     """
-    visitor = QueryVisitor(
-        scene,
-        lights,
-        traits,
-        bdd,
-        hide_emitters,
-        capacity,
-        has_caustics,
-        has_indirect,
-        one_vertex,
-        weights,
-    )
-    radiance, alpha, splat = trace_camera(
-        scene,
-        sensor,
-        integrator,
-        traits,
-        visitor,
-        seed,
-        first,
-        stride,
-        n_paths,
-        camera_paths,
-        wavelength_sample,
-        max_depth,
-        rr_depth,
-        hide_emitters,
-    )
+    visitor = QueryVisitor(world, limits, queries, weights)
+    radiance, alpha, splat = trace_camera(world, limits, camera_pass, visitor)
     return radiance, alpha, splat, visitor.store.vertices, visitor.store.count

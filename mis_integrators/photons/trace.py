@@ -5,26 +5,11 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from ..core.packing import Store, float_bits, pack_direction, pack_surface
+from ..core.packing import Store
+from ..core.records import write_packets
 from ..paths.light import trace_light
-
-
-def photon_words():
-    """32-bit words of a photon's second record: its flux (one a channel or wavelength) and its
-    packed direction, padded to a power of two so that it moves in one packet."""
-    channels = dr.size_v(mi.Spectrum)
-    return {1: 2, 3: 4, 4: 8}[channels]
-
-
-def write_words(target, words, slot, active):
-    """Writes a record of 32-bit words, two or a multiple of four of them, to the place `slot`."""
-    if len(words) == 2:
-        dr.scatter(target, mi.Vector2u(words), slot, active)
-        return
-    packets = len(words) // 4
-    for part in range(packets):
-        packet = mi.Vector4u(words[4 * part : 4 * part + 4])
-        dr.scatter(target, packet, packets * slot + part, active)
+from ..paths.setting import LightPass, Limits, World
+from .photon import new_photons, write_photon
 
 
 class PhotonVisitor:
@@ -32,15 +17,15 @@ class PhotonVisitor:
 
     def __init__(self, capacity, keep_direct, light_state):
         self.keep_direct, self.light_state = keep_direct, light_state
+        surface, power = new_photons(capacity)
         self.store = Store(
-            surface=dr.empty(mi.UInt32, 4 * capacity),
-            power=dr.empty(mi.UInt32, photon_words() * capacity),
+            surface=surface,
+            power=power,
             room=dr.opaque(mi.UInt32, capacity),
             count=dr.zeros(mi.UInt32, 1),
         )
         if light_state is not None:
-            words = len(light_state.words(light_state.init()))
-            self.store.mis_words = dr.empty(mi.UInt32, words * capacity)
+            self.store.mis_words = light_state.layout.room(capacity)
 
     def blank(self, lanes):
         return self.begin([])
@@ -57,14 +42,17 @@ class PhotonVisitor:
         keep &= at.scattered | at.had_delta | self.keep_direct
         slot = dr.scatter_inc(store.count, mi.UInt32(0), keep)
         keep &= slot < store.room
-        position = [float_bits(x) for x in at.si.p]
-        surface = pack_surface(at.si.n, at.depth, ~at.scattered)
-        write_words(store.surface, [*position, surface], slot, keep)
-        power = [*(float_bits(x) for x in at.flux), pack_direction(at.towards)]
-        power += [mi.UInt32(0)] * (photon_words() - len(power))
-        write_words(store.power, power, slot, keep)
+        photon = {
+            "p": at.si.p,
+            "n": at.si.n,
+            "towards": at.towards,
+            "flux": at.flux,
+            "depth": at.depth,
+            "caustic": ~at.scattered,
+        }
+        write_photon(store.surface, store.power, slot, photon, keep)
         if self.light_state is not None:
-            write_words(store.mis_words, self.light_state.words(state), slot, keep)
+            write_packets(store.mis_words, self.light_state.words(state), slot, keep)
         return state
 
     def leave(self, state, at, wo, delta, active):
@@ -74,53 +62,32 @@ class PhotonVisitor:
 
 
 def trace_light_paths(
-    scene,
-    lights,
-    traits,
-    seed,
-    n_paths: int,
+    world: World,
+    limits: Limits,
+    light_pass: LightPass,
     capacity: int,
-    wavelengths,
-    shutter_open: float,
-    shutter_time: float,
-    max_depth: int,
-    rr_depth: int,
     keep_direct: bool = False,
     light_state=None,
 ):
-    """Traces `n_paths` light sub-paths and stores photons on surfaces that scatter smoothly.
+    """Traces the light sub-paths of a pass and stores photons on surfaces that scatter smoothly.
 
     Stored are photons of two or more segments that have scattered smoothly at least once
     ("indirect"), and photons that have met only delta surfaces on the way from the emitter
     ("caustic"); a photon's first smooth vertex straight from the emitter is next-event estimation's
-    business and is stored with `keep_direct` only (of kind "caustic"). `max_depth` counts the
-    segments of a whole path (0 or less: unlimited); a photon's own depth is its number of segments
-    from the emitter.
+    business and is stored with `keep_direct` only (of kind "caustic"). A photon's depth is its
+    number of segments from the emitter.
 
-    Returns `(surface, power, count)`: uint32 arrays with four words a photon (position's bits;
-    normal, depth and kind packed) and `photon_words()` words a photon (bits of the flux that one
-    sub-path carries, packed direction to where it came from), in no particular order, and the
-    number of photons, of width one. If it exceeds `capacity` the surplus is missing: repeat the
-    pass with more room. Shading normals: Veach 1997, section 5.3 (adjoint factor); where maps
-    perturb normals inside BSDFs, these are evaluated from the camera's side instead.
+    Returns `(surface, power, count)`: the records of `photon.surface_layout` and `power_layout`, in
+    no particular order, and the number of photons, of width one. If it exceeds `capacity` the
+    surplus is missing: repeat the pass with more room. Shading normals: Veach 1997, section 5.3
+    (adjoint factor); where maps perturb normals inside BSDFs, these are evaluated from the camera's
+    side instead.
 
-    With a `light_state` (a `mis.state.LightState`) the result has a fourth array: the words that it
-    stores with each photon.
+    With a `light_state` (a `mis.state.LightState`) the result has a fourth array: records of its
+    `layout`.
     """
     visitor = PhotonVisitor(capacity, keep_direct, light_state)
-    trace_light(
-        scene,
-        lights,
-        traits,
-        visitor,
-        seed,
-        n_paths,
-        wavelengths,
-        shutter_open,
-        shutter_time,
-        max_depth,
-        rr_depth,
-    )
+    trace_light(world, limits, light_pass, visitor)
     store = visitor.store
     photons = store.surface, store.power, store.count
     return photons if light_state is None else (*photons, store.mis_words)

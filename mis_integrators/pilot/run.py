@@ -16,7 +16,9 @@ import numpy as np
 from ..core.recording import lanes
 from ..core.spectra import channel_mean
 from ..paths.camera import film_sample_count, film_size
+from ..paths.setting import CameraPass
 from ..photons.gather import mean_photon_count
+from ..photons.queries import read_queries
 from .radius import (
     LARGEST_SHARE,
     Expected,
@@ -261,13 +263,16 @@ class Pilot:
         ) % 2**32  # from a copy's path after the last pixel to the next copy's of the first one
         self._camera = session.recorded(
             lambda scene, sensor, tables, seed, spectral: session._trace_camera(
-                scene,
-                sensor,
-                seed,
-                lanes(self.paths) // self.pixels * back,
-                self.stride,
-                self.paths,
-                self.pilot_camera_paths,
+                CameraPass(
+                    sensor,
+                    session.integrator,
+                    seed,
+                    lanes(self.paths) // self.pixels * back,
+                    self.paths,
+                    self.pilot_camera_paths,
+                    spectral["sample"],
+                    self.stride,
+                ),
                 capacity,
                 spectral,
             )
@@ -337,8 +342,9 @@ class Pilot:
     def _prepare(self, photons, vertices):
         """Sets the ladder and counts photons; false if no camera path meets a surface that
         gathers."""
-        points = vertices["ray_o"] + vertices["ray_d"] * vertices["hit"].t
-        self.ladder = ladder(np.array(points), np.array(dr.max(vertices["throughput"])))
+        seen = read_queries(vertices)
+        points = seen["ray_o"] + seen["ray_d"] * seen["hit"].t
+        self.ladder = ladder(np.array(points), np.array(dr.max(seen["throughput"])))
         if self.ladder is None:
             return False
         self._count(photons, vertices)
@@ -355,7 +361,7 @@ class Pilot:
         radius = dr.opaque(mi.Float, float(self.ladder[-1]))
         for kind in self.ways:
             photon_map = self.session._map(photons, kind, radius)
-            self.photons[kind] = mean_photon_count(photon_map, vertices, radius)
+            self.photons[kind] = mean_photon_count(photon_map, read_queries(vertices), radius)
 
     def _cost(self, kind, corrected, radius, camera_paths):
         gather = GATHER_COST * self.gathered(kind, radius) + PROBE_COST * corrected

@@ -11,7 +11,7 @@ from mis_integrators.core.traits import SceneTraits
 from mis_integrators.lights.environment_guide import EnvironmentGuide
 from mis_integrators.lights.lights import Lights
 from mis_integrators.mis.heuristic import HeuristicWeights
-from mis_integrators.photons.gather import gather_photons
+from mis_integrators.photons.gather import QueryVertices, gather_photons
 from mis_integrators.photons.grid import build_photon_map
 from mis_integrators.photons.queries import LAST_VERTEX, STATE
 from mis_integrators.weights.heuristics import heuristic_weights
@@ -200,14 +200,11 @@ class JointPaths:
         brought = []
         for weigh in (weights.weigher(kind, level, vertices, photon_map), None):
             (radiance,) = gather_photons(
-                self.traits,
                 photon_map,
-                vertices,
+                QueryVertices(self.traits, vertices, [], True),
                 [dr.opaque(mi.Float, self.MERGE_RADIUS)],
-                [],
                 1,
                 -1,
-                True,
                 weigh=weigh,
             )
             brought.append(dr.mean(radiance))

@@ -15,6 +15,7 @@ from mis_integrators.lights.lights import Lights
 from mis_integrators.mis.vertex_merging import ConnectionWeights
 from mis_integrators.paths.connect import join, join_sensor
 from mis_integrators.paths.sensor import Lens
+from mis_integrators.paths.setting import CameraPass, LightPass, Limits, World
 from mis_integrators.paths.subpaths import (
     NO_PARENT,
     read_vertices,
@@ -23,7 +24,8 @@ from mis_integrators.paths.subpaths import (
     vertex_layout,
 )
 from mis_integrators.paths.vertex import VertexBSDF
-from mis_integrators.photons.merge import merge, vertex_map
+from mis_integrators.photons.gather import KeptVertices, gather_photons
+from mis_integrators.photons.vertex_map import state_of, vertex_map
 
 import drjit as dr
 import mitsuba as mi
@@ -268,15 +270,13 @@ class JointPaths:
             )
         y = self.record(0, "light", light[0])
         seen = join_sensor(
-            self.scene,
+            World(self.scene, self.lights, self.traits),
+            Limits(-1, 5),
             None,
-            self.traits,
             self.lens,
             y,
             self.aperture,
-            mi.Float(0),
             [],
-            False,
             self.valid,
         )
         self.valid &= seen.active | mi.Bool(delta[0])
@@ -312,9 +312,18 @@ class JointPaths:
             {"words": words}, mi.UInt32(self.COUNT), self.COUNT, self.traits.bounds, mi.Float(0.01)
         )
         brought = []
-        for weigh in (lambda *args: weights.merged(z, *args), lambda *args: mi.Float(1)):
-            radiance = merge(
-                self.traits, photons, z, dr.opaque(mi.Float, 1e-4), [], 1, -1, weigh, self.valid
+
+        def merged(index, f, p, back, active):
+            return weights.merged(z, state_of(photons, index, active), p, back())
+
+        for weigh in (merged, None):
+            (radiance,) = gather_photons(
+                photons,
+                KeptVertices(self.traits, z, [], self.valid),
+                [dr.opaque(mi.Float, 1e-4)],
+                1,
+                -1,
+                weigh,
             )
             brought.append(np.array(dr.mean(radiance)))
         self.valid &= mi.Bool(brought[1] > 0)
@@ -356,27 +365,17 @@ def test_states_of_traced_subpaths(rgb, kind):
     scene, beta = room("rough", "area"), 2
     traits, lights, sensor = SceneTraits(scene), Lights(scene), scene.sensors()[0]
     weights, count, capacity = ConnectionWeights(lights, beta, 1.3), 300, 4000
+    world = World(scene, lights, traits)
     if kind == "light":
         vertices, found, _ = trace_light_subpaths(
-            scene, lights, traits, weights, mi.UInt32(3), count, capacity, [], 0.0, 0.0, 6, 50
+            world, Limits(6, 50), LightPass(mi.UInt32(3), count, []), weights, capacity
         )
     else:
         *_, vertices, found = trace_camera_subpaths(
-            scene,
-            sensor,
-            None,
-            lights,
-            traits,
+            world,
+            Limits(6, 50),
+            CameraPass(sensor, None, mi.UInt32(3), mi.UInt32(0), 64, 1, 0.5),
             weights,
-            mi.UInt32(3),
-            mi.UInt32(0),
-            mi.UInt32(0),
-            64,
-            1,
-            0.5,
-            6,
-            50,
-            False,
             capacity,
         )
     dr.eval(vertices, found)

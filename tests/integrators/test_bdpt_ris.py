@@ -9,6 +9,7 @@ from pathlib import Path
 
 from mis_integrators.paths.camera_vertices import (
     STEP,
+    LightEnd,
     leave,
     not_left,
     step_to_hit,
@@ -16,8 +17,11 @@ from mis_integrators.paths.camera_vertices import (
     sum_before,
 )
 from mis_integrators.paths.connect import join_sensor
+from mis_integrators.paths.setting import Limits, World
 from mis_integrators.paths.subpaths import (
     NO_PARENT,
+    Kept,
+    hit_record,
     new_vertices,
     read_vertices,
     vertex_bsdf_of,
@@ -92,7 +96,7 @@ class ResampledPaths(JointPaths):
         vertex_layout(states).write(buffer["words"], values, slot, self.valid)
         dr.scatter(buffer["parent"], parent, slot, self.valid)
         if "hit" in buffer:
-            dr.scatter(buffer["hit"], mi.PreliminaryIntersection3f(hit), slot, self.valid)
+            hit_record().write(buffer["hit"], {"hit": hit}, slot, self.valid)
         dr.eval(buffer)
         return slot
 
@@ -196,11 +200,13 @@ class ResampledPaths(JointPaths):
             camera,
             hit,
             parent,
-            hit["start"],
-            hit["light_mean"],
-            mi.Float(1),
-            hit["across"],
-            mi.UInt32(self.length + 1),
+            LightEnd(
+                hit["start"],
+                hit["light_mean"],
+                mi.Float(1),
+                hit["across"],
+                mi.UInt32(self.length + 1),
+            ),
             weights,
             self.valid,
         )
@@ -245,15 +251,13 @@ class ResampledPaths(JointPaths):
             result[self.length - z] = np.array(share) * ~blocked
         y = read_vertices(light, light_slots[0], self.valid, states=END)
         seen = join_sensor(
-            self.scene,
+            World(self.scene, self.lights, self.traits),
+            Limits(-1, 5),
             None,
-            self.traits,
             self.lens,
             y,
             self.aperture,
-            mi.Float(0),
             [],
-            False,
             self.valid,
         )
         self.valid &= seen.active | mi.Bool(delta[0])
@@ -598,9 +602,7 @@ def test_slight_vertices_are_thinned_out(rgb):
         places, factor, found = list_draws(
             session.grid,
             pmfs[2],
-            camera,
-            count,
-            session.capacity["camera"],
+            Kept(camera, count, session.capacity["camera"]),
             session.chunk,
             STEP,
             session.capacity["camera"],

@@ -10,6 +10,7 @@ from mis_integrators.lights.environment_guide import (
 )
 from mis_integrators.lights.lights import Lights, _mean_power, mis_power
 from mis_integrators.photons import grid as photon_map
+from mis_integrators.photons.photon import read_power
 
 import drjit as dr
 import mitsuba as mi
@@ -73,7 +74,7 @@ def query_counts(photons, queries, radii, cell, capacity=None, low=None, high=No
 
     def visit(index, record, offset, distance_squared, hit, state):
         number, total = state
-        flux, _ = photon_map.read_power(built.power, index, hit)
+        flux, _ = read_power(built.power, index, hit)
         return number + dr.select(hit, mi.UInt32(1), 0), total + dr.select(hit, flux[0], 0)
 
     m = len(queries)

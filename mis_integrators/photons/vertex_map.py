@@ -1,0 +1,47 @@
+"""Photon maps of kept vertices: light sub-paths that are joined can be merged, too."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from ..core.records import Layout
+from ..paths.subpaths import STATES, read_vertices
+from .grid import build_photon_map
+from .photon import new_photons, write_photon
+
+
+def state_layout():
+    """What such photons have of the weights: the state of their vertex."""
+    return Layout(dict.fromkeys(STATES, mi.Float))
+
+
+def vertex_map(vertices, count, capacity: int, bounds, cell):
+    """A `PhotonMap` of all kept light vertices; its mis_words are records of `state_layout`.
+    Arguments as of `build_photon_map`."""
+    index = dr.arange(mi.UInt32, capacity)
+    active = index < dr.gather(mi.UInt32, count, 0)
+    fields = ("p", "n", "depth", "towards", "throughput", *STATES)
+    y = read_vertices(vertices, index, active, fields)
+    upright = mi.Vector3f(0, 0, 1)  # other places hold no unit vectors
+    photon = {
+        "p": y["p"],
+        "n": dr.select(active, y["n"], upright),
+        "towards": dr.select(active, y["towards"], upright),
+        "flux": y["throughput"],
+        "depth": y["depth"],
+        "caustic": mi.Bool(False),
+    }
+    surface, power = new_photons(capacity)
+    mis_words = state_layout().room(capacity)
+    write_photon(surface, power, index, photon, active)
+    state_layout().write(mis_words, y, index, active)
+    dr.eval(surface, power, mis_words)
+    return build_photon_map(surface, power, count, bounds, cell, capacity, "all", mis_words)
+
+
+def state_of(photon_map, index, active):
+    """The weights' state of photons `index` of a `vertex_map`, a list."""
+    place = photon_map.place_of_mis_words(index, active)
+    record = state_layout().read(photon_map.mis_words, place, active)
+    return [record[name] for name in STATES]
