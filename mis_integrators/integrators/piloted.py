@@ -20,8 +20,6 @@ LIKE_A_PILOT = 1.5
 """What an iteration takes, in seconds of one of the pilot, until it is measured."""
 TOO_SLOW = 1.5
 """An iteration that takes so many times the guess is not believed to be typical."""
-LONG = 16
-"""Iterations that a render must have time for, lest several camera paths not be worth trying."""
 
 
 class PilotedSession(IterativeSession):
@@ -131,34 +129,23 @@ class PilotedSession(IterativeSession):
 
     def _choose_by_clock(self, pilot):
         """Chooses for a guess of how many iterations there is time for, measures what one takes
-        with that choice, and chooses again."""
+        with that choice, and chooses again. Where several camera paths a pixel may pay, what they
+        cost is measured, too."""
         guess = LIKE_A_PILOT * pilot.seconds
         left = max(self.begun + self.seconds - time.perf_counter(), guess)
-        first = pilot.choose(left / guess)
+        camera_paths, camera_share = self.camera_paths, CAMERA_SHARE
+        first = pilot.choose(left / guess, camera_paths, camera_share)
         self._take(first)
         seconds, spent = self._time_first_iterations(guess, left)
-        count = max(left / seconds * pilot.cost(first, first.camera_paths), 1)
-        camera_paths, camera_share = first.camera_paths, CAMERA_SHARE
-        if pilot.setting.chooses_camera_paths and left / seconds > LONG:
-            camera_paths, camera_share, more = self._choose_camera_paths(
-                pilot, first, seconds, count, left
-            )
+        count = max(left / seconds * pilot.cost(first, camera_paths), 1)
+        if pilot.two_camera_paths_may_pay(count, left / seconds):
+            self._take(replace(first, camera_paths=2))
+            of_two, more = self._time_first_iterations(2 * seconds, left)
             spent += more
-        self._take(
-            pilot.choose(count, camera_paths, camera_share, first, reluctance=min(spent / left, 1))
-        )
-
-    def _choose_camera_paths(self, pilot, first, seconds, count, left):
-        """How many camera paths each pixel should have in an iteration, where one takes so many
-        `seconds` and there is time for `count` of them, what share of an iteration's cost a camera
-        path has, and the seconds that this took. The cost is measured where more camera paths may
-        pay."""
-        if not pilot.two_camera_paths_may_pay(count):
-            return first.camera_paths, CAMERA_SHARE, 0.0
-        self._take(replace(first, camera_paths=2))
-        of_two, spent = self._time_first_iterations(2 * seconds, left)
-        camera_share = pilot.camera_share(first, of_two / seconds)
-        return pilot.best_camera_paths(count, camera_share), camera_share, spent
+            camera_share = pilot.camera_share(first, of_two / seconds)
+            camera_paths = pilot.best_camera_paths(count, camera_share)
+        reluctance = min(spent / left, 1)
+        self._take(pilot.choose(count, camera_paths, camera_share, first, reluctance))
 
     def _take(self, choice: Choice):
         """Renders with this choice from now on. What was rendered with another is no longer

@@ -20,6 +20,8 @@ from .setting import PilotPixels, PilotSetting, neighbourhoods
 
 NUMBERS_OF_PATHS = (1, 2, 4, 8)
 """Camera paths a pixel and iteration that are considered."""
+LONG = 16
+"""Iterations that a render must have time for, lest several camera paths not be worth trying."""
 WORTH_TRYING = 0.92
 """Two camera paths are tried where the best number is expected to make the error smaller by this
 factor, if a camera path costs the least that it may."""
@@ -201,9 +203,10 @@ class PilotResult:
             default=1.0,
         )
 
-    def two_camera_paths_may_pay(self, count: float) -> bool:
-        """Whether it is worth while to measure what a second camera path a pixel costs."""
-        if not self.errors:
+    def two_camera_paths_may_pay(self, count: float, iterations: float) -> bool:
+        """Whether it is worth while to measure what a second camera path a pixel costs, where there
+        is time for `count` iterations of usual cost, and for so many like the first."""
+        if not self.errors or not self.setting.chooses_camera_paths or iterations <= LONG:
             return False
         hoped = self._errors_by_camera_paths(count, LEAST_CAMERA_SHARE)
         return min(hoped.values()) <= WORTH_TRYING * hoped[1]
