@@ -213,8 +213,8 @@ class BDPMSession(PilotedSession):
             self.reference_mean,
         )
 
-    def pilot_passes(self, pixels):
-        return SubsetPasses(self, pixels)
+    def pilot_passes(self, setting, pixels):
+        return SubsetPasses(self, setting, pixels)
 
     def _vertex_room(self, paths):
         if not self.kinds():
@@ -415,9 +415,8 @@ class BDPMSession(PilotedSession):
 class SubsetPasses:
     """The passes of a `BDPMSession` on the pixels of its pilot (`pilot.run.PilotPasses`)."""
 
-    def __init__(self, session, pixels):
-        self.session, self.pixels = session, pixels
-        self.corrects = session.pilot_setting().corrections
+    def __init__(self, session, setting, pixels):
+        self.session, self.setting, self.pixels = session, setting, pixels
         self._record_camera(session._vertex_room(pixels.paths) * (1 if session.one_vertex else 4))
         self._record_gather()
         self._covered = session.recorded(session._covered)
@@ -455,7 +454,7 @@ class SubsetPasses:
                     spectral,
                     grey=True,
                 )
-                for kind in session.kinds()
+                for kind in self.setting.kinds
             }
         )
 
@@ -489,7 +488,7 @@ class SubsetPasses:
         radii = [dr.opaque(mi.Float, float(radius)) for radius in radii]
         gathered = self._gather(session.scene, session._tables, photons, vertices, radii, spectral)
         for kind, values in gathered.items():
-            for corrected in self.corrects(kind):
+            for corrected in self.setting.corrections(kind):
                 if corrected:
                     values = [
                         value

@@ -138,7 +138,7 @@ def choose(integrator, scene, sensor, seed, iterations, seconds):
     )
     trials, reasons = [_trial(plugin, parameters, first, segments)], []
     spent, usual = _pilot_cost(first, segments), trials[0].cost
-    budget = (prediction.count if seconds else iterations or UNPLANNED_ITERATIONS) * usual
+    budget = (prediction.iterations if seconds else iterations or UNPLANNED_ITERATIONS) * usual
     blind = _why_not_path(first, prediction)
     if blind:
         reasons.append(blind)

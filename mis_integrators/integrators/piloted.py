@@ -48,8 +48,8 @@ class PilotedSession(IterativeSession):
         """The `PilotSetting` of this render."""
         raise TypeError(f"{type(self).__name__} does not define pilot_setting")
 
-    def pilot_passes(self, pixels):
-        """The `PilotPasses` on these pixels."""
+    def pilot_passes(self, setting, pixels):
+        """The `PilotPasses` of this setting on these pixels."""
         raise TypeError(f"{type(self).__name__} does not define pilot_passes")
 
     def _render(self, iteration):
@@ -125,7 +125,7 @@ class PilotedSession(IterativeSession):
             return None
         setting = self.pilot_setting()
         pixels = pilot_pixels(setting)
-        return run_pilot(setting, pixels, self.pilot_passes(pixels))
+        return run_pilot(setting, pixels, self.pilot_passes(setting, pixels))
 
     def _choose_by_clock(self, pilot):
         """Chooses for a guess of how many iterations there is time for, measures what one takes

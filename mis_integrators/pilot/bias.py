@@ -3,7 +3,11 @@ that explains it."""
 
 from __future__ import annotations
 
+from typing import TypeVar
+
 import numpy as np
+
+Exponents = TypeVar("Exponents", float, np.ndarray)
 
 AT_EDGES, BY_CURVATURE = (1, 4.327), (4, 16 / 9)
 """Exponents q of the squared bias and what it is then in units of Q. At an edge a disk whose centre
@@ -29,7 +33,7 @@ def expected_products(a: np.ndarray, b: np.ndarray, weights: np.ndarray) -> np.n
     )
 
 
-def jackknife(a, b, weights):
+def jackknife(a: np.ndarray, b: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """`expected_products` and its standard error, by leaving out one iteration at a time (the
     jackknife): neighbouring pixels share photons, so that pixels are no independent samples."""
     value, m = expected_products(a, b, weights), a.shape[0]
@@ -51,7 +55,7 @@ def squared_difference(samples: np.ndarray, weights: np.ndarray) -> tuple[np.nda
     return np.concatenate([[0.0], difference]), np.concatenate([[0.0], error])
 
 
-def squared_bias_over_difference(exponent):
+def squared_bias_over_difference(exponent: Exponents) -> Exponents:
     """bias^2(R) over Q(R), where both grow as R^exponent: exact for edges and for curvature,
     geometric between."""
     (low, at_edges), (high, by_curvature) = AT_EDGES, BY_CURVATURE

@@ -3,6 +3,12 @@ camera path a pixel whose disks hold `USUAL_PHOTONS`."""
 
 from __future__ import annotations
 
+from typing import TypeVar
+
+import numpy as np
+
+Gathered = TypeVar("Gathered", float, np.ndarray)
+
 GATHER_COST = 0.013
 """Cost of one gathered photon a vertex, in units of an iteration's light and camera passes (0.006
 to 0.018 on the bundled scenes)."""
@@ -17,7 +23,9 @@ USUAL_PHOTONS = 10
 for themselves."""
 
 
-def iteration_cost(gathered, corrected, camera_paths: int, camera_share: float = CAMERA_SHARE):
+def iteration_cost(
+    gathered: Gathered, corrected: bool, camera_paths: int, camera_share: float = CAMERA_SHARE
+) -> Gathered:
     """Cost of an iteration that gathers so many photons a vertex, of plain or corrected estimates,
     with so many camera paths a pixel: 1 + g + (N_B - 1) (s + g), s the `camera_share`."""
     gather = GATHER_COST * gathered + PROBE_COST * corrected

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 FEW_DISKS = 64
@@ -66,7 +68,12 @@ def photon_variance(
     )
 
 
-def bounded_by_larger_disks(radii, variance, floor, disks=None):
+def bounded_by_larger_disks(
+    radii: np.ndarray,
+    variance: np.ndarray,
+    floor: float,
+    disks: Sequence[int] | np.ndarray | None = None,
+) -> np.ndarray:
     """V(R), no smaller than what larger radii say: the noise of photons falls with the area of the
     disk, above a `floor` that is not theirs. Small disks seldom find the rare bright photons that
     large ones have seen.

@@ -3,8 +3,8 @@ camera paths. Pure functions."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, replace
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -17,6 +17,8 @@ from .noise import (
 )
 from .radius import ErrorByRadius, RadiusChoice, best_radius, error_by_radius, middle_index
 from .setting import PilotPixels, PilotSetting, neighbourhoods
+
+Radii = TypeVar("Radii", float, np.ndarray)
 
 NUMBERS_OF_PATHS = (1, 2, 4, 8)
 """Camera paths a pixel and iteration that are considered."""
@@ -54,8 +56,8 @@ class Prediction(NamedTuple):
     """Of one iteration, direct light included."""
     gathered: float
     """Photons within a vertex's merge disks."""
-    count: float
-    """Iterations that were planned for."""
+    iterations: float
+    """Those that there is time for."""
     cost_of_paths: float
     """What an iteration costs with its camera paths, in units of one with one a pixel."""
     mean: np.ndarray
@@ -69,7 +71,7 @@ class Prediction(NamedTuple):
     @property
     def error(self) -> float:
         """Relative mean squared error of the render: bias^2 + V / n."""
-        return self.squared_bias + self.variance / max(self.count, 1)
+        return self.squared_bias + self.variance / max(self.iterations, 1)
 
 
 @dataclass(frozen=True)
@@ -85,8 +87,8 @@ class Choice:
 
 @dataclass(frozen=True)
 class PilotResult:
-    """What a pilot has measured. `choose` says what follows from it; all other values are of
-    samples that `measure` makes, and empty where no camera path meets a surface that gathers."""
+    """What a pilot has measured (made by `measure`), and the choices that follow from it. The
+    dictionaries are empty where no camera path meets a surface that gathers."""
 
     setting: PilotSetting
     pixels: PilotPixels
@@ -140,17 +142,27 @@ class PilotResult:
             kind: self._best_radius(kind, count, camera_paths, camera_share, kept, reluctance)
             for kind in self.errors
         }
-        return Choice(
-            {kind: choice.radius for kind, choice in chosen.items()},
-            {kind: choice.corrected for kind, choice in chosen.items()},
+        choice = Choice(
+            {kind: found.radius for kind, found in chosen.items()},
+            {kind: found.corrected for kind, found in chosen.items()},
             camera_paths,
-            self._predict(chosen, count, camera_paths, camera_share),
+            None,
         )
+        prediction = self._predict(choice, list(chosen.values()), count, camera_share)
+        return replace(choice, prediction=prediction)
 
-    def _best_radius(self, kind, count, camera_paths, camera_share, kept, reluctance):
+    def _best_radius(
+        self,
+        kind: str,
+        count: float,
+        camera_paths: int,
+        camera_share: float,
+        kept: Choice | None,
+        reluctance: float,
+    ) -> RadiusChoice:
         """The `RadiusChoice` for one kind of photons."""
 
-        def iterations(radius, corrected):
+        def iterations(radius: np.ndarray, corrected: bool) -> np.ndarray:
             gathered = self.gathered(kind, radius)
             return np.maximum(
                 count / iteration_cost(gathered, corrected, camera_paths, camera_share), 1
@@ -164,29 +176,25 @@ class PilotResult:
         return best_radius(self.errors[kind], iterations, used, reluctance, more_noise)
 
     def _predict(
-        self, chosen: dict[str, RadiusChoice], count: float, camera_paths: int, camera_share: float
+        self, choice: Choice, chosen: list[RadiusChoice], count: float, camera_share: float
     ) -> Prediction:
-        def cost(number):
-            return max(
-                iteration_cost(
-                    self.gathered(kind, choice.radius), choice.corrected, number, camera_share
-                )
-                for kind, choice in chosen.items()
-            )
-
+        """The `Prediction` for a choice, made of those for its kinds of photons."""
+        cost, cost_of_one = (
+            self.cost(choice, number, camera_share) for number in (choice.camera_paths, 1)
+        )
         return Prediction(
-            sum(choice.squared_bias for choice in chosen.values()),
-            self.direct / camera_paths + sum(choice.variance for choice in chosen.values()),
-            sum(self.gathered(kind, choice.radius) for kind, choice in chosen.items()),
-            count / cost(camera_paths),
-            cost(camera_paths) / cost(1),
+            sum(found.squared_bias for found in chosen),
+            self.direct / choice.camera_paths + sum(found.variance for found in chosen),
+            sum(self.gathered(kind, radius) for kind, radius in choice.radii.items()),
+            count / cost,
+            cost / cost_of_one,
             self.mean,
             self.pixels,
             self.caustic_share,
             self.iterations,
         )
 
-    def gathered(self, kind: str, radius):
+    def gathered(self, kind: str, radius: Radii) -> Radii:
         """Photons of a kind within `radius` of a vertex, on average."""
         return self.photons[kind] * (radius / self.errors[kind].ladder[-1]) ** 2
 
@@ -226,11 +234,12 @@ class PilotResult:
             errors, key=lambda number: errors[number] / (1 if number == 2 else WORTH_CHANGING)
         )
 
-    def _errors_by_camera_paths(self, count, camera_share):
-        return {
-            number: self.choose(count, number, camera_share).prediction.error
+    def _errors_by_camera_paths(self, count: float, camera_share: float) -> dict[int, float]:
+        predictions = {
+            number: self.choose(count, number, camera_share).prediction
             for number in NUMBERS_OF_PATHS
         }
+        return {number: found.error for number, found in predictions.items() if found is not None}
 
 
 def measure(

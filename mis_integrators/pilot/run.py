@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
@@ -35,7 +34,7 @@ class PilotIteration(Protocol):
     def mean_photon_count(self, kind: str, radius: float) -> float:
         """Photons of a kind within `radius` of a vertex, on average."""
 
-    def gather(self, radii: Sequence[float]) -> dict[tuple[str, bool], np.ndarray]:
+    def gather(self, radii: np.ndarray) -> dict[tuple[str, bool], np.ndarray]:
         """What photons bring, by kind and whether the estimate is corrected at edges: mean over the
         channels, (radii, camera paths, pixels)."""
 
@@ -52,11 +51,21 @@ class PilotPasses(Protocol):
 
 
 def run_pilot(setting: PilotSetting, pixels: PilotPixels, passes: PilotPasses) -> PilotResult:
-    """Runs as many iterations on the pixels as the render's plan allows.
+    """Runs as many iterations as the render's plan allows, and returns what they have measured.
 
-    `passes` trace those `pixels`, and gather all that `setting` has of kinds and corrections.
+    Parameters
+    ----------
+    setting
+        The render that the pilot is for.
+    pixels
+        Those that it takes: `setting.pilot_pixels`.
+    passes
+        They trace those pixels, and gather all kinds and corrections of the setting.
     """
-    radii, photons, gathered, direct = None, {}, [], []
+    radii: np.ndarray | None = None
+    photons: dict[str, float] = {}
+    gathered: list[dict[tuple[str, bool], np.ndarray]] = []
+    direct: list[np.ndarray] = []
     began = time.perf_counter()
     for done in range(1, MOST_ITERATIONS + 1):
         start = time.perf_counter()
@@ -66,6 +75,7 @@ def run_pilot(setting: PilotSetting, pixels: PilotPixels, passes: PilotPasses) -
         if radii is not None:
             gathered.append(iteration.gather(radii))
             direct.append(iteration.direct())
+        del iteration  # its photons' memory is free for those of the next
         now = time.perf_counter()
         if radii is None or has_enough(setting, done, now - began):
             break
@@ -92,15 +102,15 @@ def choose_ladder(
     if radii is None:
         return None, {}
 
-    def count():
+    def count(radii: np.ndarray) -> dict[str, float]:
         return {kind: iteration.mean_photon_count(kind, float(radii[-1])) for kind in setting.kinds}
 
-    photons = count()
+    photons = count(radii)
     largest = LARGEST_SHARE * setting.extent / 3**0.5
     while (most := max(photons.values())) < FEWEST_PHOTONS and radii[-1] < largest:
         radii = radii * min(WIDER, largest / radii[-1])
-        photons = count()
+        photons = count(radii)
     if most > MOST_PHOTONS:
         radii = radii * (MOST_PHOTONS / most) ** 0.5
-        photons = count()
+        photons = count(radii)
     return radii, photons
