@@ -442,7 +442,7 @@ class SubsetPasses:
         )
 
     def _record_gather(self):
-        session = self.session
+        session, kinds = self.session, self.setting.kinds
         self.photon_capacity = session.photon_capacity
         self._gather = session.recorded(
             lambda scene, tables, photons, vertices, radii, spectral: {
@@ -454,7 +454,7 @@ class SubsetPasses:
                     spectral,
                     grey=True,
                 )
-                for kind in self.setting.kinds
+                for kind in kinds
             }
         )
 
