@@ -12,19 +12,19 @@ ONLY = {
     "weights": {"weights"},
     "core": {"core"},
     "analysis": {"analysis"},
+    "pilot": {"pilot"},
 }
 """Packages that import nothing of the house but these: pure functions, the ground of all others,
-and what judges images without rendering any."""
+what judges images without rendering any, and what chooses radii from estimates that it is given."""
 TRACING = {"lights", "paths", "photons", "resampling"}
 NOT = {
     **{name: {"mis", "pilot", "integrators", "app", "volume"} for name in TRACING},
     "mis": {"integrators", "pilot", "app"},
     "volume": {"mis", "pilot", "integrators", "app"},
-    "pilot": {"integrators", "app"},
 }
 """Packages, and what they do not import: how paths are made knows no weights, and neither knows the
 plugins."""
-WITHOUT_MITSUBA = {"weights", "analysis"}
+WITHOUT_MITSUBA = {"weights", "analysis", "pilot"}
 MAY_IMPORT_PLUGINS = {"mis_integrators", "mis_integrators._plugins"}
 """Modules outside `integrators` that may import a module of it: a plugin class belongs to the
 variant in which it was registered, and they register it."""
@@ -61,6 +61,7 @@ def test_rules_are_about_packages_that_there_are():
         ("core.film", "llvm"),
         ("paths.connect", "mis.heuristic"),
         ("mis.heuristic", "pilot.radius"),
+        ("pilot.run", "core.random"),
         ("app.cli", "integrators.bdpm"),
         ("analysis.metrics", "app.loading"),
     ],

@@ -93,14 +93,14 @@ def measured(opened, plugins) -> list[dict]:
             continue
         pilot = mi.load_dict({"type": plugin, **given}).session(scene, sensor)
         pilot.iterate()
-        if pilot.forecast is None:
+        if pilot.prediction is None:
             continue
         for factor in RADII:
             session = mi.load_dict({"type": plugin, **given}).session(scene, sensor)
             session.radii = {kind: radius * factor for kind, radius in pilot.radii.items()}
             session.iterate()
             counted = costs.events(
-                session, segments, session.last_vertex, pilot.forecast.gathered * factor**2
+                session, segments, session.last_vertex, pilot.prediction.gathered * factor**2
             )
             sessions.append(
                 (plugin, f"{name_of(plugin, parameters)} x {factor:g}", session, counted)

@@ -189,7 +189,7 @@ def free_choice(pilot: Contender, maker: SessionMaker) -> Contender:
 def with_set_up(law: ErrorLaw, pilot: Contender) -> ErrorLaw:
     """The law with the set-up that its pilot took: a pilot keeps the iterations by which it has
     measured time, so that what is left of them after the first is no set-up either."""
-    return replace(law, set_up=pilot.first - (1 + len(pilot.session.rehearsed)) * law.seconds)
+    return replace(law, set_up=pilot.first - (1 + len(pilot.session.kept)) * law.seconds)
 
 
 def law(contender: Contender, references: References) -> ErrorLaw:

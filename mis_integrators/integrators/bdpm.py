@@ -2,32 +2,44 @@
 
 from __future__ import annotations
 
-import time
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from ..core.film import splat_samples
 from ..core.packing import rounded_up
-from ..core.recording import recorder
+from ..core.recording import lanes, recorder
+from ..core.spectra import channel_mean
 from ..core.traits import SceneTraits, lookup
-from ..core.untrusted import Fields
 from ..lights.lights import Lights
-from ..paths.camera import film_sample_count
-from ..paths.setting import World
+from ..paths.camera import film_sample_count, film_size
+from ..paths.setting import CameraPass, World
 from ..photons.coverage import covered_share
-from ..photons.gather import QueryVertices, gather_photons
+from ..photons.gather import QueryVertices, gather_photons, mean_photon_count
 from ..photons.grid import PhotonMap, build_photon_map, smallest_cell
 from ..photons.queries import Queries, read_queries, trace_camera_paths
 from ..photons.trace import trace_light_paths
-from ..pilot.run import choose_radii
-from .common import MOST_LIGHT_PATHS, IterativeIntegrator, IterativeSession
-from .schedule import LARGEST_RADIUS, SMALLEST_RADIUS, read_radius, shrunk
+from ..pilot.setting import PilotSetting
+from .common import MOST_LIGHT_PATHS, IterativeIntegrator
+from .piloted import PilotedSession
+from .schedule import read_radius
 
 SPARE_PHOTONS = 1 << 20
 """Unused room beyond half of a photon buffer that is worth the time to record the passes anew."""
 CAMERA_CHUNK = 1 << 21
 """Camera paths traced at once at most; larger films are traced in parts (bounds memory)."""
+
+
+class Survey(NamedTuple):
+    """What sessions of the same scene have in common."""
+
+    traits: SceneTraits
+    lights: Lights
+    mean: np.ndarray | None = None
+    """Radiance of the pilot's pixels that errors are relative to (None: that which the pilot
+    finds)."""
 
 
 class BDPM(IterativeIntegrator):
@@ -104,7 +116,7 @@ class BDPM(IterativeIntegrator):
     CAMERA_PATHS = 0, 0, "at least 0 (0: automatic)"
 
     survey = None
-    """Traits and lights of the scene, where another session knows them already."""
+    """A `Survey`, where another session has made it already."""
 
     def read_parameters(self, parameters):
         self.read_photon_parameters(parameters)
@@ -130,14 +142,13 @@ class BDPM(IterativeIntegrator):
         return BDPMSession(self, scene, sensor, seed, iterations)
 
 
-class BDPMSession(IterativeSession):
+class BDPMSession(PilotedSession):
     """Iterations of `bdpm`: light pass, photon maps, camera pass, gather."""
 
     def __init__(self, integrator, scene, sensor, seed, iterations):
         super().__init__(integrator, scene, sensor, seed, iterations)
-        self.traits, self.lights = integrator.survey or (
-            SceneTraits(scene),
-            Lights.seen_by(scene, sensor, integrator.plugin),
+        self.traits, self.lights, self.reference_mean = integrator.survey or Survey(
+            SceneTraits(scene), Lights.seen_by(scene, sensor, integrator.plugin)
         )
         self.world = World(scene, self.lights, self.traits)
         self.split_paths(CAMERA_CHUNK)
@@ -156,33 +167,17 @@ class BDPMSession(IterativeSession):
         )
         self.photon_capacity = rounded_up(3 * self.light_path_count)
         self.vertex_capacity = self._vertex_room(self.chunk)
-        self.radii = (
-            dict.fromkeys(self.kinds(), integrator.initial_radius)
-            if integrator.initial_radius
-            else None
-        )
+        if integrator.initial_radius:
+            self.radii = dict.fromkeys(self.kinds(), integrator.initial_radius)
         self.corrected = dict.fromkeys(self.kinds(), False)
-        self.seconds = self.begun = None  # what rendering may take, and when it began
-        self.forecast = self.judged_by = (
-            # what the pilot expects, and the image (of its pixels) that errors are relative to
-            None
-        )
-        self.rehearsed = {}  # iterations that the pilot has rendered already, by number
         self.photons_found = 0  # by the last light pass
         self._sized = False
         self.recorded = recorder()
         self._freeze()
 
-    def plan_time(self, seconds):
-        """Rendering will last `seconds`: the automatic radius is chosen for as many iterations as
-        fit."""
-        self.seconds = seconds
-
     @property
     def settings(self):
-        radii = {f"radius.{kind}": radius for kind, radius in (self.radii or {}).items()}
-        corrected = {f"edge_correction.{kind}": flag for kind, flag in self.corrected.items()}
-        return {**super().settings, "photon_count": self.light_path_count, **radii, **corrected}
+        return {**super().settings, "photon_count": self.light_path_count}
 
     @property
     def last_vertex(self):
@@ -190,27 +185,38 @@ class BDPMSession(IterativeSession):
         return self.integrator.bdd
 
     def kinds(self):
-        """Photon maps that the scene needs."""
         return [
             kind
             for kind, needed in (("caustic", self.has_caustics), ("indirect", self.has_indirect))
             if needed
         ]
 
-    def send(self, camera_paths):
-        """Sends so many camera paths through each pixel from the next iteration on."""
-        self.resize(camera_paths)
-        self.rehearsed.clear()
+    def set_camera_paths(self, camera_paths):
+        super().set_camera_paths(camera_paths)
         self.split_paths(CAMERA_CHUNK)
         self.vertex_capacity = self._vertex_room(self.chunk)
+        self._record_camera_pass()
+
+    def _record_camera_pass(self):
         self._camera_pass = self.recorded(self._render_chunk)
 
-    def radii_at(self, iteration):
-        """Merge radius of each kind of photon."""
-        return {
-            kind: dr.opaque(mi.Float, shrunk(radius, self.integrator.alpha, iteration))
-            for kind, radius in self.radii.items()
-        }
+    def pilot_setting(self):
+        integrator = self.integrator
+        return PilotSetting(
+            film_size(self.sensor)[0],
+            film_sample_count(self.sensor),
+            float(dr.norm(self.traits.bounds.extents())),
+            tuple(self.kinds()),
+            integrator.bdd == 0,
+            self.camera_paths,
+            self.seconds is not None and not integrator.camera_paths,
+            self.iterations_planned,
+            self.seconds,
+            self.reference_mean,
+        )
+
+    def pilot_passes(self, setting, pixels):
+        return SubsetPasses(self, setting, pixels)
 
     def _vertex_room(self, paths):
         if not self.kinds():
@@ -225,7 +231,7 @@ class BDPMSession(IterativeSession):
         self._tables = [self.traits.lambertian, self.traits.perturbed, *self.lights.tables()]
         self._light_pass = self.recorded(self._trace_light)
         self._map_pass = self.recorded(self._build_maps)
-        self._camera_pass = self.recorded(self._render_chunk)
+        self._record_camera_pass()
 
     def _trace_light(self, scene, sensor, tables, seed, spectral):
         return trace_light_paths(
@@ -359,43 +365,7 @@ class BDPMSession(IterativeSession):
             self.photon_capacity = room
             self._freeze()
 
-    def start(self):
-        self.begun = self.begun or time.perf_counter()
-        self.set_up()
-
-    def set_up(self):
-        """What `start` does when it has looked at the clock: chooses the radii, unless they are
-        known."""
-        if self.radii is None:
-            self.forecast = choose_radii(self)
-
-    @property
-    def learned(self):
-        if self.radii is None:
-            return {}
-        return {
-            "radii": {kind: float(radius) for kind, radius in self.radii.items()},
-            "corrected": {kind: bool(flag) for kind, flag in self.corrected.items()},
-            "camera_paths": self.camera_paths,
-        }
-
-    def recall(self, learned):
-        if learned == {} and (self.radii is not None or not self.kinds()):
-            return
-        fields = Fields(learned, "learned")
-        radii, corrected = fields.object("radii"), fields.object("corrected")
-        self.radii = {
-            kind: radii.number(kind, LARGEST_RADIUS, SMALLEST_RADIUS) for kind in self.kinds()
-        }
-        self.corrected = {kind: corrected.boolean(kind) for kind in self.kinds()}
-        self.send(fields.integer("camera_paths", 1, self.most_camera_paths()))
-        for each in (radii, corrected, fields):
-            each.finish()
-
-    def _iteration(self, iteration):
-        self.start()
-        if iteration in self.rehearsed:
-            return self.rehearsed.pop(iteration)
+    def _render(self, iteration):
         radii = self.radii_at(iteration)
         spectral = self._spectral(iteration)
         photons = (
@@ -423,6 +393,141 @@ class BDPMSession(IterativeSession):
 
         (block,) = self.sum_of_chunks(render)
         return block
+
+
+class SubsetPasses:
+    """The passes of a `BDPMSession` on the pixels of its pilot (`pilot.run.PilotPasses`)."""
+
+    def __init__(self, session, setting, pixels):
+        self.session, self.setting, self.pixels = session, setting, pixels
+        self._record_camera(session._vertex_room(pixels.paths) * (1 if session.one_vertex else 4))
+        self._record_gather()
+        self._covered = session.recorded(session._covered)
+
+    def _record_camera(self, capacity):
+        session, pixels = self.session, self.pixels
+        self.capacity, stride = capacity, pixels.stride * pixels.camera_paths
+        back = (
+            1 - pixels.count * stride
+        ) % 2**32  # from a path of the last pixel to the next one of the first
+        self._camera = session.recorded(
+            lambda scene, sensor, tables, seed, spectral: session._trace_camera(
+                CameraPass(
+                    sensor,
+                    session.integrator,
+                    seed,
+                    lanes(pixels.paths) // pixels.count * back,
+                    pixels.paths,
+                    pixels.camera_paths,
+                    spectral["sample"],
+                    stride,
+                ),
+                capacity,
+                spectral,
+            )
+        )
+
+    def _record_gather(self):
+        session, kinds = self.session, self.setting.kinds
+        self.photon_capacity = session.photon_capacity
+        self._gather = session.recorded(
+            lambda scene, tables, photons, vertices, radii, spectral: {
+                kind: session._gather(
+                    session._map(photons, kind, radii[-1]),
+                    vertices,
+                    kind,
+                    radii,
+                    spectral,
+                    grey=True,
+                )
+                for kind in kinds
+            }
+        )
+
+    def trace(self, number):
+        session = self.session
+        spectral = session._spectral(number)
+        photons = session._photons(number, spectral)
+        if self.photon_capacity != session.photon_capacity:
+            self._record_gather()
+        seed = session._seed(number, CAMERA)
+        radiance, vertices = self._trace_camera(seed, spectral)
+        return SubsetIteration(self, photons, vertices, radiance, seed, spectral)
+
+    def _trace_camera(self, seed, spectral):
+        """Radiance and vertices of the camera paths. Where the vertices overflow their buffer, it
+        grows and the pass runs again."""
+        session = self.session
+        while True:
+            radiance, _, _, vertices, count = self._camera(
+                session.scene, session.sensor, session._tables, seed, spectral
+            )
+            found = 0 if session.one_vertex else int(dr.max(count)[0])
+            if found <= self.capacity:
+                return radiance, vertices
+            self._record_camera(found + found // 8)
+
+    def gather(self, photons, vertices, radii, seed, spectral):
+        """What photons bring to the camera paths, by kind and whether it is corrected at edges:
+        (radii, camera paths, pixels)."""
+        session, estimates = self.session, {}
+        radii = [dr.opaque(mi.Float, float(radius)) for radius in radii]
+        gathered = self._gather(session.scene, session._tables, photons, vertices, radii, spectral)
+        for kind, values in gathered.items():
+            for corrected in self.setting.corrections(kind):
+                if corrected:
+                    values = [
+                        value
+                        * dr.rcp(
+                            self._covered(session.scene, session._tables, vertices, radius, seed)
+                        )
+                        for value, radius in zip(values, radii)
+                    ]
+                estimates[kind, corrected] = np.array(
+                    [
+                        self.by_pixel(session._per_path(value, vertices, self.pixels.paths))
+                        for value in values
+                    ]
+                )
+        return estimates
+
+    def mean_photon_count(self, photons, vertices, kind, radius):
+        """Photons of a kind within `radius` of a vertex, on average."""
+        radius = dr.opaque(mi.Float, radius)
+        photon_map = self.session._map(photons, kind, radius)
+        return mean_photon_count(photon_map, read_queries(vertices), radius)
+
+    def by_pixel(self, values):
+        """Values of the camera paths as (camera paths, pixels)."""
+        pixels = self.pixels
+        return np.broadcast_to(np.array(values), pixels.paths).reshape(
+            pixels.camera_paths, pixels.count
+        )
+
+
+class SubsetIteration(NamedTuple):
+    """Photons and camera paths of one iteration of `SubsetPasses` (`pilot.run.PilotIteration`)."""
+
+    passes: SubsetPasses
+    photons: tuple
+    vertices: dict
+    radiance: mi.Spectrum
+    seed: mi.UInt32
+    spectral: dict
+
+    def points(self):
+        vertices = read_queries(self.vertices)
+        points = vertices["ray_o"] + vertices["ray_d"] * vertices["hit"].t
+        return np.array(points), np.array(dr.max(vertices["throughput"]))
+
+    def mean_photon_count(self, kind, radius):
+        return self.passes.mean_photon_count(self.photons, self.vertices, kind, radius)
+
+    def gather(self, radii):
+        return self.passes.gather(self.photons, self.vertices, radii, self.seed, self.spectral)
+
+    def direct(self):
+        return self.passes.by_pixel(channel_mean(self.radiance))
 
 
 LIGHT, CAMERA = range(2)

@@ -114,6 +114,7 @@ class AutoSession(IterativeSession):
                     self.seconds,
                 )
             )
+        self.decision.session.start()
 
     def _take(self, decision):
         self.decision, self.camera_paths = decision, decision.session.camera_paths
@@ -155,5 +156,4 @@ class AutoSession(IterativeSession):
         self._take(Decision(plugin, parameters, session, reasons, errors))
 
     def _iteration(self, iteration):
-        self.start()
         return self.decision.session._iteration(iteration)

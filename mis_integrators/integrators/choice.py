@@ -19,9 +19,11 @@ import numpy as np
 from ..core.recording import lanes
 from ..core.spectra import channel_mean
 from ..paths.path_length_statistics import mean_segments
-from ..pilot.radius import relative_weights, trimmed_mean
-from ..pilot.run import FEWEST_ITERATIONS, PILOT_INDEX, UNPLANNED_ITERATIONS, pilot_pixels
+from ..pilot.noise import relative_weights, trimmed_mean
+from ..pilot.run import FEWEST_ITERATIONS, PILOT_INDEX
+from ..pilot.setting import UNPLANNED_ITERATIONS
 from . import costs
+from .bdpm import Survey
 from .unidirectional import PathSession
 
 PHOTON_MAPPERS = FIRST, OPT2, LATER, OPT3 = (
@@ -115,90 +117,66 @@ def choose(integrator, scene, sensor, seed, iterations, seconds):
     first = new_session(plugin, parameters, integrator, scene, sensor, seed, iterations)
     if not first.kinds():
         return Decision("path", {}, path, [_no_photons(integrator, first)])
-    first.seconds, first.begun = seconds, began
+    first.plan_time(seconds, began)
     first.start()
-    forecast = first.forecast
-    if forecast is None:
+    prediction = first.prediction
+    if prediction is None:
         return Decision(
             "path", {}, path, ["path: no camera path meets a surface that scatters smoothly"]
         )
     first_seconds = time.perf_counter() - began
 
-    stride, pixels, _ = pilot_pixels(first)
+    pixels = prediction.pixels
     segments = mean_segments(
-        scene, sensor, seed, stride, pixels, integrator.max_depth, integrator.rr_depth
+        scene,
+        sensor,
+        seed,
+        pixels.stride,
+        pixels.count,
+        integrator.max_depth,
+        integrator.rr_depth,
     )
-    trials, reasons, spent = (
-        [_trial(plugin, parameters, first, segments)],
-        [],
-        _pilot_cost(first, segments),
-    )
-    usual = trials[0].cost
-    budget = (forecast.count if seconds else iterations or UNPLANNED_ITERATIONS) * usual
-    blind = _why_not_path(first, forecast)
+    trials, reasons = [_trial(plugin, parameters, first, segments)], []
+    spent, usual = _pilot_cost(first, segments), trials[0].cost
+    budget = (prediction.iterations if seconds else iterations or UNPLANNED_ITERATIONS) * usual
+    blind = _why_not_path(first, prediction)
     if blind:
         reasons.append(blind)
     else:
-        trials.insert(0, _try_path(path, segments, stride, pixels, forecast.mean))
+        trials.insert(0, _try_path(path, segments, pixels, prediction.mean))
     weighting = (
         not blind and 1 < trials[0].error(budget) / max(trials[1].error(budget), 1e-30) < KEEPS_UP
     )
+    survey = Survey(first.traits, first.lights, prediction.mean)
     for plugin, parameters in later_candidates(first.traits):
-        name = name_of(plugin, parameters)
-        if plugin.startswith("bdpm_opt") and not first.traits.has_rough:
-            reasons.append(
-                f"not {name}: all smooth surfaces are diffuse, where one strategy does as well"
-            )
-            continue
-        if (
-            plugin == "bdpm_opt3"
-            and not first.traits.has_mixed
-            and trials[-1].name.endswith("bdd=1")
-            and _worse(trials, budget)
-        ):
-            reasons.append(
-                f"not {name}: merging at the second vertex does not pay, let alone at the third"
-            )
-            continue
-        if seconds is None:
-            whole, gone, takes = budget, spent, FEWEST_ITERATIONS * usual * 0.5
-        else:
-            whole, gone, takes = (
-                seconds,
-                time.perf_counter() - began,
-                LIKE_THE_FIRST * first_seconds,
-            )
         likely = weighting and plugin.startswith("bdpm_opt")
-        if gone + takes > TRIAL_TIME_SHARE * whole and not (
-            likely and takes < WORTH_SHARE * (whole - gone)
-        ):
-            reasons.append(
-                f"not {name}: trying it would take more than "
-                f"{WORTH_SHARE if likely else TRIAL_TIME_SHARE:.0%} of the time"
-            )
+        if seconds is None:
+            time_of_trials = budget, spent, FEWEST_ITERATIONS * usual * 0.5
+        else:
+            time_of_trials = seconds, time.perf_counter() - began, LIKE_THE_FIRST * first_seconds
+        reason = _why_useless(plugin, first.traits, trials, budget) or _why_too_dear(
+            likely, *time_of_trials
+        )
+        if reason:
+            reasons.append(f"not {name_of(plugin, parameters)}: {reason}")
             continue
         weighting &= not likely
-        session = new_session(
-            plugin,
-            parameters,
-            integrator,
-            scene,
-            sensor,
-            seed,
-            max(int(budget / usual), 1),
-            (first.traits, first.lights),
-        )
-        session.judged_by, session.seconds, session.begun = forecast.mean, seconds, began
+        planned = max(int(budget / usual), 1)
+        session = new_session(plugin, parameters, integrator, scene, sensor, seed, planned, survey)
+        session.plan_time(seconds, began)
         session.start()
-        if session.forecast is None:
-            continue
-        trials.append(_trial(plugin, parameters, session, segments))
-        spent += _pilot_cost(session, segments)
+        if session.prediction is not None:
+            trials.append(_trial(plugin, parameters, session, segments))
+            spent += _pilot_cost(session, segments)
+    return _decision(trials, reasons, budget, usual, iterations)
+
+
+def _decision(trials, reasons, budget, usual, iterations):
+    """The `Decision` for the trial with the least error predicted for this budget."""
     best = min(trials, key=lambda trial: trial.error(budget))
-    reasons.insert(
-        0,
+    why = (
         f"{best.name}: least predicted error in this time; bias {best.squared_bias:.2g}, noise "
-        f"{best.variance * best.cost / budget:.2g} (squared, relative)",
+        f"{best.variance * best.cost / budget:.2g} (squared, relative)"
     )
     best.session.iterations_planned = iterations
     for trial in trials:
@@ -206,7 +184,34 @@ def choose(integrator, scene, sensor, seed, iterations, seconds):
             trial.session = None  # its photons' and kernels' memory is free to go
     predicted = {trial.name: float(trial.error(budget)) for trial in trials}
     errors = {name: error for name, error in predicted.items() if math.isfinite(error)}
-    return Decision(best.plugin, best.parameters, best.session, reasons, errors, trials, usual)
+    return Decision(
+        best.plugin, best.parameters, best.session, [why, *reasons], errors, trials, usual
+    )
+
+
+def _why_useless(plugin, traits, trials, budget):
+    """Why this candidate cannot be the best, given the `trials` so far; `None` if it can."""
+    if plugin.startswith("bdpm_opt") and not traits.has_rough:
+        return "all smooth surfaces are diffuse, where one strategy does as well"
+    if (
+        plugin == "bdpm_opt3"
+        and not traits.has_mixed
+        and trials[-1].name.endswith("bdd=1")
+        and _worse(trials, budget)
+    ):
+        return "merging at the second vertex does not pay, let alone at the third"
+    return None
+
+
+def _why_too_dear(likely, whole, gone, takes):
+    """Why there is no time for a trial that `takes` so much, where so much of the `whole` is
+    `gone`; `None` if there is. A candidate that is `likely` to be the best may take more."""
+    if gone + takes <= TRIAL_TIME_SHARE * whole or (
+        likely and takes < WORTH_SHARE * (whole - gone)
+    ):
+        return None
+    share = WORTH_SHARE if likely else TRIAL_TIME_SHARE
+    return f"trying it would take more than {share:.0%} of the time"
 
 
 def later_candidates(traits):
@@ -231,33 +236,33 @@ def _no_photons(integrator, session):
     return f"path: light of at most {integrator.max_depth} segments needs no photons"
 
 
-def _why_not_path(session, forecast):
+def _why_not_path(session, prediction):
     """Why `path` is not tried, in one line; `None` if it is."""
     if not session.has_caustics:
         return None
     if not session.traits.has_light_surfaces or session.lights.needs_photons_for_direct_light():
-        if forecast.caustic_share > UNSEEN:
+        if prediction.caustic_share > UNSEEN:
             return (
-                f"not path: it cannot see the caustics, {forecast.caustic_share:.1%} of the light"
+                f"not path: it cannot see the caustics, {prediction.caustic_share:.1%} of the light"
             )
-    elif forecast.caustic_share > RARE:
+    elif prediction.caustic_share > RARE:
         return (
-            f"not path: it would meet the caustics, {forecast.caustic_share:.1%} of the "
+            f"not path: it would meet the caustics, {prediction.caustic_share:.1%} of the "
             "light, by chance only"
         )
     return None
 
 
 def _trial(plugin, parameters, session, segments):
-    forecast = session.forecast
-    counted = costs.events(session, segments, session.last_vertex, forecast.gathered)
+    prediction = session.prediction
+    counted = costs.events(session, segments, session.last_vertex, prediction.gathered)
     return Trial(
         plugin,
         parameters,
         session,
-        forecast.squared_bias,
-        forecast.variance,
-        costs.cost(plugin, counted) * forecast.cost_of_paths,
+        prediction.squared_bias,
+        prediction.variance,
+        costs.cost(plugin, counted) * prediction.cost_of_paths,
     )
 
 
@@ -265,26 +270,26 @@ def _pilot_cost(session, segments):
     """What a session's pilot took, a pixel: its light passes are whole, its camera paths few."""
     _, light, _, _ = costs.events(session, segments, session.last_vertex, 0.0)
     plugin = session.integrator.plugin
-    return session.forecast.iterations * costs.cost(plugin, (0.0, light, 0.0, 1.0))
+    return session.prediction.pilot_iterations * costs.cost(plugin, (0.0, light, 0.0, 1.0))
 
 
-def _try_path(path, segments, stride, pixels, mean):
+def _try_path(path, segments, pixels, mean):
     """`path` on the pilot's pixels."""
     passes = (
         PATH_TRIALS if mi.is_spectral else 1
     )  # wavelengths are shared by all that is traced at once
     at_once = PATH_TRIALS // passes
-    trial = lanes(at_once * pixels) // pixels
+    count, stride = pixels.count, pixels.stride * path.camera_paths
+    trial = lanes(at_once * count) // count
     values = []
-    stride *= path.camera_paths
-    first = trial * (-pixels * stride % 2**32)  # back to the first pixel
+    first = trial * (-count * stride % 2**32)  # back to the first pixel
     for number in range(PILOT_INDEX, PILOT_INDEX + passes):
         radiance, *_ = path.trace(
-            number, 0, first, stride, at_once * pixels, path._spectral(number), trial
+            number, 0, first, stride, at_once * count, path._spectral(number), trial
         )
         values += list(
-            np.broadcast_to(np.array(channel_mean(radiance)), at_once * pixels).reshape(
-                at_once, pixels
+            np.broadcast_to(np.array(channel_mean(radiance)), at_once * count).reshape(
+                at_once, count
             )
         )
     path.sampler.seed(0, 1)

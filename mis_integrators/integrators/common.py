@@ -233,7 +233,7 @@ class IterativeSession:
 
     def start(self):
         """Finds out what must be known before the first iteration, unless it is known: pilots,
-        caches."""
+        caches. `iterate` calls it."""
 
     @property
     def learned(self):
@@ -279,6 +279,7 @@ class IterativeSession:
                 f"{mi.variant()}"
             )
         with dr.suspend_grad(), self.sums.all_or_nothing():
+            self.start()
             self._run(self.sums.done.first_missing if iteration is None else iteration)
             dr.eval(self.sums.tensors)
             dr.sync_thread()

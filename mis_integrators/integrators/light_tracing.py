@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..pilot.radius import relative_weights, trimmed_mean
+from ..pilot.noise import relative_weights, trimmed_mean
 from . import costs
 
 LEAST_LIGHT_TRACING, MOST_LIGHT_TRACING = 1 / 8, 8.0

@@ -752,7 +752,6 @@ class ResampledSession(IterativeSession):
             self._prepare()
 
     def _iteration(self, iteration):
-        self.start()
         spectral = self._spectral(iteration)
         proposals, begun = self.begun if iteration == 0 and self.begun else (None, None)
         self.begun = light = None

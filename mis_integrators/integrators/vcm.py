@@ -14,14 +14,13 @@ from ..paths.subpaths import read_vertices
 from ..photons.gather import KeptVertices, gather_photons
 from ..photons.grid import smallest_cell
 from ..photons.vertex_map import state_of, vertex_map
+from ..pilot.run import PILOT_INDEX
 from .bdpt import BDPT, BDPTSession
 from .common import MOST_LIGHT_PATHS
 from .schedule import LARGEST_RADIUS, SMALLEST_RADIUS, read_radius, shrunk
 
 RADIUS_SHARE = 0.004
 """The automatic radius, in units of the spread of what the camera sees."""
-PILOT_INDEX = 1 << 30
-"""Iteration number of the pilot that looks at it, so that its random numbers are its own."""
 
 
 class VCM(BDPT):
@@ -119,13 +118,12 @@ class VCMSession(BDPTSession):
 
     def _spectral(self, iteration):
         spectral = super()._spectral(iteration)
-        if self.radius is None:
-            self._choose_radius(spectral)
         spectral["radius"] = dr.opaque(mi.Float, self.radius_at(iteration))
         return spectral
 
     def start(self):
-        self._spectral(0)
+        if self.radius is None:
+            self._choose_radius(super()._spectral(0))
 
     @property
     def learned(self):

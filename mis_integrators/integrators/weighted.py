@@ -80,15 +80,22 @@ class WeightedSession(BDPMSession):
 
         return weigh
 
-    def set_up(self):
-        if not self.weighted_pilot:
-            super().set_up()  # may render already, to measure time, and so come here
+    def _run_pilot(self):
+        """The weights are made before the pilot or after it, see `weighted_pilot`."""
+        if self.weighted_pilot:
+            self._begin_weighting()
+        pilot = super()._run_pilot()
+        self._begin_weighting()
+        return pilot
+
+    def _begin_weighting(self):
+        """Weights all passes from now on, where the scene has paths that several strategies
+        make."""
         if not self._weighted and self.kinds() and self.mixes():
             self.prepare(super()._spectral(0))
             self._weighted, self.one_vertex = True, False
             self.vertex_capacity = self._vertex_room(self.chunk)
             self._freeze()
-        super().set_up()
 
     def _vertex_room(self, paths):
         return (

@@ -1,1 +1,5 @@
-"""The pilot that chooses merge radii: its statistics, and the iterations that it renders."""
+"""The pilot that chooses merge radii: a function of explicit inputs with a frozen result.
+
+`run.run_pilot` asks a renderer for estimates through `run.PilotPasses`, a small protocol.
+`radius` has all that is measured, fitted and minimised on one page.
+"""

@@ -324,7 +324,7 @@ def test_camera_paths_of_the_chosen_are_its_own(rgb, monkeypatch):
     trial = session.decision.trials[0]
     assert 1.5 < trial.cost / costs.cost(
         trial.plugin,
-        costs.events(trial.session, [1.0] * 5, 0, session.decision.session.forecast.gathered),
+        costs.events(trial.session, [1.0] * 5, 0, session.decision.session.prediction.gathered),
     )
     other = auto().session(caustic_scene("point"))
     other.recall(json.loads(json.dumps(session.learned)))

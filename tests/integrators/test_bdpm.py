@@ -1,11 +1,15 @@
 """Behaviour of the plugin `bdpm`: strategies, seeds, films, limits, and errors."""
 
+import dataclasses
 import gc
 import sys
+import time
 
 from mis_integrators._plugins import PLUGINS
-from mis_integrators.pilot.radius import relative_weights, trimmed_mean
-from mis_integrators.pilot.run import Pilot, choose_camera_paths
+from mis_integrators.pilot.cost import CAMERA_SHARE
+from mis_integrators.pilot.noise import relative_weights, trimmed_mean
+from mis_integrators.pilot.result import PilotResult, PilotSamples, measure
+from mis_integrators.pilot.setting import pilot_pixels
 
 import drjit as dr
 import mitsuba as mi
@@ -873,44 +877,43 @@ def test_rare_photons_get_no_smallest_radius(rgb):
     tries."""
     scene = box_scene(16)
     session = bdpm(bdd=0, photon_count=1, initial_radius=0.0).session(scene, seed=1, spp=4)
-    pilot = Pilot(session)
-    pilot.ladder, pilot.photons, pilot.direct = (
+    setting = session.pilot_setting()
+    samples = PilotSamples(
         np.array([0.01 * 2**i for i in range(7)]),
         {"indirect": 0.0},
-        [np.ones((2, 256))] * 4,
+        {("indirect", corrected): np.zeros((4, 7, 2, 256)) for corrected in (False, True)},
+        np.ones((4, 2, 256)),
     )
-    pilot.samples = {key: [np.zeros((7, 2, 256))] * 4 for key in pilot.samples}
-    pilot.decide(100)
-    assert session.radii["indirect"] == pytest.approx(0.16)
+    choice = measure(setting, pilot_pixels(setting), samples, 4, 1.0).choose(100)
+    assert choice.radii["indirect"] == pytest.approx(0.16)
 
 
 # --- Camera paths of an iteration ---------------------------------------------
 
 
 def made_up_pilot(scene, direct_noise, shared=True):
-    """A pilot of three iterations over a constant image: photons make half of it, with a noise that
-    falls with the radius and that the camera paths of a pixel have in common if it is `shared`;
-    `direct_noise` is that of the other half, relative to the image."""
+    """A session, and a pilot of three iterations over a constant image: photons make half of it,
+    with a noise that falls with the radius and that the camera paths of a pixel have in common if
+    it is `shared`; `direct_noise` is that of the other half, relative to the image."""
     session = bdpm(bdd=0, camera_paths=0, photon_count=3000, initial_radius=0.0).session(
         scene, seed=1
     )
-    session.plan_time(1000.0)
-    pilot, rng = Pilot(session), np.random.default_rng(5)
-    shape = pilot.pilot_camera_paths, pilot.pixels
-    pilot.ladder, pilot.photons = 0.1 * 2.0 ** -np.arange(6, -1, -1.0), {"indirect": 10.0}
-    pilot.direct = [0.5 + direct_noise * rng.normal(size=shape) for _ in range(3)]
+    session.plan_time(200.0, time.perf_counter())
+    setting, rng = session.pilot_setting(), np.random.default_rng(5)
+    pixels = pilot_pixels(setting)
+    shape, ladder = (pixels.camera_paths, pixels.count), 0.1 * 2.0 ** -np.arange(6, -1, -1.0)
+    direct = np.array([0.5 + direct_noise * rng.normal(size=shape) for _ in range(3)])
     photons = [
         0.5
         + 0.05
-        * rng.normal(size=(7, 1 if shared else pilot.pilot_camera_paths, pilot.pixels))
-        * (0.1 / pilot.ladder)[:, None, None]
+        * rng.normal(size=(7, 1 if shared else pixels.camera_paths, pixels.count))
+        * (0.1 / ladder)[:, None, None]
         for _ in range(3)
     ]
-    pilot.samples = {
-        key: [np.broadcast_to(values, (7, *shape)) for values in photons] for key in pilot.samples
-    }
-    pilot.decide(100)
-    return pilot
+    photons = np.array([np.broadcast_to(values, (7, *shape)) for values in photons])
+    gathered = {("indirect", corrected): photons for corrected in (False, True)}
+    samples = PilotSamples(ladder, {"indirect": 10.0}, gathered, direct)
+    return session, measure(setting, pixels, samples, 3, 1.0)
 
 
 @pytest.mark.parametrize(
@@ -920,27 +923,30 @@ def made_up_pilot(scene, direct_noise, shared=True):
 def test_camera_paths_follow_noise_and_cost(rgb, monkeypatch, direct_noise, cost, expected):
     """Several where camera paths make most of the noise and little of the cost; where they make
     little of the noise, two are not even tried."""
-    pilot, tried = made_up_pilot(box_scene(), direct_noise), []
+    session, pilot = made_up_pilot(box_scene(), direct_noise)
+    tried = []
 
-    def rehearse(session, guess, left):
+    def time_first_iterations(guess, left):
         tried.append(session.camera_paths)
-        return 1 + cost, 1 + cost
+        seconds = 1 + cost * (session.camera_paths - 1)
+        return seconds, seconds
 
-    monkeypatch.setattr("mis_integrators.pilot.run.rehearse", rehearse)
-    choose_camera_paths(pilot, 1.0, 200, 200)
-    assert pilot.camera_paths == pilot.session.camera_paths and pilot.camera_paths in expected
-    assert tried == ([2] if expected != {1} else [])
+    monkeypatch.setattr(session, "_time_first_iterations", time_first_iterations)
+    session._choose_by_clock(pilot)
+    assert session.camera_paths in expected
+    assert tried == ([1, 2] if expected != {1} else [1])
 
 
 @pytest.mark.parametrize("shared", [True, False])
 def test_camera_paths_average_their_own_noise_only(rgb, shared):
     """Of what photons bring, too, where it differs between the camera paths of a pixel (5 % of
     noise in the estimate)."""
-    pilot = made_up_pilot(box_scene(), 0.0, shared)
+    _, pilot = made_up_pilot(box_scene(), 0.0, shared)
     found = []
     for camera_paths in (1, 2, 8):
-        choice = pilot._best_radii(camera_paths, 100)["indirect"]
-        found.append(choice.variance * choice.radius**2 * (1 if shared else camera_paths))
+        choice = pilot.choose(100, camera_paths)
+        variance, radius = choice.prediction.variance, choice.radii["indirect"]
+        found.append(variance * radius**2 * (1 if shared else camera_paths))
     assert found[1:] == pytest.approx([found[0]] * 2, rel=0.25)
 
 
@@ -967,20 +973,15 @@ def test_noise_of_several_camera_paths_is_foreseen(rgb, plugin, given, camera_pa
         session.iterate()
     mean, variance = session.estimate()
     measured = relative_weights(mean.mean(axis=-1).ravel()) * 12 * variance.mean(axis=-1).ravel()
-    assert 1 / 1.3 < session.forecast.variance / trimmed_mean(measured) < 1.3
+    assert 1 / 1.3 < session.prediction.variance / trimmed_mean(measured) < 1.3
 
 
 def always_choose_camera_paths(monkeypatch, camera_paths):
     """Every pilot that may choose a number of camera paths chooses this one, however short the
     render."""
-    monkeypatch.setattr("mis_integrators.pilot.run.LONG", 0)
-
-    def choose(pilot, *_):
-        pilot.camera_paths = camera_paths
-        pilot.session.send(camera_paths)
-        return 0.0
-
-    monkeypatch.setattr("mis_integrators.pilot.run.choose_camera_paths", choose)
+    monkeypatch.setattr(PilotResult, "two_camera_paths_may_pay", lambda *_: True)
+    monkeypatch.setattr(PilotResult, "camera_share", lambda *_: CAMERA_SHARE)
+    monkeypatch.setattr(PilotResult, "best_camera_paths", lambda *_: camera_paths)
 
 
 def test_a_timed_render_chooses_its_camera_paths(rgb, monkeypatch):
@@ -1272,33 +1273,30 @@ def test_alpha_at_the_last_depth(rgb, max_depth):
 def test_timed_iterations_are_of_the_radii_rendered_with(rgb, monkeypatch, changed):
     """Iterations by which a pilot measures time belong to the image, unless the time they took
     changes the radii."""
-    from mis_integrators.pilot.run import Pilot
-
     scene, decisions = box_scene(), []
-    decide = Pilot.decide
+    choose = PilotResult.choose
 
-    def decide_again(pilot, count, reluctance=None):
-        choices = decide(pilot, count, 1.0 if reluctance is not None else None)
+    def choose_again(pilot, count, camera_paths, camera_share, kept=None, reluctance=0.0):
+        choice = choose(pilot, count, camera_paths, camera_share, kept, 1.0 if kept else 0.0)
         if changed and decisions:
-            pilot.session.radii = {
-                kind: 1.5 * radius for kind, radius in pilot.session.radii.items()
-            }
+            radii = {kind: 1.5 * radius for kind, radius in choice.radii.items()}
+            choice = dataclasses.replace(choice, radii=radii)
         decisions.append(count)
-        return choices
+        return choice
 
-    monkeypatch.setattr(Pilot, "decide", decide_again)
+    monkeypatch.setattr(PilotResult, "choose", choose_again)
     timed, same = (
         bdpm(bdd=0, initial_radius=0.0, photon_count=3000).session(scene, seed=4) for _ in range(2)
     )
     timed.plan_time(2.0)
     timed.start()
-    assert len(decisions) == 2 and bool(timed.rehearsed) != changed
+    assert len(decisions) == 2 and bool(timed.kept) != changed
     same.recall(timed.learned)
     for session in (timed, same):
         for _ in range(3):
             session.iterate()
     np.testing.assert_allclose(timed.image(), same.image(), rtol=1e-4, atol=1e-5)
-    assert not timed.rehearsed
+    assert not timed.kept
 
 
 def kernels(integrator, scene, seed):

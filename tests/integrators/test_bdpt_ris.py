@@ -789,7 +789,7 @@ def test_noise_is_seen_in_one_iteration(camera_paths):
     """Camera paths and splats with the same known variances in each pixel, in an image whose
     brightness varies a hundredfold: each is found to 5 % (five standard errors and more)."""
     from mis_integrators.integrators.light_tracing import observed_noise
-    from mis_integrators.pilot.radius import relative_weights
+    from mis_integrators.pilot.noise import relative_weights
 
     rng, width, height, rate = np.random.default_rng(2), 104, 96, 0.5
     brightness = np.repeat(np.repeat(np.geomspace(0.1, 10, 13), 8)[None], height, axis=0)

@@ -1,6 +1,20 @@
 """The pilot's arithmetic, on made-up pilots whose squared bias and noise are known exactly."""
 
 from mis_integrators.pilot import radius
+from mis_integrators.pilot.bias import (
+    AT_EDGES,
+    BY_CURVATURE,
+    expected_squared_bias,
+    jackknife,
+    squared_bias_over_difference,
+)
+from mis_integrators.pilot.edges import STEP_DEVIATION, light_lost_at_edges, shares_by_step
+from mis_integrators.pilot.noise import (
+    FEW_DISKS,
+    bounded_by_larger_disks,
+    relative_weights,
+    shrink_to_neighbours,
+)
 
 import numpy as np
 import pytest
@@ -41,10 +55,10 @@ def pilot(iterations, seed, reach=np.inf, noise=0.05, curvature=0.0):
 def test_constants_of_edges():
     u = (np.arange(200000) + 0.5) / 200000
     whole, half = lost_share(u), lost_share(2 * u)
-    exponent, ratio = radius.AT_EDGES
+    exponent, ratio = AT_EDGES
     assert exponent == 1
     assert np.mean(whole**2) / np.mean((whole - half) ** 2) == pytest.approx(ratio, rel=1e-3)
-    exponent, ratio = radius.BY_CURVATURE  # bias c R^2 against c (R^2 - R^2 / 4)
+    exponent, ratio = BY_CURVATURE  # bias c R^2 against c (R^2 - R^2 / 4)
     assert ratio == pytest.approx(1 / (1 - 1 / 4) ** 2) and exponent == 4
 
 
@@ -52,7 +66,7 @@ def test_products_of_iterations_are_unbiased():
     rng = np.random.default_rng(0)
     truth = np.array([0.3, 1.0])[:, None] * np.ones(2000)
     samples = truth + rng.normal(size=(5, 2, 2000))
-    value, error = radius.with_error(samples, samples, np.ones(2000))
+    value, error = jackknife(samples, samples, np.ones(2000))
     spread = np.sqrt(2 / (5 * 4) / 2000 + 4 * truth[:, 0] ** 2 / (5 * 2000))
     assert np.all(np.abs(value - truth[:, 0] ** 2) < FIVE_SIGMA * spread)
     assert np.all(error < 4 * spread) and np.all(error > spread / 4)
@@ -63,7 +77,7 @@ def test_products_of_iterations_are_unbiased():
 def test_share_lost_at_edges_is_found(reach, seed):
     plain, corrected = pilot(16, seed, reach)
     added, lost = losses(RADII[:, None], reach)
-    squared, share, doubt = radius.light_lost_at_edges(plain, corrected, np.ones(PIXELS))
+    squared, share, doubt = light_lost_at_edges(plain, corrected, np.ones(PIXELS))
     assert squared[3:] == pytest.approx((added**2).mean(axis=1)[3:], rel=1e-6)
     truth = (lost * added).mean(axis=1) / (added**2).mean(axis=1)
     assert np.all(np.abs(share - truth)[-2:] < FIVE_SIGMA * doubt[-2:] + 0.05)
@@ -79,7 +93,7 @@ def test_shares_known_from_three_iterations_are_not_believed():
         plain, corrected = (samples[..., ::16] for samples in pilot(3, seed, noise=0.3))
         share, doubt = (
             values[-1]
-            for values in radius.light_lost_at_edges(plain, corrected, np.ones(PIXELS // 16))[1:]
+            for values in light_lost_at_edges(plain, corrected, np.ones(PIXELS // 16))[1:]
         )
         off += abs(share - 1) > 2 * doubt
     assert off < 0.06 * 600
@@ -87,21 +101,21 @@ def test_shares_known_from_three_iterations_are_not_believed():
 
 def test_edges_are_believed_in_without_evidence():
     plain, corrected = pilot(3, 0, noise=30)
-    _, share, doubt = radius.light_lost_at_edges(plain, corrected, np.ones(PIXELS))
+    _, share, doubt = light_lost_at_edges(plain, corrected, np.ones(PIXELS))
     assert np.all(np.abs(share - 1) < 0.3) and np.all(doubt < 0.5)
 
 
 def test_shares_without_noise_are_as_measured():
     measured = np.array([0.9, 0.4, -0.1, 0.3])
-    shares, variances = radius.shares_by_step(measured, np.full(4, 1e-12))
+    shares, variances = shares_by_step(measured, np.full(4, 1e-12))
     assert shares[1:] == pytest.approx(measured, abs=1e-6) and np.all(variances[1:] < 1e-6)
-    assert measured[0] < shares[0] < 1 and variances[0] >= radius.SHARES_STRAY**2
+    assert measured[0] < shares[0] < 1 and variances[0] >= STEP_DEVIATION**2
 
 
 def test_hidden_shares_lie_between_one_and_the_next_larger():
     """Where the correction takes clutter for edges at large radii, noise at small ones is no reason
     to believe in it fully."""
-    shares, variances = radius.shares_by_step(
+    shares, variances = shares_by_step(
         np.array([5.0, -7.0, 3.0, 0.2]), np.array([1e6, 1e6, 1e6, 1e-6])
     )
     assert shares[-1] == pytest.approx(0.2, abs=1e-3)
@@ -112,8 +126,8 @@ def test_hidden_shares_lie_between_one_and_the_next_larger():
 @pytest.mark.parametrize("exponent", [1, 2, 4])
 def test_squared_bias_follows_from_differences(exponent):
     bias = 0.02 * (RADII / RADII[-1]) ** exponent
-    difference = np.concatenate([[0.0], bias[1:] / radius.squared_bias_over_difference(exponent)])
-    found = radius.expected_squared_bias(RADII, difference, 1e-3 * difference + 1e-9, 16, RADII)
+    difference = np.concatenate([[0.0], bias[1:] / squared_bias_over_difference(exponent)])
+    found = expected_squared_bias(RADII, difference, 1e-3 * difference + 1e-9, 16, RADII)
     assert found[1:3] == pytest.approx(bias[1:3], rel=0.5)
 
 
@@ -123,21 +137,19 @@ def test_errors_known_from_three_iterations_are_not_believed():
     pilots, 7 % if those errors were believed. (1000 pilots: false-alarm rate below 1e-4.)"""
     rng = np.random.default_rng(0)
     bias = 0.03 * (RADII / RADII[-1]) ** 2
-    true_difference = bias[1:] / radius.squared_bias_over_difference(2)
+    true_difference = bias[1:] / squared_bias_over_difference(2)
     noise = 0.003 * (RADII[-1] / RADII[1:]) ** 1.5
     too_large = 0
     for _ in range(1000):
         difference = np.concatenate([[0.0], true_difference + noise * rng.normal(size=6)])
         error = np.concatenate([[0.0], noise * np.sqrt(rng.chisquare(2, 6) / 2)])
-        too_large += (
-            radius.expected_squared_bias(RADII, difference, error, 3, RADII)[4] > 4 * bias[4]
-        )
+        too_large += expected_squared_bias(RADII, difference, error, 3, RADII)[4] > 4 * bias[4]
     assert too_large < 35
 
 
 def test_a_blind_pilot_still_expects_blur():
     error = np.full(len(RADII), 10.0)
-    found = radius.expected_squared_bias(RADII, np.zeros(len(RADII)), error, 16, RADII)
+    found = expected_squared_bias(RADII, np.zeros(len(RADII)), error, 16, RADII)
     assert 0.003 < found[-1] < 1
     assert np.all(np.diff(found) > 0)
 
@@ -165,7 +177,7 @@ def test_choice_is_nearly_the_best(reach, corrects, curvature, most, count):
     for seed in range(12):
         plain, corrected = pilot(3, seed, reach, noise, curvature)
         chosen, way, *_ = radius.best_radius(
-            radius.expect(RADII, plain, corrected, np.ones(PIXELS)),
+            radius.error_by_radius(RADII, plain, corrected, np.ones(PIXELS)),
             lambda r, corrected: count * np.ones_like(r),
         )
         ratios.append(true_error(chosen, way) / best)
@@ -176,7 +188,7 @@ def test_choice_is_nearly_the_best(reach, corrects, curvature, most, count):
 
 def test_more_iterations_mean_smaller_radii():
     plain, corrected = pilot(4, 0, curvature=0.05)
-    expected = radius.expect(RADII, plain, corrected, np.ones(PIXELS))
+    expected = radius.error_by_radius(RADII, plain, corrected, np.ones(PIXELS))
     chosen = [
         radius.best_radius(expected, lambda r, way, n=n: n * np.ones_like(r))[0]
         for n in (1, 30, 1000)
@@ -188,11 +200,11 @@ def test_noise_of_small_disks_is_what_large_ones_saw():
     """One bright photon that only the largest disk met counts for the smaller ones too."""
     seen = np.array([0.0, 0.0, 1.0])
     radii = np.array([1.0, 2.0, 4.0])
-    assert radius.noise_of_photons(radii, seen, 0.0) == pytest.approx([16.0, 4.0, 1.0])
-    assert radius.noise_of_photons(radii, seen, 0.0, [radius.FEW_MET] * 3) == pytest.approx(
+    assert bounded_by_larger_disks(radii, seen, 0.0) == pytest.approx([16.0, 4.0, 1.0])
+    assert bounded_by_larger_disks(radii, seen, 0.0, [FEW_DISKS] * 3) == pytest.approx(
         [0.0, 4.0, 1.0]
     )
-    assert radius.noise_of_photons(radii, seen, 0.0, [0, radius.FEW_MET, 10**6]) == pytest.approx(
+    assert bounded_by_larger_disks(radii, seen, 0.0, [0, FEW_DISKS, 10**6]) == pytest.approx(
         [16.0, 4.0, 1.0]
     )
 
@@ -207,7 +219,7 @@ def test_disks_that_met_no_photons_are_not_without_noise():
     samples = met * (RADII[-1] / RADII)[:, None] ** 2 * 1000.0
     assert not samples[:, 0].any() and samples[:, -1].any()
     choice = radius.best_radius(
-        radius.expect(RADII, samples, None, np.ones(PIXELS), alike=True), lambda *_: 100.0
+        radius.error_by_radius(RADII, samples, None, np.ones(PIXELS), alike=True), lambda *_: 100.0
     )
     assert choice.radius > RADII[-1] / 2
 
@@ -220,28 +232,24 @@ def test_steadied_means_do_not_know_their_own_noise():
     samples = truth * rng.exponential(size=(3, PIXELS))
 
     def noise(mean):
-        return np.mean(radius.relative_weights(mean) * samples.var(axis=0, ddof=1))
+        return np.mean(relative_weights(mean) * samples.var(axis=0, ddof=1))
 
     assert noise(samples.mean(axis=0)) < 0.8 * noise(truth)
-    assert noise(radius.shrink_to_neighbours(samples, cells)) == pytest.approx(
-        noise(truth), rel=0.15
-    )
+    assert noise(shrink_to_neighbours(samples, cells)) == pytest.approx(noise(truth), rel=0.15)
 
 
 def test_steadied_means_keep_what_is_real():
     rng, cells = np.random.default_rng(4), np.arange(PIXELS) // 16
     truth = np.exp(rng.normal(size=PIXELS))
-    np.testing.assert_allclose(radius.shrink_to_neighbours(np.array([truth] * 3), cells), truth)
+    np.testing.assert_allclose(shrink_to_neighbours(np.array([truth] * 3), cells), truth)
     noisy = truth * rng.normal(1, 0.1, size=(3, PIXELS))
     weights, plain, right = (
-        radius.relative_weights(mean)
-        for mean in (radius.shrink_to_neighbours(noisy, cells), noisy.mean(axis=0), truth)
+        relative_weights(mean)
+        for mean in (shrink_to_neighbours(noisy, cells), noisy.mean(axis=0), truth)
     )
     assert np.std(weights / right) < 1.1 * np.std(plain / right) < 0.2
-    assert radius.shrink_to_neighbours(noisy, cells).sum() == pytest.approx(
-        noisy.mean(axis=0).sum()
-    )
-    np.testing.assert_array_equal(radius.shrink_to_neighbours(noisy[:1], cells), noisy[0])
+    assert shrink_to_neighbours(noisy, cells).sum() == pytest.approx(noisy.mean(axis=0).sum())
+    np.testing.assert_array_equal(shrink_to_neighbours(noisy[:1], cells), noisy[0])
 
 
 def test_ladder_needs_vertices():

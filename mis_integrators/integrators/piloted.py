@@ -1,0 +1,183 @@
+"""Sessions whose merge radii a pilot chooses."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+
+from ..core.untrusted import Fields
+from ..pilot.cost import CAMERA_SHARE
+from ..pilot.result import Choice
+from ..pilot.run import run_pilot
+from ..pilot.setting import pilot_pixels
+from .common import IterativeSession
+from .schedule import LARGEST_RADIUS, SMALLEST_RADIUS, shrunk
+
+LIKE_A_PILOT = 1.5
+"""What an iteration takes, in seconds of one of the pilot, until it is measured."""
+TOO_SLOW = 1.5
+"""An iteration that takes so many times the guess is not believed to be typical."""
+
+
+class PilotedSession(IterativeSession):
+    """Runs a pilot, chooses from it, and renders with what was chosen.
+
+    A subclass says which photon maps there are (`kinds`), what the pilot must know of the render
+    (`pilot_setting`), how it estimates pixels (`pilot_passes`), and renders an iteration
+    (`_render`). In a render of a given time, the choice is made twice: the first iterations are
+    rendered with the first choice, to measure what they take, and are kept unless the second choice
+    is another.
+    """
+
+    def __init__(self, integrator, scene, sensor, seed, iterations):
+        super().__init__(integrator, scene, sensor, seed, iterations)
+        self.seconds = self.begun = None  # what rendering may take, and when it began
+        self.radii = None  # by kind of photons, once they are known
+        self.corrected = {}  # whether estimates are corrected at edges, by kind of photons
+        self.prediction = None  # a `Prediction`, where a pilot has chosen
+        self.kept = {}  # iterations that were rendered to measure their time, by number
+
+    def kinds(self):
+        """Photon maps that the scene needs."""
+        raise TypeError(f"{type(self).__name__} does not define kinds")
+
+    def pilot_setting(self):
+        """The `PilotSetting` of this render."""
+        raise TypeError(f"{type(self).__name__} does not define pilot_setting")
+
+    def pilot_passes(self, setting, pixels):
+        """The `PilotPasses` of this setting on these pixels."""
+        raise TypeError(f"{type(self).__name__} does not define pilot_passes")
+
+    def _render(self, iteration):
+        """The block of one iteration."""
+        raise TypeError(f"{type(self).__name__} does not define _render")
+
+    def _record_camera_pass(self):
+        """Records the camera pass anew, because its estimates are others."""
+        raise TypeError(f"{type(self).__name__} does not define _record_camera_pass")
+
+    def plan_time(self, seconds, begun=None):
+        """Rendering will last `seconds`, from `begun` (else from `start`) on: the automatic radius
+        is chosen for as many iterations as fit."""
+        self.seconds, self.begun = seconds, begun
+
+    @property
+    def settings(self):
+        radii = {f"radius.{kind}": radius for kind, radius in (self.radii or {}).items()}
+        corrected = {f"edge_correction.{kind}": flag for kind, flag in self.corrected.items()}
+        return {**super().settings, **radii, **corrected}
+
+    @property
+    def learned(self):
+        if self.radii is None:
+            return {}
+        return {
+            "radii": {kind: float(radius) for kind, radius in self.radii.items()},
+            "corrected": {kind: bool(flag) for kind, flag in self.corrected.items()},
+            "camera_paths": self.camera_paths,
+        }
+
+    def recall(self, learned):
+        if learned == {} and (self.radii is not None or not self.kinds()):
+            return
+        fields = Fields(learned, "learned")
+        radii, corrected = fields.object("radii"), fields.object("corrected")
+        self.radii = {
+            kind: radii.number(kind, LARGEST_RADIUS, SMALLEST_RADIUS) for kind in self.kinds()
+        }
+        self.corrected = {kind: corrected.boolean(kind) for kind in self.kinds()}
+        self.set_camera_paths(fields.integer("camera_paths", 1, self.most_camera_paths()))
+        for each in (radii, corrected, fields):
+            each.finish()
+
+    def set_camera_paths(self, camera_paths):
+        """Sends so many camera paths through each pixel from the next iteration on."""
+        self.resize(camera_paths)
+        self.kept.clear()
+
+    def radii_at(self, iteration):
+        """Merge radius of each kind of photon."""
+        return {
+            kind: dr.opaque(mi.Float, shrunk(radius, self.integrator.alpha, iteration))
+            for kind, radius in self.radii.items()
+        }
+
+    # ------------------------------------------------------------------ choice
+
+    def start(self):
+        if self.begun is None:
+            self.begun = time.perf_counter()
+        pilot = self._run_pilot()
+        if pilot is None:
+            self.radii = self.radii or {}
+        elif self.seconds is None:
+            self._take(pilot.choose(pilot.setting.planned_iterations))
+        else:
+            self._choose_by_clock(pilot)
+
+    def _run_pilot(self):
+        """The `PilotResult`; None where radii are known, or there are no photons to gather."""
+        if self.radii is not None or not self.kinds():
+            return None
+        setting = self.pilot_setting()
+        pixels = pilot_pixels(setting)
+        return run_pilot(setting, pixels, self.pilot_passes(setting, pixels))
+
+    def _choose_by_clock(self, pilot):
+        """Chooses for a guess of how many iterations there is time for, measures what one takes
+        with that choice, and chooses again. Where several camera paths a pixel may pay, what they
+        cost is measured, too."""
+        guess = LIKE_A_PILOT * pilot.seconds
+        left = max(self.begun + self.seconds - time.perf_counter(), guess)
+        camera_paths, camera_share = self.camera_paths, CAMERA_SHARE
+        first = pilot.choose(left / guess, camera_paths, camera_share)
+        self._take(first)
+        seconds, spent = self._time_first_iterations(guess, left)
+        count = max(left / seconds * pilot.cost(first, camera_paths), 1)
+        if pilot.two_camera_paths_may_pay(count, left / seconds):
+            self._take(replace(first, camera_paths=2))
+            of_two, more = self._time_first_iterations(2 * seconds, left)
+            spent += more
+            camera_share = pilot.camera_share(first, of_two / seconds)
+            camera_paths = pilot.best_camera_paths(count, camera_share)
+        reluctance = min(spent / left, 1)
+        self._take(pilot.choose(count, camera_paths, camera_share, first, reluctance))
+
+    def _take(self, choice: Choice):
+        """Renders with this choice from now on. What was rendered with another is no longer
+        kept."""
+        if choice.camera_paths != self.camera_paths:
+            self.set_camera_paths(choice.camera_paths)
+        if (choice.radii, choice.corrected) != (self.radii, self.corrected):
+            self.kept.clear()
+        changed = choice.corrected != self.corrected
+        self.radii, self.corrected = dict(choice.radii), dict(choice.corrected)
+        self.prediction = choice.prediction
+        if changed:
+            self._record_camera_pass()
+
+    def _time_first_iterations(self, guess, left):
+        """Renders the first iteration, and the second where the first took longer than it should
+        have (it may have had to be compiled) but not most of the seconds that are `left`; keeps
+        them. Returns the seconds of an iteration, and those of all."""
+        spent = 0.0
+        for number in range(2):
+            start = time.perf_counter()
+            block = self._render(number)
+            dr.eval(block)
+            dr.sync_thread()
+            seconds = time.perf_counter() - start
+            self.kept[number] = block
+            spent += seconds
+            if seconds < TOO_SLOW * guess or spent > left / 2:
+                break
+        return seconds, spent
+
+    def _iteration(self, iteration):
+        if iteration in self.kept:
+            return self.kept.pop(iteration)
+        return self._render(iteration)

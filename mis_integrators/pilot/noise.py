@@ -1,0 +1,119 @@
+"""The noise of estimates: V(R), the relative variance of a pixel over iterations."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+FEW_DISKS = 64
+"""Merge disks that found photons, fewer than which tell nothing of the noise of that radius."""
+RARE_PIXELS = 0.001
+"""Share of the pixels, the noisiest, without which noise is judged."""
+
+
+def relative_weights(mean: np.ndarray) -> np.ndarray:
+    """Weights 1 / (mean^2 + 0.1 <mean>^2) of squared errors: relative error, without letting dark
+    pixels rule. The overall mean <mean> leaves out the brightest tenth (visible lamps, the sky in
+    windows)."""
+    usual = np.mean(np.minimum(mean, np.quantile(mean, 0.9)))
+    return 1 / (mean**2 + 0.1 * usual**2 + 1e-30)
+
+
+def shrink_to_neighbours(samples: np.ndarray, cells: np.ndarray) -> np.ndarray:
+    """Means (pixels,) of `samples` (iterations, pixels), each drawn towards the mean of its
+    neighbours by as much as noise is of their differences.
+
+    A pixel's own noisy mean must not say what its noise is relative to: where it came out bright by
+    chance, its noise would count little. `cells`: (pixels,) the numbers of the pixels'
+    neighbourhoods, from 0.
+    """
+    iterations = len(samples)
+    means = samples.mean(axis=0)
+    if iterations < 2:
+        return means
+    number = np.maximum(np.bincount(cells), 1)
+    noise = np.bincount(cells, samples.var(axis=0, ddof=1) / iterations) / number
+    cell = np.bincount(cells, means) / number
+    spread = np.bincount(cells, (means - cell[cells]) ** 2) / np.maximum(number - 1, 1)
+    real = np.maximum(spread - noise, 0) / np.maximum(spread, 1e-30)
+    return cell[cells] + real[cells] * (means - cell[cells])
+
+
+def photon_variance(
+    radii: np.ndarray,
+    samples: np.ndarray,
+    weights: np.ndarray,
+    at_first_vertex: bool = True,
+    alike: bool = False,
+) -> np.ndarray:
+    """V(R), one a radius.
+
+    Parameters
+    ----------
+    samples : (iterations, radii, pixels)
+        Estimates of independent iterations.
+    weights : (pixels,)
+        See `relative_weights`.
+    at_first_vertex
+        Whether the vertices that gather are those which the camera sees, so that all noise is that
+        of photons.
+    alike
+        Whether photons are alike, as those of a caustic; see `bounded_by_larger_disks`.
+    """
+    variance = np.array([trimmed_mean(values) for values in weights * samples.var(axis=0, ddof=1)])
+    disks = np.count_nonzero(samples, axis=(0, 2)) if alike else None
+    return bounded_by_larger_disks(
+        radii, variance, 0.0 if at_first_vertex else variance.min(), disks
+    )
+
+
+def bounded_by_larger_disks(
+    radii: np.ndarray,
+    variance: np.ndarray,
+    floor: float,
+    disks: Sequence[int] | np.ndarray | None = None,
+) -> np.ndarray:
+    """V(R), no smaller than what larger radii say: the noise of photons falls with the area of the
+    disk, above a `floor` that is not theirs. Small disks seldom find the rare bright photons that
+    large ones have seen.
+
+    Where photons are alike, `disks` says how many disks of each radius found any. Then only the
+    next larger radius has a say: what larger disks spill from a caustic onto its dark surroundings
+    is far noisier, relative to them, than anything that small disks do. But a radius with fewer
+    than `FEW_DISKS` tells nothing, and has the noise of the next larger one.
+    """
+    photons = np.maximum(variance - floor, 0) * radii**2
+    if disks is None:
+        return floor + np.maximum.accumulate(photons[::-1])[::-1] / radii**2
+    seen = photons.copy()
+    for r in range(len(radii) - 2, -1, -1):
+        seen[r] = max(photons[r], photons[r + 1] if disks[r] >= FEW_DISKS else seen[r + 1])
+    return floor + seen / radii**2
+
+
+def variance_between_camera_paths(samples: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Relative variance between camera paths of a pixel that share photons, one a radius; zero
+    where there is one path.
+
+    `samples`: (iterations, radii, camera paths, pixels).
+    """
+    if samples.shape[2] == 1:
+        return np.zeros(samples.shape[1])
+    variance = np.var(samples, axis=2, ddof=1).mean(axis=0)
+    return np.array([trimmed_mean(pixels) for pixels in weights * variance])
+
+
+def direct_variance(direct: np.ndarray, weights: np.ndarray) -> float:
+    """Relative variance of the light of a camera path that does not come from photons; infinite
+    where one iteration tells nothing of it. `direct`: (iterations, camera paths, pixels)."""
+    if len(direct) < 2:
+        return trimmed_mean(weights * np.full(direct.shape[-1], np.inf))
+    return trimmed_mean(weights * np.var(direct, axis=0, ddof=1).mean(axis=0))
+
+
+def trimmed_mean(values: np.ndarray, rare: float = RARE_PIXELS, fewest: int = 0) -> float:
+    """Mean over pixels without the largest `rare` (a share) of them, `fewest` at least: one pixel
+    at the edge of a lamp can outweigh all others."""
+    kept = np.sort(values)[: max(len(values) - max(round(len(values) * rare), fewest), 1)]
+    return float(np.mean(kept))

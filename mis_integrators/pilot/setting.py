@@ -1,0 +1,90 @@
+"""What a pilot must know of a render, and the pixels that it takes."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+PILOT_PATHS = 4096
+NEIGHBOURS = 16
+"""Pilot pixels that are expected to look alike."""
+UNPLANNED_ITERATIONS = 64
+
+
+@dataclass(frozen=True)
+class PilotSetting:
+    """What a pilot must know of the render that it is for."""
+
+    width: int
+    """Pixels in a row of the film."""
+    pixels: int
+    """Of the film."""
+    extent: float
+    """Diagonal of the scene's bounding box."""
+    kinds: tuple[str, ...]
+    """Photon maps: `caustic`, `indirect`, or both."""
+    at_first_vertex: bool
+    """Whether photons are gathered at the first smooth vertex, which the camera sees."""
+    camera_paths: int
+    """Camera paths a pixel and iteration."""
+    chooses_camera_paths: bool
+    """Whether another number of them may be chosen."""
+    iterations: int | None
+    """Iterations planned, if their number is."""
+    seconds: float | None
+    """Seconds planned, if those are."""
+    mean: np.ndarray | None
+    """Radiance of the pilot's pixels that errors are relative to; None: the pilot's own."""
+
+    @property
+    def planned_iterations(self) -> int:
+        """A usual number where none is planned."""
+        return self.iterations or UNPLANNED_ITERATIONS
+
+    def corrections(self, kind: str) -> tuple[bool, ...]:
+        """The estimates to compare: plain ones, and those corrected at edges where these may be
+        better. Caustics have edges of their own; only the smooth indirect light gains from knowing
+        the surfaces' edges, and only where the camera sees the vertices: deeper ones are spread
+        over the scene, and their blur averages out."""
+        return (False, True) if kind == "indirect" and self.at_first_vertex else (False,)
+
+
+@dataclass(frozen=True)
+class PilotPixels:
+    """The pixels that a pilot renders: numbers 0, stride, 2 stride, ... of the film's.
+
+    Where an iteration may have several camera paths a pixel the pilot has two, which share the
+    photons of their iteration: their difference tells the noise of camera paths from that of
+    photons.
+    """
+
+    stride: int
+    count: int
+    camera_paths: int
+    """Camera paths through each of them, in one iteration of the pilot."""
+
+    @property
+    def paths(self) -> int:
+        """Camera paths in one iteration of the pilot."""
+        return self.count * self.camera_paths
+
+
+def pilot_pixels(setting: PilotSetting) -> PilotPixels:
+    """The `PilotPixels`, spread over the film and not in columns."""
+    camera_paths = 2 if setting.chooses_camera_paths or setting.camera_paths > 1 else 1
+    count = min(setting.pixels, PILOT_PATHS // camera_paths)
+    stride = setting.pixels // count
+    while stride > 1 and math.gcd(stride, setting.width) > 1:
+        stride -= 1
+    return PilotPixels(stride, count, camera_paths)
+
+
+def neighbourhoods(width: int, pixels: PilotPixels) -> np.ndarray:
+    """Numbers of the square cells of a film of this `width`, from 0, in which the pilot's pixels
+    lie, `NEIGHBOURS` in each: (pixels,)."""
+    side = math.sqrt(NEIGHBOURS * pixels.stride)
+    row, column = np.divmod(np.arange(pixels.count) * pixels.stride, width)
+    cells = (row // side) * math.ceil(width / side) + column // side
+    return np.unique(cells, return_inverse=True)[1]
