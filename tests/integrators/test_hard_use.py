@@ -108,9 +108,10 @@ def check_random_scenes(plugins, whole, **options):
 
 
 def test_random_scenes(rgb):
-    """The same few every time."""
-    visible = check_random_scenes(["bdpm"], 0.05, max_examples=2, derandomize=True)
-    assert len(visible) == 2 and min(visible) < 0.1
+    """The same few every time, until another version of hypothesis draws others: of four, none
+    shows an error of a tenth once in sixteen versions."""
+    visible = check_random_scenes(["bdpm"], 0.05, max_examples=4, derandomize=True)
+    assert len(visible) == 4 and min(visible) < 0.1
 
 
 @pytest.mark.parametrize(
