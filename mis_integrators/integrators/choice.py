@@ -35,26 +35,27 @@ PHOTON_MAPPERS = FIRST, OPT2, LATER, OPT3 = (
 """The first is tried in any case."""
 CANDIDATES = ("path", {}), *PHOTON_MAPPERS
 TRIAL_TIME_SHARE = 0.05
-"""Share of the planned time that the pilot may have; `path` and the first photon mapper are tried
-however long that takes."""
+"""Tuned: share of the planned time that the pilot may have; `path` and the first photon mapper are
+tried however long that takes."""
 KEEPS_UP = 4
-"""Where the error expected of `path` is at most so many times that of the first photon mapper,
-camera paths find much of the light by themselves, and what spoils photon maps are highlights on
-glossy surfaces: optimal weights are likely to be the best. (Where `path` is ahead, they seldom are
-by more than their trial takes.)"""
+"""Tuned: where the error expected of `path` is at most so many times that of the first photon
+mapper, camera paths find much of the light by themselves, and what spoils photon maps are
+highlights on glossy surfaces: optimal weights are likely to be the best. (Where `path` is ahead,
+they seldom are by more than their trial takes.)"""
 WORTH_SHARE = 0.3
-"""The share of the time that is left that a trial may then take. If it is won, nothing of it was in
-vain."""
+"""Tuned: the share of the time that is left that a trial may then take. If it is won, nothing of it
+was in vain."""
 LIKE_THE_FIRST = 2.5
-"""What trying another photon mapper takes, in the seconds that the first one took (optimal weights
-have to learn first): 1.6 to 3."""
+"""Tuned: what trying another photon mapper takes, in the seconds that the first one took (optimal
+weights have to learn first): 1.6 to 3."""
 PATH_TRIALS = 12
+"""Tuned: samples of `path` on each of the pilot's pixels."""
 UNSEEN = 1e-3
-"""Share of the light, brought by caustics, from which on a `path` that cannot see them is out of
-the question."""
+"""Tuned: share of the light, brought by caustics, from which on a `path` that cannot see them is
+out of the question."""
 RARE = 0.02
-"""The same for a `path` that meets them by chance only: so seldom that a pilot does not see how
-noisy they are."""
+"""Tuned: the same for a `path` that meets them by chance only: so seldom that a pilot does not see
+how noisy they are."""
 
 
 @dataclass

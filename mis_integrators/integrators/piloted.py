@@ -17,9 +17,9 @@ from .common import IterativeSession
 from .schedule import LARGEST_RADIUS, SMALLEST_RADIUS, shrunk
 
 LIKE_A_PILOT = 1.5
-"""What an iteration takes, in seconds of one of the pilot, until it is measured."""
+"""Tuned: what an iteration takes, in seconds of one of the pilot, until it is measured."""
 TOO_SLOW = 1.5
-"""An iteration that takes so many times the guess is not believed to be typical."""
+"""Tuned: an iteration that takes so many times the guess is not believed to be typical."""
 
 
 class PilotedSession(IterativeSession):

@@ -20,7 +20,7 @@ from .common import MOST_LIGHT_PATHS
 from .schedule import LARGEST_RADIUS, SMALLEST_RADIUS, read_radius, shrunk
 
 RADIUS_SHARE = 0.004
-"""The automatic radius, in units of the spread of what the camera sees."""
+"""Tuned: the automatic radius, in units of the spread of what the camera sees."""
 
 
 class VCM(BDPT):

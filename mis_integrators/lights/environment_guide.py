@@ -26,31 +26,38 @@ from .histograms import draw_cell, in_square_cell, smoothed, square_cell
 from .portals import PortalDistribution
 
 POLAR_CELLS = 16
+"""Tuned: cells of directions from pole to pole."""
 AZIMUTH_CELLS = 32
+"""Tuned: cells of directions around."""
 DIRECTION_CELLS = POLAR_CELLS * AZIMUTH_CELLS
 POSITION_CELLS = 64
+"""Tuned: cells along each edge of the position histograms."""
 DEFENSIVE_SHARE = 0.1
-"""Share of sub-paths that start anywhere on the scene's disk."""
+"""Tuned: share of sub-paths that start anywhere on the scene's disk."""
 ENOUGH_RECORDS = 256
-"""Records of a direction cell at which its own histogram has as large a share as the one over the
-faces of the box, which serves all of them."""
+"""Tuned: records of a direction cell at which its own histogram has as large a share as the one
+over the faces of the box, which serves all of them."""
 PILOT_PATHS = 65536
+"""Tuned: camera paths of the pilot."""
 PILOT_BOUNCES = 4
+"""Tuned: vertices of each."""
 TESTS = 2
-"""Directions in which each place of the pilot looks for an environment, once these are known."""
+"""Tuned: directions in which each place of the pilot looks for an environment, once these are
+known."""
 PASS_THROUGH = 8
 """Transmissive surfaces that the pilot's visibility test looks straight through (panes, masks)."""
 LEVEL_SHARES = (0.55, 0.25, 0.1, 0.1)
-"""Shares of the position histogram at full, half, quarter and eighth resolution."""
+"""Tuned: shares of the position histogram at full, half, quarter and eighth resolution."""
 FEWEST_RECORDS = 64
+"""Tuned: records, fewer than which tell nothing."""
 SPREAD_WAVELENGTHS = 450, 520, 590, 640
 """Wavelengths [nm] at which lights are looked at where no path brings its own."""
 AIMED_SHARE = 0.5
-"""Share of the directions of direct light that are aimed at the entrances, if any are."""
+"""Tuned: share of the directions of direct light that are aimed at the entrances, if any are."""
 WORTH_AIMING = 0.9
-"""None are if that leaves more than this of the noise."""
+"""Tuned: none are if that leaves more than this of the noise."""
 FOCUS_TAIL = 0.01
-"""Share of the records' weight that may lie outside the focus, at each end of each axis."""
+"""Tuned: share of the records' weight that may lie outside the focus, at each end of each axis."""
 
 
 def infinite_emitters(scene):

@@ -21,12 +21,13 @@ from ..core.traits import UnsupportedScene, lookup, registry_table
 from .environment_guide import AIMED_SHARE, EnvironmentGuide, direction_cell, infinite_emitters
 
 POWER_SAMPLES = 4096
+"""Tuned: rays by which the power of a textured emitter is estimated."""
 LEAST_POWER = 1e-6
 """Of a textured emitter of which no sample has met light, as a share of the others' power: its
 texture may have small bright spots all the same. (By `UNIFORM_SHARE` it is chosen more often.)"""
 UNIFORM_SHARE = 0.1
-"""Share of the choices among emitters that ignores power, so that a dim but near emitter is not
-starved."""
+"""Tuned: share of the choices among emitters that ignores power, so that a dim but near emitter is
+not starved."""
 
 
 def mis_power(pdf_a, pdf_b):

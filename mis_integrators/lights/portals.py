@@ -15,16 +15,16 @@ from ..core.packing import from_numpy
 from .histograms import draw_cell, in_square_cell, smoothed, square_cell
 
 FACE_CELLS = 64
-"""Cells along each edge of a face."""
+"""Tuned: cells along each edge of a face."""
 FACES = 6
 """Numbers 2 a (the lower face across axis a) and 2 a + 1 (the upper one)."""
 LEVEL_SHARES = (0.4, 0.2, 0.15, 0.15, 0.1)
-"""Shares of the histograms at full, half, quarter, ... resolution."""
+"""Tuned: shares of the histograms at full, half, quarter, ... resolution."""
 LEAST_EXTENT = 0.02
-"""Least edge of the box, in units of its longest."""
+"""Tuned: least edge of the box, in units of its longest."""
 MARGIN = 0.1
-"""How far from the box a place may be that still looks through its faces for light, in units of the
-box' edges."""
+"""Tuned: how far from the box a place may be that still looks through its faces for light, in units
+of the box' edges."""
 
 
 class PortalDistribution:

@@ -16,9 +16,9 @@ from .setting import LightPass, Limits, World
 Array = Any
 
 PATHS_PER_LANE = 8
-"""Light sub-paths that a SIMD lane of a CPU traces one after the other: a lane whose path has ended
-starts the next at once, instead of waiting for the longest path beside it. (A GPU needs the paths
-side by side.)"""
+"""Tuned: light sub-paths that a SIMD lane of a CPU traces one after the other: a lane whose path
+has ended starts the next at once, instead of waiting for the longest path beside it. (A GPU needs
+the paths side by side.)"""
 
 
 def lane_count(n_paths):

@@ -15,14 +15,15 @@ from ..core.random import vertex_streams
 from .gather import SAME_SURFACE_COSINE, SAME_SURFACE_OFFSET
 
 PROBES = 8
+"""Tuned: probe rays of a merge disk."""
 OUTER = PROBES // 2
 """Probes of the outer half of the disk, which are made first, a quarter turn apart: where they all
 find surface there is no edge, and the others are not made."""
 HEIGHT = 0.25
-"""Probes start this share of the radius above the vertex, or halfway to what is closer."""
+"""Tuned: probes start this share of the radius above the vertex, or halfway to what is closer."""
 SMALLEST_SHARE = 0.4
-"""Right at a wall half of the disk is left. Smaller estimates come from clutter that the probes
-meet as often as from corners, and would brighten more than they mend."""
+"""Tuned: right at a wall half of the disk is left. Smaller estimates come from clutter that the
+probes meet as often as from corners, and would brighten more than they mend."""
 OWN_STREAM = 0x70726F62
 """Keeps the probes' random numbers apart from those of the camera paths, which share their seed."""
 

@@ -21,13 +21,15 @@ from .photon import read_power
 from .queries import LAST_VERTEX
 
 SAME_SURFACE_COSINE = 0.7
-"""Photons merge only with vertices whose geometric normals differ by less than 45 degrees."""
+"""Tuned: photons merge only with vertices whose geometric normals differ by less than 45
+degrees."""
 SAME_SURFACE_OFFSET = 0.5
-"""... and that lie closer than this share of the radius along the normal (steps, thin objects)."""
+"""Tuned: ... and that lie closer than this share of the radius along the normal (steps, thin
+objects)."""
 SAME_PLANE_COSINE_SQUARED = 0.9999
 LARGEST_COSINE_RATIO = 4.0
-"""Bound on shading over geometric cosine of a photon's direction, which grazing light on smoothed
-meshes would exceed."""
+"""Tuned: bound on shading over geometric cosine of a photon's direction, which grazing light on
+smoothed meshes would exceed."""
 SMALLEST_COSINE = 1e-6
 
 

@@ -17,7 +17,7 @@ from .photon import landing_of, power_layout, read_landing, surface_layout
 RUN = 32
 """Photons of a row that a query tests at once: one bit of a word each."""
 KEPT_RUNS = 4
-"""Runs with hits that a query keeps before it visits these."""
+"""Tuned: runs with hits that a query keeps before it visits these."""
 
 
 def table_size(capacity):

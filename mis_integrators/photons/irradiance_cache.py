@@ -25,19 +25,21 @@ from .grid import build_photon_map, for_each_photon, smallest_cell
 from .photon import read_landing, read_power, surface_layout
 
 PHOTONS_A_CELL = 32
+"""Tuned: photons of a cell, on average over those that hold any."""
 GATHER_RADIUS = 2.0
-"""Radius within which photons count for a cell, in units of its edge: noise of the cells costs more
-than their blur does."""
+"""Tuned: radius within which photons count for a cell, in units of its edge: noise of the cells
+costs more than their blur does."""
 TRIAL_SHARE = 1 / 64
 """Edge of the first, trial cells as a share of the scene's diagonal."""
 LARGEST_SHARE = 0.2
-"""Largest edge of the cells, in the same unit."""
+"""Tuned: largest edge of the cells, in the same unit."""
 INDEX_BITS = 23
 MOST_LIGHTS = 64
-"""Emitters tried as the strongest of a cell."""
+"""Tuned: emitters tried as the strongest of a cell."""
 DIRECT_SAMPLES = 32
+"""Tuned: samples of next-event estimation at a cell, by which its noise is estimated."""
 UNSEEN_NOISE = 200.0
-"""Relative variance of next-event estimation that is assumed where none of the samples meets
+"""Tuned: relative variance of next-event estimation that is assumed where none of the samples meets
 light."""
 OWN_STREAM = 0x64697265
 

@@ -14,14 +14,14 @@ AT_EDGES, BY_CURVATURE = (1, 4.327), (4, 16 / 9)
 is u R away loses the share g(u) = (acos u - u sqrt(1 - u^2)) / pi, and the ratio is the integral of
 g(u)^2 over that of (g(u) - g(2u))^2. Curvature has the bias c R^2 against c (R^2 - R^2 / 4)."""
 LEAST_BIAS, MOST_BIAS = 0.003, 1.0
-"""Squared relative bias that disks of the ladder's largest radius can have, however little of it a
-short pilot sees. (In Cornell boxes, a corridor, rooms lit through a door or a window it is 0.002 to
-0.04.)"""
+"""Tuned: squared relative bias that disks of the ladder's largest radius can have, however little
+of it a short pilot sees. (In Cornell boxes, a corridor, rooms lit through a door or a window it is
+0.002 to 0.04.)"""
 LEAST_CORRECTED = 1e-4
-"""The same where the correction at edges adds what plain estimates lack (1e-4 to 1.6e-3 in Cornell
-boxes)."""
+"""Tuned: the same where the correction at edges adds what plain estimates lack (1e-4 to 1.6e-3 in
+Cornell boxes)."""
 MISFIT_OF_LAW = 0.15
-"""Relative error of the law itself, beyond the noise of Q."""
+"""Tuned: relative error of the law itself, beyond the noise of Q."""
 
 
 def expected_products(a: np.ndarray, b: np.ndarray, weights: np.ndarray) -> np.ndarray:

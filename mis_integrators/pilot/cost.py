@@ -10,17 +10,18 @@ import numpy as np
 Gathered = TypeVar("Gathered", float, np.ndarray)
 
 GATHER_COST = 0.013
-"""Cost of one gathered photon a vertex, in units of an iteration's light and camera passes (0.006
-to 0.018 on the bundled scenes)."""
+"""Tuned: cost of one gathered photon a vertex, in units of an iteration's light and camera passes
+(0.006 to 0.018 on the bundled scenes)."""
 PROBE_COST = 0.15
-"""Cost of the probe rays of corrected estimates, in the same units (0.03 to 0.25)."""
+"""Tuned: cost of the probe rays of corrected estimates, in the same units (0.03 to 0.25)."""
 CAMERA_SHARE = 0.35
-"""Share of the same units that each camera path of a pixel takes, until it is measured (0.1 to 0.5
-on the bundled scenes)."""
+"""Tuned: share of the same units that each camera path of a pixel takes, until it is measured (0.1
+to 0.5 on the bundled scenes)."""
 LEAST_CAMERA_SHARE, MOST_CAMERA_SHARE = 0.1, 0.8
+"""Tuned: bounds of the measured camera share."""
 USUAL_PHOTONS = 10
-"""Photons a gather at which an iteration counts as one planned iteration: larger gathers must pay
-for themselves."""
+"""Tuned: photons a gather at which an iteration counts as one planned iteration: larger gathers
+must pay for themselves."""
 
 
 def iteration_cost(

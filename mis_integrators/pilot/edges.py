@@ -7,12 +7,12 @@ import numpy as np
 from .bias import expected_products, jackknife
 
 STUDENT_WIDENING = 2
-"""A standard error estimated from n + 1 iterations counts for 1 + STUDENT_WIDENING / n times what
-they say, about as Student's 95 % intervals are wider than normal ones."""
+"""Tuned: A standard error estimated from n + 1 iterations counts for 1 + STUDENT_WIDENING / n times
+what they say, about as Student's 95 % intervals are wider than normal ones."""
 STEP_DEVIATION, RETURN_TO_ONE = 0.3, 0.5
-"""The share that plain estimates lack, from one step of the ladder to the next smaller one: its
-standard deviation, and which part of its distance from one, where small disks have it, it makes up
-for."""
+"""Tuned: the share that plain estimates lack, from one step of the ladder to the next smaller one:
+its standard deviation, and which part of its distance from one, where small disks have it, it makes
+up for."""
 
 
 def light_lost_at_edges(

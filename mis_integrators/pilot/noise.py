@@ -7,9 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 
 FEW_DISKS = 64
-"""Merge disks that found photons, fewer than which tell nothing of the noise of that radius."""
+"""Tuned: merge disks that found photons, fewer than which tell nothing of the noise of that
+radius."""
 RARE_PIXELS = 0.001
-"""Share of the pixels, the noisiest, without which noise is judged."""
+"""Tuned: share of the pixels, the noisiest, without which noise is judged."""
 
 
 def relative_weights(mean: np.ndarray) -> np.ndarray:

@@ -36,12 +36,14 @@ from .edges import light_lost_at_edges
 from .noise import photon_variance, relative_weights
 
 LADDER_STEPS = 7
+"""Tuned: radii of the ladder."""
 STEP = 2.0
 LARGEST_SHARE = 0.08
-"""Largest radius of the ladder in units of the spread of the points where photons are gathered."""
+"""Tuned: largest radius of the ladder in units of the spread of the points where photons are
+gathered."""
 LEAST_NOISE = 0.1
-"""Share of the noise of a pilot's pixels that is left, however many camera paths they average: that
-of their photons."""
+"""Tuned: share of the noise of a pilot's pixels that is left, however many camera paths they
+average: that of their photons."""
 
 
 def ladder(points: np.ndarray, weights: np.ndarray) -> np.ndarray | None:

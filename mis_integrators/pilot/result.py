@@ -21,14 +21,15 @@ from .setting import PilotPixels, PilotSetting, neighbourhoods
 Radii = TypeVar("Radii", float, np.ndarray)
 
 NUMBERS_OF_PATHS = (1, 2, 4, 8)
-"""Camera paths a pixel and iteration that are considered."""
+"""Tuned: camera paths a pixel and iteration that are considered."""
 LONG = 16
-"""Iterations that a render must have time for, lest several camera paths not be worth trying."""
+"""Tuned: iterations that a render must have time for, lest several camera paths not be worth
+trying."""
 WORTH_TRYING = 0.92
-"""Two camera paths are tried where the best number is expected to make the error smaller by this
-factor, if a camera path costs the least that it may."""
+"""Tuned: two camera paths are tried where the best number is expected to make the error smaller by
+this factor, if a camera path costs the least that it may."""
 WORTH_CHANGING = 0.95
-"""Another number than was tried must make it smaller by this factor."""
+"""Tuned: another number than was tried must make it smaller by this factor."""
 RADIUS_WITHOUT_VERTICES = 1e-3
 """The radius where no camera path meets a surface that gathers, in units of the scene's extent."""
 

@@ -12,15 +12,18 @@ from .result import PilotResult, PilotSamples, measure
 from .setting import PilotPixels, PilotSetting
 
 FEWEST_ITERATIONS, FEWEST_TIMED_ITERATIONS, MOST_ITERATIONS = 4, 3, 16
+"""Tuned: iterations of a pilot: the fewest, the fewest in renders of a given time, the most."""
 PILOT_TIME_SHARE = 0.04
-"""Share of the planned iterations, or seconds, that the pilot may have once it has the fewest."""
+"""Tuned: share of the planned iterations, or seconds, that the pilot may have once it has the
+fewest."""
 PILOT_INDEX = 1 << 30
 """Iteration numbers of the pilot start here, so that its random numbers are its own."""
 MOST_PHOTONS = 160
-"""Photons a vertex within the largest radius that is tried."""
+"""Tuned: photons a vertex within the largest radius that is tried."""
 FEWEST_PHOTONS, WIDER = 1, 4
-"""Photons a vertex within the largest radius, fewer than which tell nothing (the camera may see one
-point only): then radii so many times larger are tried, up to those that suit the whole scene."""
+"""Tuned: photons a vertex within the largest radius, fewer than which tell nothing (the camera may
+see one point only): then radii so many times larger are tried, up to those that suit the whole
+scene."""
 
 
 class PilotIteration(Protocol):

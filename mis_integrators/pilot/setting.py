@@ -8,9 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 
 PILOT_PATHS = 4096
+"""Tuned: camera paths of a pilot's iteration, about."""
 NEIGHBOURS = 16
-"""Pilot pixels that are expected to look alike."""
+"""Tuned: pilot pixels that are expected to look alike."""
 UNPLANNED_ITERATIONS = 64
+"""Tuned: iterations that a render without a planned end is taken to have."""
 
 
 @dataclass(frozen=True)

@@ -18,13 +18,13 @@ from ..core.packing import from_numpy, to_numpy
 CELLS = 1 << 14
 """Cells of the grid at most; times six facings and the number of neighbours, four bytes each."""
 FINENESS = 0.75
-"""Edge of a cell over the cache points' spacing, unless that makes too many cells."""
+"""Tuned: edge of a cell over the cache points' spacing, unless that makes too many cells."""
 BLOCK = 4
 """Edge of a block of cells that are searched together, in cells."""
 FACINGS = 6
 NORMAL_COST = 8.0
-"""Squared distance, in units of the cache points' spacing, that a cache point facing the other way
-seems farther; a right angle: half of it."""
+"""Tuned: squared distance, in units of the cache points' spacing, that a cache point facing the
+other way seems farther; a right angle: half of it."""
 
 
 class CacheGrid:

@@ -6,11 +6,11 @@ import drjit as dr
 import mitsuba as mi
 
 UNIFORM_SHARE = 0.03, 0.2
-"""Share of draws that ignore the cache, for what no near cache point is sent: where a cache point
-sees all light, and where it sees none."""
+"""Tuned: share of draws that ignore the cache, for what no near cache point is sent: where a cache
+point sees all light, and where it sees none."""
 BLIND_SHARE = 0.4
-"""Share of the cached pmfs that ignores what stands between: a cache point in the shadow knows
-little of a place near it in the light."""
+"""Tuned: share of the cached pmfs that ignores what stands between: a cache point in the shadow
+knows little of a place near it in the light."""
 
 
 def uniform_share(visible):

@@ -16,8 +16,8 @@ BLOCKED, SHIFT_INVALID = 0.0, -1.0
 """What stands in a connection's `ratio` where a view does not see the pivot, and where it sees it
 but the shift fails."""
 DIM = 4.0
-"""Optical depth beyond that of the clearest view from which on a view shares next to nothing (e^-4
-of its paths)."""
+"""Tuned: optical depth beyond that of the clearest view from which on a view shares next to nothing
+(e^-4 of its paths)."""
 MOST_NULLS = 256.0
 """Expected number of null interactions up to which views are made to agree: bounds the work."""
 

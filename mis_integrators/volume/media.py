@@ -8,7 +8,7 @@ import mitsuba as mi
 from ..core.spectra import channel_mean
 
 FAINT = 0.05
-"""Transmittance below which the estimate on the way to a light plays roulette."""
+"""Tuned: transmittance below which the estimate on the way to a light plays roulette."""
 
 
 def point_in(medium, p, time, wavelengths):
