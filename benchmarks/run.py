@@ -19,6 +19,7 @@ from common.methods import COMPARED, VARIED, Method, parse_method, registered  #
 from common.scene_files import BUNDLED, bundled  # noqa: E402
 from experiments import (  # noqa: E402
     compare,
+    constants,
     converge,
     costs,
     freezing,
@@ -279,6 +280,44 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument(
         "--scale", type=_positive, default=1, help="film size, scene's own = 1 (default: 1)"
     )
+
+    command = _measuring(commands, "constants", constants)
+    command.add_argument(
+        "--file",
+        type=Path,
+        default=Path("out/constants.json"),
+        metavar="FILE",
+        help="where figures are kept, and added to (default: out/constants.json)",
+    )
+    command.add_argument(
+        "--only", nargs="+", metavar="TEXT", help="constants whose names contain one of these"
+    )
+    command.add_argument(
+        "--change",
+        nargs="+",
+        metavar="MODULE.NAME=VALUE",
+        help="try these values, all at once, instead",
+    )
+    command.add_argument(
+        "--method", type=_method, metavar="PLUGIN[:...]", help="what renders (default: by module)"
+    )
+    command.add_argument(
+        "--time",
+        type=_positive,
+        default=3,
+        metavar="SECONDS",
+        help="rendering seconds of each (default: 3)",
+    )
+    command.add_argument("--seeds", type=int, default=1, help="renders of each (default: 1)")
+    command.add_argument(
+        "--width", type=int, default=160, help="of the films, in pixels (default: 160)"
+    )
+    command.add_argument(
+        "--processor-time",
+        action="store_true",
+        help="count seconds of all processors together, for machines that do other work too",
+    )
+    references.add_options(command)
 
     command = _measuring(commands, "views", view_counts, scenes=False)
     _views(command, view_counts.COUNTS, 0.25, 3, 1)
