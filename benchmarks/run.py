@@ -285,9 +285,12 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument(
         "--file",
         type=Path,
-        default=Path("out/constants.json"),
+        default=constants.FIGURES,
         metavar="FILE",
-        help="where figures are kept, and added to (default: out/constants.json)",
+        help="where figures are kept, and added to (default: docs/constants.json)",
+    )
+    command.add_argument(
+        "--page", action="store_true", help="only print docs/constants.md from code and figures"
     )
     command.add_argument(
         "--only", nargs="+", metavar="TEXT", help="constants whose names contain one of these"

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ast
 import importlib
+import itertools
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -64,7 +65,7 @@ def tuned_constants() -> list[Constant]:
 
 def _in_module(path: Path, module: str) -> Iterator[Constant]:
     body = ast.parse(path.read_text()).body
-    for statement, following in zip(body, body[1:]):
+    for statement, following in itertools.pairwise(body):
         text = _docstring(following)
         if isinstance(statement, ast.Assign) and text.startswith(MARK):
             meaning = " ".join(text.removeprefix(MARK).split())

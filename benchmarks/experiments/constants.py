@@ -22,6 +22,7 @@ from common.rows import console
 from common.scene_files import OpenScene, open_scene
 from common.tuned import Constant, changed, tuned_constants
 from common.turns import Contender
+from report import constants as report
 
 METHODS = {
     "mis.optimal": "bdpm_opt3",
@@ -54,8 +55,23 @@ def variants(constant: Constant) -> dict[str, object]:
     return {name: value for name, value in tried.items() if value is not None}
 
 
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "constants.md"
+FIGURES = PAGE.with_suffix(".json")
+NOTES = "## What went"
+"""What the page's last part begins with, which is written by hand."""
+
+
+def page() -> str:
+    """The text of the page of constants, from the code and the figures kept beside the page."""
+    notes = NOTES + PAGE.read_text().partition(NOTES)[2]
+    return report.page(tuned_constants(), json.loads(FIGURES.read_text()), notes)
+
+
 def run(options: argparse.Namespace) -> None:
-    """The sub-command ``constants``: adds what it finds to a file, after each scene."""
+    """The sub-command ``constants``: adds what it finds to a file, after each constant."""
+    if options.page:
+        PAGE.write_text(page())
+        return
     if options.processor_time:
         time.perf_counter = time.process_time
     experiments = wanted(options)
