@@ -33,11 +33,11 @@ from ..mis.resampling import (
 )
 from ..paths.camera import with_gaps
 from ..paths.camera_vertices import STEP, LightEnd, hit_layout, sum_before, trace_camera_vertices
-from ..paths.connect import join_sensor, list_draws
+from ..paths.connect import join_sensor
 from ..paths.light_starts import sample_light_starts
 from ..paths.sensor import Lens
 from ..paths.setting import World
-from ..paths.subpaths import Kept, read_vertices, seen_normal, trace_light_subpaths, vertex_bsdf_of
+from ..paths.subpaths import read_vertices, seen_normal, trace_light_subpaths, vertex_bsdf_of
 from ..paths.vertex import scattered_mean
 from ..resampling.cache_points import CacheGrid
 from ..resampling.light_vertices import END, LightVertices, list_light_vertices
@@ -63,9 +63,9 @@ made); beyond that there are fewer cache points."""
 FEW = 8
 """Renders of fewer iterations do not find out how many light sub-paths pay: the passes would have
 to be recorded anew for the rest."""
-KEPT_DRAWS = 0.9
-"""Share of the camera vertices that there is room for among those that draw, at first: enough in
-most scenes."""
+MORE_ROOM = 1.1
+"""Room for vertices of sub-paths over what the first iteration has: a connection takes a lane for
+each place of a camera vertex, used or not."""
 KNOWN_PATHS, MOST_KNOWN_SETS = 200, 8
 """Light sub-paths of the first iteration from which Q and Q_s are estimated, in sets of M; at most
 so many sets."""
@@ -121,8 +121,7 @@ class ResampledSession(IterativeSession):
         "_camera_pass": ("_trace_camera", ("camera", "hits")),
         "_pilot_pass": ("_pilot_targets", ("light", "ends")),
         "_target_pass": ("_own_targets", ("light", "ends")),
-        "_draw_pass": ("_list_draws", ("camera", "draws")),
-        "_connection_pass": ("_connect", ("light", "camera", "ends", "draws")),
+        "_connection_pass": ("_connect", ("light", "camera", "ends")),
         "_hit_pass": ("_meet", ("camera", "hits")),
         "_sensor_pass": ("_join_sensor", ("light",)),
     }
@@ -137,7 +136,6 @@ class ResampledSession(IterativeSession):
         self.pixel_paths = width * height * integrator.camera_paths
         self.capacity = {
             "camera": rounded_up(4 * self.chunk),
-            "draws": rounded_up(self.chunk),
             "hits": rounded_up(self.chunk),
             "ends": rounded_up(6 * integrator.resampled_light_paths),
         }
@@ -345,18 +343,6 @@ class ResampledSession(IterativeSession):
         dr.eval(pmfs)  # a recording cannot make it
         return pmfs
 
-    def _list_draws(self, tables, camera, count, expected, seed):
-        """As `list_draws`."""
-        return list_draws(
-            self.grid,
-            expected,
-            Kept(camera, count, self.capacity["camera"]),
-            self.chunk,
-            STEP,
-            self.capacity["draws"],
-            seed,
-        )
-
     def _connect(
         self,
         scene,
@@ -364,27 +350,26 @@ class ResampledSession(IterativeSession):
         tables,
         radiance,
         camera,
-        draws,
+        count,
         proposals,
         seed,
         spectral,
     ):
-        """Radiance of camera paths with that of connections to drawn light sub-paths added.
-        `draws`: as of `list_draws`; `proposals`: as of `_proposals`."""
+        """Radiance of camera paths with that of connections of their `count` vertices to drawn
+        light sub-paths added. `proposals`: as of `_proposals`."""
         light, starts, places, found, pmfs = proposals
         integrator, weights = self.integrator, self.weights()
         ends = self._ends(starts, light, places, found)
         pmf = Proposals(
             self.grid,
-            *pmfs[:2],
+            *pmfs,
             ends.count,
             integrator.resampled_light_paths + self.capacity["ends"],
         )
-        index = lanes(self.capacity["draws"] * integrator.resamples)
-        chosen, factor, count = draws
+        index = lanes(self.capacity["camera"] * integrator.resamples)
         slot = index // integrator.resamples
         active = slot < dr.gather(mi.UInt32, count, 0)
-        z = read_vertices(camera, dr.gather(mi.UInt32, chosen, slot, active), active, states=STEP)
+        z = read_vertices(camera, slot, active, states=STEP)
         rng = vertex_streams(
             z["path"] * integrator.resamples + index % integrator.resamples, z["number"], seed
         )
@@ -405,9 +390,7 @@ class ResampledSession(IterativeSession):
         carried = z["throughput"] * value * sent.light
         active &= (dr.max(carried) > 0) & dr.all(dr.isfinite(carried))
         active = ends.unblocked(scene, z["p"], z["n"], sent, active)
-        share = self._share(
-            weights, camera, z, sent, value, forward, back, segments, active
-        ) * dr.gather(mi.Float, factor, slot, active)
+        share = self._share(weights, camera, z, sent, value, forward, back, segments, active)
         estimate = carried * (
             share
             * dr.rcp(
@@ -498,7 +481,7 @@ class ResampledSession(IterativeSession):
         wanted = min(max(FEWEST_CACHE_POINTS, int(vertices * CACHE_SHARE)), max(vertices, 1))
         self.capacity |= {
             "ends": ends_room(np.array(light[2]), M),
-            "draws": rounded_up(max(int(KEPT_DRAWS * vertices), 1)),
+            "camera": rounded_up(int(MORE_ROOM * vertices) + 1),
         }
         self.cache = self._cache_points(
             traced[3], vertices, max(min(wanted, MOST_PAIRS // (M + self.capacity["ends"])), 1)
@@ -674,26 +657,17 @@ class ResampledSession(IterativeSession):
         )
         return light[0], *ends, self._pmfs(r, seen, ends[-1])
 
-    def _draws(self, camera, count, expected, seed):
-        """What `list_draws` returns."""
-        while True:
-            draws = self._draw_pass(self._tables, camera, count, expected, seed)
-            if not self._grown("draws", draws[-1]):
-                return draws
-
     def _radiance(self, iteration, chunk, traced, proposals, spectral):
         """Radiance of camera paths (`trace_camera_vertices`) with everything that they meet and are
         connected to."""
         radiance, _, _, camera, count, hits, hit_count = traced
-        *_, (*_, expected) = proposals
-        draws = self._draws(camera, count, expected, self._seed(iteration, THIN, chunk))
         radiance = self._connection_pass(
             self.scene,
             self.sensor,
             self._tables,
             radiance,
             camera,
-            draws,
+            count,
             proposals,
             self._seed(iteration, DRAW, chunk),
             spectral,
@@ -783,7 +757,7 @@ class ResampledSession(IterativeSession):
         )
 
 
-LIGHT, CAMERA, APERTURE, START, DRAW, THIN = 0, 1, 3, 4, 5, 6
+LIGHT, CAMERA, APERTURE, START, DRAW = 0, 1, 3, 4, 5
 """Purposes of an iteration's random seeds, besides `IterativeSession.WAVELENGTH`."""
 PILOT = 1 << 31
 """The number of the iteration that never is: what only the weights and the cache are made of draws

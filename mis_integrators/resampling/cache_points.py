@@ -94,16 +94,6 @@ class CacheGrid:
         """Index of the cache point `number` (0: nearest) of a row."""
         return dr.gather(mi.UInt32, self.table, row * self.neighbors + number, active)
 
-    def mean(self, values, row, active=True):
-        """Mean of `values`, one a cache point, over those of a row."""
-        return (
-            sum(
-                dr.gather(mi.Float, values, self.neighbor(row, number, active), active)
-                for number in range(self.neighbors)
-            )
-            / self.neighbors
-        )
-
 
 def facing(n):
     """Which of the six axis directions a normal is nearest to."""

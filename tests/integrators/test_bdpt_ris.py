@@ -20,7 +20,6 @@ from mis_integrators.paths.connect import join_sensor
 from mis_integrators.paths.setting import Limits, World
 from mis_integrators.paths.subpaths import (
     NO_PARENT,
-    Kept,
     hit_record,
     new_vertices,
     read_vertices,
@@ -559,65 +558,6 @@ def test_dark_and_short(rgb, parameters):
         for i in (plugin("bdpt_ris", **parameters), path(**parameters))
     ]
     np.testing.assert_allclose(*[x.mean(axis=(0, 1)) for x in images], rtol=0.03)
-
-
-# --- Which camera vertices draw -----------------------------------------------
-
-
-def test_slight_vertices_are_thinned_out(rgb):
-    """Each camera vertex stays with the probability whose inverse it is given, worked out apart:
-    rough ones and the brightest of a path always, others by what the nearest cache points promise.
-    A chi-square of 200 rounds, false alarms 1e-6."""
-    from mis_integrators.paths.connect import LEAST_CHANCE, SLIGHT, list_draws
-
-    session, rounds = plugin("pcbpt", max_depth=6).session(glossy_box(size=32), 0, 1, 0), 200
-    session.start()
-    spectral = session._spectral(1)
-    light, (_, _, _, camera, count, *_) = (
-        session._light(1, 0, spectral),
-        session._camera(1, 0, spectral),
-    )
-    *_, pmfs = session._proposals(1, spectral, light)
-    number = int(count[0])
-    z = read_vertices(camera, dr.arange(mi.UInt32, number), True, states=STEP)
-    row = np.array(session.grid.row(z["p"], dr.mulsign(z["n"], dr.dot(z["n"], z["towards"]))))
-    expected = np.array(pmfs[2])[np.array(session.grid.table).reshape(-1, 3)[row]].mean(axis=1)
-    promised = np.array(z["throughput"] * z["value"]).mean(axis=0) * expected
-    path, rough = np.array(z["path"]), np.array(z["density"]) < 0
-    promised[rough] = 0
-    brightest = np.zeros(session.chunk)
-    np.maximum.at(brightest, path, promised)
-    level = SLIGHT * brightest[path]
-    chance = np.where(
-        rough | (promised >= level),
-        1,
-        np.maximum(promised / np.where(level > 0, level, 1), LEAST_CHANCE),
-    )
-    slight = chance < 1
-    assert (
-        0.05 < slight.mean() < 0.95 and rough.any() and (chance[slight] > LEAST_CHANCE).mean() > 0.2
-    )
-    stays = np.zeros(number)
-    for seed in range(rounds):
-        places, factor, found = list_draws(
-            session.grid,
-            pmfs[2],
-            Kept(camera, count, session.capacity["camera"]),
-            session.chunk,
-            STEP,
-            session.capacity["camera"],
-            mi.UInt32(seed),
-        )
-        places, factor = (np.array(x)[: int(found[0])] for x in (places, factor))
-        assert len(set(places)) == len(places)
-        np.testing.assert_allclose(factor, 1 / chance[places], rtol=1e-4)
-        stays[places] += 1
-    assert np.all(stays[~slight] == rounds)
-    squares = (stays - rounds * chance)[slight] ** 2 / (rounds * chance * (1 - chance))[
-        slight
-    ].clip(1e-3)
-    mean, error = squares.mean(), squares.std() / np.sqrt(slight.sum())
-    assert abs(mean - 1) < 5 * error and error < 0.1
 
 
 # --- Repeatability, memory, parameters ----------------------------------------
