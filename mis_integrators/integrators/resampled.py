@@ -20,7 +20,6 @@ from ..core.random import mix, next_2d, vertex_streams
 from ..core.recording import lanes, recorder
 from ..core.spectra import channel_mean
 from ..core.traits import SceneTraits
-from ..core.untrusted import Fields
 from ..lights.lights import Lights
 from ..mis.resampling import (
     LENGTHS,
@@ -43,13 +42,6 @@ from ..resampling.cache_points import CacheGrid
 from ..resampling.light_vertices import END, LightVertices, list_light_vertices
 from ..resampling.proposals import Proposals, cumulative_sums
 from .common import IterativeIntegrator, IterativeSession
-from .light_tracing import (
-    LEAST_LIGHT_TRACING,
-    MOST_LIGHT_TRACING,
-    best_ratio,
-    observed_noise,
-    path_costs,
-)
 
 CHUNK = 1 << 18
 """Camera paths, and as many light sub-paths, traced at once at most; larger films are traced in
@@ -60,9 +52,9 @@ shadow rays."""
 MOST_PAIRS = 1 << 24
 """Pairs of a cache point and a light vertex at most, four bytes each (and some more while they are
 made); beyond that there are fewer cache points."""
-FEW = 8
-"""Renders of fewer iterations do not find out how many light sub-paths pay: the passes would have
-to be recorded anew for the rest."""
+LIGHT_TRACING, LEAST_LIGHT_TRACING, MOST_LIGHT_TRACING = 1.0, 1 / 8, 8.0
+"""Light sub-paths that are joined to the sensor, for each camera path, unless a parameter says
+otherwise, and its bounds. A pilot that chose them by noise and cost gained nothing beyond noise."""
 MORE_ROOM = 1.1
 """Room for vertices of sub-paths over what the first iteration has: a connection takes a lane for
 each place of a camera vertex, used or not."""
@@ -84,12 +76,13 @@ class ResampledIntegrator(IterativeIntegrator):
         self.resamples = parameters.integer("resamples", 1, 1, "from 1 to 1024", high=1024)
         self.cache_neighbors = parameters.integer("cache_neighbors", 3, 1, "from 1 to 16", high=16)
         self.target = parameters.choice("target", "f_y_rho_g_v", ("f_y_rho_g_v", "f_y_f_yz"))
-        self.light_tracing = parameters.number(
+        given = parameters.number(
             "light_tracing",
-            0.0,
+            LIGHT_TRACING,
             lambda n: n == 0 or LEAST_LIGHT_TRACING <= n <= MOST_LIGHT_TRACING,
             f"0 or from {LEAST_LIGHT_TRACING:g} to {MOST_LIGHT_TRACING:g}",
         )
+        self.light_tracing = given or LIGHT_TRACING
 
     def settings(self):
         return {
@@ -139,9 +132,8 @@ class ResampledSession(IterativeSession):
             "hits": rounded_up(self.chunk),
             "ends": rounded_up(6 * integrator.resampled_light_paths),
         }
-        self.light_tracing = integrator.light_tracing or None
         self.lens = Lens(sensor).connects
-        self._share_light(*self._wanted_light(0))
+        self._share_light()
         depth = integrator.max_depth
         self.lit = not self.lights.dark and (depth < 0 or depth >= 2)
         bounds = self.traits.bounds
@@ -152,46 +144,18 @@ class ResampledSession(IterativeSession):
         self.recorded = recorder()
         self.grid = CacheGrid(mi.Point3f(0), mi.Normal3f(0, 0, 1), integrator.cache_neighbors)
         self.records, self.shares = uniform_tables(self.grid)
-        self.cache = self.known = self.first_light = self.begun = self.vertices = None
+        self.cache = self.known = self.first_light = None
         self._freeze()
 
-    @property
-    def settings(self):
-        return (
-            super().settings
-            if self.light_tracing is None
-            else {**super().settings, "light_tracing": self.light_tracing}
-        )
-
-    @property
-    def learned(self):
-        return {} if self.light_tracing is None else {"light_tracing": self.light_tracing}
-
-    def recall(self, learned):
-        if learned != {}:
-            fields = Fields(learned, "learned")
-            self.light_tracing = fields.number(
-                "light_tracing", MOST_LIGHT_TRACING, LEAST_LIGHT_TRACING
-            )
-            fields.finish()
-
-    def _wanted_light(self, iteration):
-        """Light sub-paths for each camera path of an iteration, and vertices of each that there
-        shall be room for. Of the first one nothing is known."""
-        if iteration == 0:
-            return float(self.lens) * (self.integrator.light_tracing or 1.0), 4.0
-        return float(self.lens) * (self.light_tracing or 1.0), 1.25 * self.vertices[0]
-
-    def _share_light(self, ratio, vertices):
-        """Has about `ratio` light sub-paths traced for each camera path, enough in any case for
-        what is drawn from and for Q; they have so many `vertices` on average."""
-        self.shared = ratio, vertices
-        wanted = ratio * self.chunk
+    def _share_light(self):
+        """How many light sub-paths are traced: enough in any case for what is drawn from and for
+        Q."""
+        wanted = float(self.lens) * self.integrator.light_tracing * self.chunk
         self.light_rounds = max(round(wanted / CHUNK), 1)
         self.light_chunk = max(
             round(wanted / self.light_rounds), self.integrator.resampled_light_paths, KNOWN_PATHS
         )
-        self.capacity["light"] = rounded_up(int(vertices * self.light_chunk))
+        self.capacity["light"] = rounded_up(4 * self.light_chunk)
         self.ratio = dr.opaque(
             mi.Float, self.light_chunk * self.light_rounds * self.chunks / self.pixel_paths
         )
@@ -461,26 +425,25 @@ class ResampledSession(IterativeSession):
         return splat_channels(
             sensor.film(),
             joined.film,
-            [*colour_channels(value, spectral["matrix"]), dr.square(channel_mean(value))],
+            colour_channels(value, spectral["matrix"]),
             joined.active,
         )
 
     # ------------------------------------------------------------------ before the first iteration
 
     def _prepare(self):
-        """Begins the first iteration: draws the cache points from its first part, and finds out how
-        many light sub-paths pay where nobody has said so. All sessions of a render see the same
-        here, whatever they have been told."""
+        """Draws the cache points from the first part of the first iteration. All sessions of a
+        render see the same here."""
         spectral = self._spectral(0)
         light, traced = self._light(0, 0, spectral), self._camera(0, 0, spectral)
         vertices, M = (
             min(int(traced[4][0]), self.capacity["camera"]),
             self.integrator.resampled_light_paths,
         )
-        self.vertices = int(light[1][0]) / self.light_chunk, vertices / self.chunk
         wanted = min(max(FEWEST_CACHE_POINTS, int(vertices * CACHE_SHARE)), max(vertices, 1))
         self.capacity |= {
             "ends": ends_room(np.array(light[2]), M),
+            "light": rounded_up(int(MORE_ROOM * int(light[1][0])) + 1),
             "camera": rounded_up(int(MORE_ROOM * vertices) + 1),
         }
         self.cache = self._cache_points(
@@ -491,31 +454,6 @@ class ResampledSession(IterativeSession):
         )
         self.records, self.shares = uniform_tables(self.grid)
         self._freeze()
-        self.first_light = light
-        if self.light_tracing is None and self.lens and (self.iterations_planned or FEW) >= FEW:
-            proposals = self._proposals(0, spectral, light)
-            part = self._part(0, 0, spectral, light, proposals, traced)
-            self.light_tracing = self._best_light_tracing(*part)
-            self.begun = proposals, part
-
-    def _best_light_tracing(self, radiance, alpha, position, met):
-        """How many light sub-paths pay for each camera path, by a part (`_part`) of an iteration
-        with one."""
-        paths, met = self.integrator.camera_paths, self.chunks * np.array(met)
-        border, weight = (
-            self.sensor.film().rfilter().border_size(),
-            np.array(self.expected_weight)[:, :, 0],
-        )
-        corner = to_numpy(position) - np.array(self.sensor.film().crop_offset())[:, None] + border
-        noise = observed_noise(
-            np.floor(corner).astype(int),
-            np.array(channel_mean(radiance)),
-            paths,
-            met[:, :, :3].mean(axis=2),
-            met[:, :, 3],
-            weight,
-        )
-        return best_ratio(noise, *path_costs(self.integrator.plugin, self.vertices, paths))
 
     def _take_weights(self, iteration):
         """Sets the weights of an iteration. They must not depend on its own light sub-paths: the
@@ -524,16 +462,12 @@ class ResampledSession(IterativeSession):
         if not self.integrator.aware:
             return
         if iteration > 0 and self.known is None:
-            self.known = tabulate(self.grid, *self._integrals(self.first_light, self._spectral(0)))
+            spectral = self._spectral(0)
+            light = self.first_light or self._light(0, 0, spectral)
+            self.known = tabulate(self.grid, *self._integrals(light, spectral))
             self.first_light = None
         self.records, self.shares = self.known if iteration > 0 else uniform_tables(self.grid)
         self._fill_tables()
-
-    def _take_light(self, iteration):
-        """Sets how many light sub-paths an iteration has."""
-        if self.shared != self._wanted_light(iteration):
-            self._share_light(*self._wanted_light(iteration))
-            self._freeze("light")
 
     def _cache_points(self, camera, vertices, count):
         """`count` of the camera's vertices, at random (a single one in nothingness if there is
@@ -678,17 +612,16 @@ class ResampledSession(IterativeSession):
 
     def _meet_sensor(self, light, seed, spectral):
         """Block of the light sub-paths (`trace_light_subpaths`) that meet the sensor: three
-        channels, and the square of their mean."""
+        channels."""
         vertices, found, _ = light
         return self._sensor_pass(
             self.scene, self.sensor, self._tables, vertices, found, seed, spectral
         )
 
-    def _part(self, iteration, chunk, spectral, light, proposals, traced=None):
-        """One part of an iteration: radiance, alpha and film position of its camera paths
-        (`traced`, if they are already), and the block of the light that met the sensor (or None).
-        `light`: the first part's light sub-paths."""
-        traced = traced or self._camera(iteration, chunk, spectral)
+    def _chunk(self, iteration, chunk, spectral, light, proposals):
+        """Blocks of one part of an iteration: of its camera paths, and of the light that met the
+        sensor (or None). `light`: the first part's light sub-paths."""
+        traced = self._camera(iteration, chunk, spectral)
         radiance, alpha, position, *_ = traced
         block = None
         if self.lit:
@@ -704,10 +637,6 @@ class ResampledSession(IterativeSession):
                     spectral,
                 )
                 block = met if block is None else block + met
-        return radiance, alpha, position, block
-
-    def _chunk(self, spectral, chunk, radiance, alpha, position, block):
-        """Blocks of one part (`_part`): of camera paths, and of light that met the sensor."""
         if self.integrator.hide_emitters:
             radiance = dr.select(
                 alpha > 0, radiance, 0
@@ -727,33 +656,20 @@ class ResampledSession(IterativeSession):
 
     def _iteration(self, iteration):
         spectral = self._spectral(iteration)
-        proposals, begun = self.begun if iteration == 0 and self.begun else (None, None)
-        self.begun = light = None
+        light = proposals = None
         if self.lit:
             self._take_weights(iteration)
-            self._take_light(iteration)
-            light = (
-                self.first_light
-                if iteration == 0 and self.first_light
-                else self._light(iteration, 0, spectral)
-            )
-            if not self.integrator.aware or self.known is not None:
-                self.first_light = None  # nobody will ask for it again
-            proposals = proposals or self._proposals(iteration, spectral, light)
-
-        def render(chunk, _):
-            part = (
-                begun
-                if begun and chunk == 0
-                else self._part(iteration, chunk, spectral, light, proposals)
-            )
-            return self._chunk(spectral, chunk, *part)
-
-        block, light = self.sum_of_chunks(render)
+            light = self._light(iteration, 0, spectral)
+            if iteration == 0 and self.integrator.aware and self.known is None:
+                self.first_light = light
+            proposals = self._proposals(iteration, spectral, light)
+        block, met = self.sum_of_chunks(
+            lambda chunk, _: self._chunk(iteration, chunk, spectral, light, proposals)
+        )
         return (
             block
-            if light is None
-            else with_colour(block, as_camera_weights(light[:, :, :3], block, self.expected_weight))
+            if met is None
+            else with_colour(block, as_camera_weights(met, block, self.expected_weight))
         )
 
 

@@ -699,101 +699,10 @@ def test_pilot_sees_all_of_the_film(rgb, monkeypatch):
 # --- How many light sub-paths -------------------------------------------------
 
 
-def test_best_ratio_is_the_best():
-    """Against a search along n; what no light sub-path brings, and what nothing else brings, end at
-    the bounds."""
-    from mis_integrators.integrators.light_tracing import (
-        LEAST_LIGHT_TRACING,
-        MOST_CHOSEN,
-        LightTracingNoise,
-        best_ratio,
-    )
-
-    n = np.geomspace(LEAST_LIGHT_TRACING, MOST_CHOSEN, 4001)
-    for light, camera, light_cost, camera_cost in np.exp(
-        np.random.default_rng(1).normal(0, 1, (50, 4))
-    ):
-        best = n[np.argmin((camera + light / n) * (camera_cost + n * light_cost))]
-        assert best_ratio(
-            LightTracingNoise(light, camera), light_cost, camera_cost
-        ) == pytest.approx(best, rel=1e-3)
-    assert (
-        best_ratio(LightTracingNoise(0, 1), 1, 1) == LEAST_LIGHT_TRACING
-        and best_ratio(LightTracingNoise(1, 0), 1, 1) == MOST_CHOSEN
-        and best_ratio(LightTracingNoise(0, 0), 1, 1) == LEAST_LIGHT_TRACING
-    )
-
-
-@pytest.mark.parametrize("camera_paths", [1, 4])
-def test_noise_is_seen_in_one_iteration(camera_paths):
-    """Camera paths and splats with the same known variances in each pixel, in an image whose
-    brightness varies a hundredfold: each is found to 5 % (five standard errors and more)."""
-    from mis_integrators.integrators.light_tracing import observed_noise
-    from mis_integrators.pilot.noise import relative_weights
-
-    rng, width, height, rate = np.random.default_rng(2), 104, 96, 0.5
-    brightness = np.repeat(np.repeat(np.geomspace(0.1, 10, 13), 8)[None], height, axis=0)
-    line, column = (np.repeat(x.ravel(), camera_paths) for x in np.indices((height, width)))
-    there = brightness[line, column]
-    values = rng.gamma(4, there / 8)  # mean half the brightness, standard deviation half of that
-    light, squares = np.zeros((2, height, width))
-    splats = rng.poisson(rate * camera_paths * width * height)
-    y, x = rng.integers(0, height, splats), rng.integers(0, width, splats)
-    value = brightness[y, x] / 2 / rate  # their weights sum to `camera_paths`
-    np.add.at(light, (y, x), value)
-    np.add.at(squares, (y, x), value**2)
-    noise = observed_noise(
-        np.stack([column, line]),
-        values,
-        camera_paths,
-        light,
-        squares,
-        np.full((height, width), float(camera_paths)),
-    )
-    relative = relative_weights(brightness.ravel()) * brightness.ravel() ** 2
-    assert noise.camera == pytest.approx(np.mean(relative) / 16 / camera_paths, rel=0.05)
-    assert noise.light == pytest.approx(np.mean(relative) / 4 / rate / camera_paths, rel=0.05)
-
-
-def test_light_tracing_follows_the_scene(rgb):
-    """Where the noise is caustics, as many light sub-paths are traced as camera paths; where almost
-    nothing that they meet is seen but through glass, fewer. What was chosen is told, and makes the
-    same image in another session that recalls it (and has to begin the first iteration anew)."""
-    chosen = []
-    for name in ("caustics", "sds"):
-        scene = mi.load_file(str(SCENES / f"{name}.xml"), resx=32, resy=24)
-        session = plugin("bdpt_ris", max_depth=10).session(scene, 0, 1, 0)
-        session.iterate()
-        assert session.light_chunk == session.chunk
-        session.iterate()
-        chosen.append(session.settings["light_tracing"])
-    other = plugin("bdpt_ris", max_depth=10).session(scene, 0, 1, 0)
-    other.recall(session.learned)
-    for _ in range(2):
-        other.iterate()
-    assert chosen[0] == 1 and chosen[1] < 0.95 and other.light_chunk == session.light_chunk
-    np.testing.assert_allclose(other.image(), session.image(), rtol=1e-4, atol=1e-6)
-
-
-def test_light_tracing_does_not_follow_the_parts(rgb, monkeypatch):
-    """As much for a film in parts as for one in one, but for the noise of the pilot, which sees a
-    part."""
-    from mis_integrators.integrators import resampled
-
-    chosen = []
-    for chunk in (1 << 18, 3000):
-        monkeypatch.setattr(resampled, "CHUNK", chunk)
-        sessions = [
-            plugin("pcbpt").session(
-                mi.load_file(str(SCENES / "door.xml"), resx=48, resy=36), 0, seed, 0
-            )
-            for seed in range(4)
-        ]
-        for session in sessions:
-            session.start()
-        chosen.append(np.log([session.light_tracing for session in sessions]))
-    # log(sqrt(3)) = 0.55
-    assert session.chunks == 3 and abs(np.mean(chosen[0]) - np.mean(chosen[1])) < 0.3
+def test_no_light_tracing_is_the_default(rgb):
+    """0, which once left the number to a pilot."""
+    assert plugin("bdpt_ris", light_tracing=0).settings() == plugin("bdpt_ris").settings()
+    assert plugin("pcbpt").settings()["light_tracing"] == 1
 
 
 @pytest.mark.parametrize("ratio", [0.125, 8])
