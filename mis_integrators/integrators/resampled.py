@@ -15,7 +15,7 @@ from ..core.film import (
     splat_samples,
     with_colour,
 )
-from ..core.packing import from_numpy, rounded_up, to_numpy
+from ..core.packing import from_numpy, rounded_up
 from ..core.random import mix, next_2d, vertex_streams
 from ..core.recording import lanes, recorder
 from ..core.spectra import channel_mean
@@ -24,9 +24,7 @@ from ..lights.lights import Lights
 from ..mis.resampling import (
     LENGTHS,
     ResampledWeights,
-    around,
     guessed_weight,
-    pmf_mismatch,
     tabulate,
     uniform_tables,
 )
@@ -498,23 +496,14 @@ class ResampledSession(IterativeSession):
         return cache
 
     def _integrals(self, light, spectral):
-        """`Q_s`, `Q_blind`, `pmf_mismatches` and `ends_s` as `tabulate` takes them."""
+        """`Q_s`, `Q_blind` and `ends_s` as `tabulate` takes them."""
         M, points, cache = (
             self.integrator.resampled_light_paths,
             dr.width(self.cache["depth"]),
             self.cache,
         )
         sets = max(min(-(-KNOWN_PATHS // M), MOST_KNOWN_SETS, self.light_chunk // M), 1)
-        normals = to_numpy(seen_normal(cache)).T
-        near = around(
-            to_numpy(cache["p"]).T, normals, self.integrator.cache_neighbors, self.grid.normal_cost
-        )
-        Q_s, Q_blind, pmf_mismatches, ends_s = (
-            np.zeros((points, LENGTHS)),
-            np.zeros(points),
-            np.zeros(points),
-            np.zeros(LENGTHS),
-        )
+        Q_s, Q_blind, ends_s = np.zeros((points, LENGTHS)), np.zeros(points), np.zeros(LENGTHS)
         for k in range(sets):
             r, seen, _, _, found, vertices, _ = self._ends_fit(
                 lambda k=k: self._pilot_pass(
@@ -535,9 +524,8 @@ class ResampledSession(IterativeSession):
             length = np.minimum(np.array(vertices)[:used], LENGTHS) - 1
             Q_s += np.where(seen, r, 0) @ np.eye(LENGTHS)[length]
             Q_blind += r.sum(axis=1)
-            pmf_mismatches += pmf_mismatch(near, r, seen)
             ends_s += np.bincount(length, minlength=LENGTHS)
-        return Q_s / (sets * M), Q_blind / (sets * M), pmf_mismatches / sets, ends_s / (sets * M)
+        return Q_s / (sets * M), Q_blind / (sets * M), ends_s / (sets * M)
 
     # ------------------------------------------------------------------ iterations
 
