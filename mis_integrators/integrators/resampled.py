@@ -52,7 +52,7 @@ MOST_PAIRS = 1 << 24
 made); beyond that there are fewer cache points."""
 LIGHT_TRACING, LEAST_LIGHT_TRACING, MOST_LIGHT_TRACING = 1.0, 1 / 8, 8.0
 """Light sub-paths that are joined to the sensor, for each camera path, unless a parameter says
-otherwise, and its bounds. A pilot that chose them by noise and cost gained nothing beyond noise."""
+otherwise, and the parameter's bounds."""
 MORE_ROOM = 1.1
 """Room for vertices of sub-paths over what the first iteration has: a connection takes a lane for
 each place of a camera vertex, used or not."""
