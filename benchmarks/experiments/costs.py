@@ -12,7 +12,7 @@ import json
 import time
 from pathlib import Path
 
-from mis_integrators.integrators import costs, light_tracing
+from mis_integrators.integrators import costs
 from mis_integrators.integrators.choice import PHOTON_MAPPERS, name_of
 from mis_integrators.integrators.unidirectional import PathSession
 from mis_integrators.paths.path_length_statistics import mean_segments
@@ -24,10 +24,7 @@ from common.rows import show, tell
 from common.scene_files import open_scene, scaled_size
 
 METHODS = (("path", {}), *PHOTON_MAPPERS)
-CONNECTED, LIGHT_TRACING = ("pcbpt", "bdpt_ris"), (0.5, 2.0)
-"""Plugins that choose how many light sub-paths they trace, and numbers of those, for each camera
-path, so that their price shows."""
-PLUGINS = (*dict.fromkeys(plugin for plugin, _ in METHODS), *CONNECTED)
+PLUGINS = tuple(dict.fromkeys(plugin for plugin, _ in METHODS))
 RADII = (1.0, 2.0)
 """Multiples of the automatic radius, so that the price of a gathered photon shows."""
 ITERATIONS, SKIPPED = 8, 2
@@ -75,8 +72,7 @@ def run(options: argparse.Namespace) -> None:
 
 
 def measured(opened, plugins) -> list[dict]:
-    """One row a method and radius, or number of light sub-paths: events a pixel, and cost in units
-    of a segment of `path`."""
+    """One row a method and radius: events a pixel, and cost in units of a segment of `path`."""
     scene, sensor = opened.scene, opened.sensor
     first = mi.load_dict({"type": "bdpm", "camera_paths": 1, **opened.inherited})
     segments = mean_segments(
@@ -104,20 +100,6 @@ def measured(opened, plugins) -> list[dict]:
             )
             sessions.append(
                 (plugin, f"{name_of(plugin, parameters)} x {factor:g}", session, counted)
-            )
-    for plugin in [plugin for plugin in CONNECTED if plugin in plugins]:
-        for ratio in LIGHT_TRACING:
-            session = mi.load_dict(
-                {"type": plugin, "light_tracing": ratio, **opened.inherited}
-            ).session(scene, sensor)
-            session.iterate()
-            sessions.append(
-                (
-                    plugin,
-                    f"{plugin} light_tracing={ratio:g}",
-                    session,
-                    light_tracing.events(session),
-                )
             )
     seconds = {label: [] for _, label, _, _ in sessions}
     for _ in range(ITERATIONS):

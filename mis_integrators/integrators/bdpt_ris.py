@@ -67,8 +67,7 @@ class BDPTRIS(ResampledIntegrator):
      * - light_tracing
        - |float|
        - Light sub-paths that are joined to the sensor, for each camera path (N_t); from 0.125 to 8.
-         0 stands for as many as pay, up to 1, by noise and cost, which the first iteration tells (1
-         in it, and in renders of fewer than 8 iterations). (Default: 0)
+         0 stands for the default. (Default: 1)
      * - camera_paths
        - |int|
        - Camera paths per pixel and iteration, which share its light sub-paths and pmfs. (Default:

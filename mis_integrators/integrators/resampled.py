@@ -15,41 +15,31 @@ from ..core.film import (
     splat_samples,
     with_colour,
 )
-from ..core.packing import from_numpy, rounded_up, to_numpy
+from ..core.packing import from_numpy, rounded_up
 from ..core.random import mix, next_2d, vertex_streams
 from ..core.recording import lanes, recorder
 from ..core.spectra import channel_mean
 from ..core.traits import SceneTraits
-from ..core.untrusted import Fields
 from ..lights.lights import Lights
 from ..mis.resampling import (
     LENGTHS,
     ResampledWeights,
-    around,
     guessed_weight,
-    pmf_mismatch,
     tabulate,
     uniform_tables,
 )
 from ..paths.camera import with_gaps
 from ..paths.camera_vertices import STEP, LightEnd, hit_layout, sum_before, trace_camera_vertices
-from ..paths.connect import join_sensor, list_draws
+from ..paths.connect import join_sensor
 from ..paths.light_starts import sample_light_starts
 from ..paths.sensor import Lens
 from ..paths.setting import World
-from ..paths.subpaths import Kept, read_vertices, seen_normal, trace_light_subpaths, vertex_bsdf_of
+from ..paths.subpaths import read_vertices, seen_normal, trace_light_subpaths, vertex_bsdf_of
 from ..paths.vertex import scattered_mean
 from ..resampling.cache_points import CacheGrid
 from ..resampling.light_vertices import END, LightVertices, list_light_vertices
 from ..resampling.proposals import Proposals, cumulative_sums
 from .common import IterativeIntegrator, IterativeSession
-from .light_tracing import (
-    LEAST_LIGHT_TRACING,
-    MOST_LIGHT_TRACING,
-    best_ratio,
-    observed_noise,
-    path_costs,
-)
 
 CHUNK = 1 << 18
 """Camera paths, and as many light sub-paths, traced at once at most; larger films are traced in
@@ -60,12 +50,12 @@ shadow rays."""
 MOST_PAIRS = 1 << 24
 """Pairs of a cache point and a light vertex at most, four bytes each (and some more while they are
 made); beyond that there are fewer cache points."""
-FEW = 8
-"""Renders of fewer iterations do not find out how many light sub-paths pay: the passes would have
-to be recorded anew for the rest."""
-KEPT_DRAWS = 0.9
-"""Share of the camera vertices that there is room for among those that draw, at first: enough in
-most scenes."""
+LIGHT_TRACING, LEAST_LIGHT_TRACING, MOST_LIGHT_TRACING = 1.0, 1 / 8, 8.0
+"""Light sub-paths that are joined to the sensor, for each camera path, unless a parameter says
+otherwise, and the parameter's bounds."""
+MORE_ROOM = 1.1
+"""Room for vertices of sub-paths over what the first iteration has: a connection takes a lane for
+each place of a camera vertex, used or not."""
 KNOWN_PATHS, MOST_KNOWN_SETS = 200, 8
 """Light sub-paths of the first iteration from which Q and Q_s are estimated, in sets of M; at most
 so many sets."""
@@ -84,12 +74,13 @@ class ResampledIntegrator(IterativeIntegrator):
         self.resamples = parameters.integer("resamples", 1, 1, "from 1 to 1024", high=1024)
         self.cache_neighbors = parameters.integer("cache_neighbors", 3, 1, "from 1 to 16", high=16)
         self.target = parameters.choice("target", "f_y_rho_g_v", ("f_y_rho_g_v", "f_y_f_yz"))
-        self.light_tracing = parameters.number(
+        given = parameters.number(
             "light_tracing",
-            0.0,
+            LIGHT_TRACING,
             lambda n: n == 0 or LEAST_LIGHT_TRACING <= n <= MOST_LIGHT_TRACING,
             f"0 or from {LEAST_LIGHT_TRACING:g} to {MOST_LIGHT_TRACING:g}",
         )
+        self.light_tracing = given or LIGHT_TRACING
 
     def settings(self):
         return {
@@ -121,8 +112,7 @@ class ResampledSession(IterativeSession):
         "_camera_pass": ("_trace_camera", ("camera", "hits")),
         "_pilot_pass": ("_pilot_targets", ("light", "ends")),
         "_target_pass": ("_own_targets", ("light", "ends")),
-        "_draw_pass": ("_list_draws", ("camera", "draws")),
-        "_connection_pass": ("_connect", ("light", "camera", "ends", "draws")),
+        "_connection_pass": ("_connect", ("light", "camera", "ends")),
         "_hit_pass": ("_meet", ("camera", "hits")),
         "_sensor_pass": ("_join_sensor", ("light",)),
     }
@@ -137,13 +127,11 @@ class ResampledSession(IterativeSession):
         self.pixel_paths = width * height * integrator.camera_paths
         self.capacity = {
             "camera": rounded_up(4 * self.chunk),
-            "draws": rounded_up(self.chunk),
             "hits": rounded_up(self.chunk),
             "ends": rounded_up(6 * integrator.resampled_light_paths),
         }
-        self.light_tracing = integrator.light_tracing or None
         self.lens = Lens(sensor).connects
-        self._share_light(*self._wanted_light(0))
+        self._share_light()
         depth = integrator.max_depth
         self.lit = not self.lights.dark and (depth < 0 or depth >= 2)
         bounds = self.traits.bounds
@@ -154,46 +142,18 @@ class ResampledSession(IterativeSession):
         self.recorded = recorder()
         self.grid = CacheGrid(mi.Point3f(0), mi.Normal3f(0, 0, 1), integrator.cache_neighbors)
         self.records, self.shares = uniform_tables(self.grid)
-        self.cache = self.known = self.first_light = self.begun = self.vertices = None
+        self.cache = self.known = self.first_light = None
         self._freeze()
 
-    @property
-    def settings(self):
-        return (
-            super().settings
-            if self.light_tracing is None
-            else {**super().settings, "light_tracing": self.light_tracing}
-        )
-
-    @property
-    def learned(self):
-        return {} if self.light_tracing is None else {"light_tracing": self.light_tracing}
-
-    def recall(self, learned):
-        if learned != {}:
-            fields = Fields(learned, "learned")
-            self.light_tracing = fields.number(
-                "light_tracing", MOST_LIGHT_TRACING, LEAST_LIGHT_TRACING
-            )
-            fields.finish()
-
-    def _wanted_light(self, iteration):
-        """Light sub-paths for each camera path of an iteration, and vertices of each that there
-        shall be room for. Of the first one nothing is known."""
-        if iteration == 0:
-            return float(self.lens) * (self.integrator.light_tracing or 1.0), 4.0
-        return float(self.lens) * (self.light_tracing or 1.0), 1.25 * self.vertices[0]
-
-    def _share_light(self, ratio, vertices):
-        """Has about `ratio` light sub-paths traced for each camera path, enough in any case for
-        what is drawn from and for Q; they have so many `vertices` on average."""
-        self.shared = ratio, vertices
-        wanted = ratio * self.chunk
+    def _share_light(self):
+        """How many light sub-paths are traced: enough in any case for what is drawn from and for
+        Q."""
+        wanted = float(self.lens) * self.integrator.light_tracing * self.chunk
         self.light_rounds = max(round(wanted / CHUNK), 1)
         self.light_chunk = max(
             round(wanted / self.light_rounds), self.integrator.resampled_light_paths, KNOWN_PATHS
         )
-        self.capacity["light"] = rounded_up(int(vertices * self.light_chunk))
+        self.capacity["light"] = rounded_up(4 * self.light_chunk)
         self.ratio = dr.opaque(
             mi.Float, self.light_chunk * self.light_rounds * self.chunks / self.pixel_paths
         )
@@ -345,18 +305,6 @@ class ResampledSession(IterativeSession):
         dr.eval(pmfs)  # a recording cannot make it
         return pmfs
 
-    def _list_draws(self, tables, camera, count, expected, seed):
-        """As `list_draws`."""
-        return list_draws(
-            self.grid,
-            expected,
-            Kept(camera, count, self.capacity["camera"]),
-            self.chunk,
-            STEP,
-            self.capacity["draws"],
-            seed,
-        )
-
     def _connect(
         self,
         scene,
@@ -364,27 +312,26 @@ class ResampledSession(IterativeSession):
         tables,
         radiance,
         camera,
-        draws,
+        count,
         proposals,
         seed,
         spectral,
     ):
-        """Radiance of camera paths with that of connections to drawn light sub-paths added.
-        `draws`: as of `list_draws`; `proposals`: as of `_proposals`."""
+        """Radiance of camera paths with that of connections of their `count` vertices to drawn
+        light sub-paths added. `proposals`: as of `_proposals`."""
         light, starts, places, found, pmfs = proposals
         integrator, weights = self.integrator, self.weights()
         ends = self._ends(starts, light, places, found)
         pmf = Proposals(
             self.grid,
-            *pmfs[:2],
+            *pmfs,
             ends.count,
             integrator.resampled_light_paths + self.capacity["ends"],
         )
-        index = lanes(self.capacity["draws"] * integrator.resamples)
-        chosen, factor, count = draws
+        index = lanes(self.capacity["camera"] * integrator.resamples)
         slot = index // integrator.resamples
         active = slot < dr.gather(mi.UInt32, count, 0)
-        z = read_vertices(camera, dr.gather(mi.UInt32, chosen, slot, active), active, states=STEP)
+        z = read_vertices(camera, slot, active, states=STEP)
         rng = vertex_streams(
             z["path"] * integrator.resamples + index % integrator.resamples, z["number"], seed
         )
@@ -405,9 +352,7 @@ class ResampledSession(IterativeSession):
         carried = z["throughput"] * value * sent.light
         active &= (dr.max(carried) > 0) & dr.all(dr.isfinite(carried))
         active = ends.unblocked(scene, z["p"], z["n"], sent, active)
-        share = self._share(
-            weights, camera, z, sent, value, forward, back, segments, active
-        ) * dr.gather(mi.Float, factor, slot, active)
+        share = self._share(weights, camera, z, sent, value, forward, back, segments, active)
         estimate = carried * (
             share
             * dr.rcp(
@@ -478,27 +423,26 @@ class ResampledSession(IterativeSession):
         return splat_channels(
             sensor.film(),
             joined.film,
-            [*colour_channels(value, spectral["matrix"]), dr.square(channel_mean(value))],
+            colour_channels(value, spectral["matrix"]),
             joined.active,
         )
 
     # ------------------------------------------------------------------ before the first iteration
 
     def _prepare(self):
-        """Begins the first iteration: draws the cache points from its first part, and finds out how
-        many light sub-paths pay where nobody has said so. All sessions of a render see the same
-        here, whatever they have been told."""
+        """Draws the cache points from the first part of the first iteration. All sessions of a
+        render see the same here."""
         spectral = self._spectral(0)
         light, traced = self._light(0, 0, spectral), self._camera(0, 0, spectral)
         vertices, M = (
             min(int(traced[4][0]), self.capacity["camera"]),
             self.integrator.resampled_light_paths,
         )
-        self.vertices = int(light[1][0]) / self.light_chunk, vertices / self.chunk
         wanted = min(max(FEWEST_CACHE_POINTS, int(vertices * CACHE_SHARE)), max(vertices, 1))
         self.capacity |= {
             "ends": ends_room(np.array(light[2]), M),
-            "draws": rounded_up(max(int(KEPT_DRAWS * vertices), 1)),
+            "light": rounded_up(int(MORE_ROOM * int(light[1][0])) + 1),
+            "camera": rounded_up(int(MORE_ROOM * vertices) + 1),
         }
         self.cache = self._cache_points(
             traced[3], vertices, max(min(wanted, MOST_PAIRS // (M + self.capacity["ends"])), 1)
@@ -508,31 +452,6 @@ class ResampledSession(IterativeSession):
         )
         self.records, self.shares = uniform_tables(self.grid)
         self._freeze()
-        self.first_light = light
-        if self.light_tracing is None and self.lens and (self.iterations_planned or FEW) >= FEW:
-            proposals = self._proposals(0, spectral, light)
-            part = self._part(0, 0, spectral, light, proposals, traced)
-            self.light_tracing = self._best_light_tracing(*part)
-            self.begun = proposals, part
-
-    def _best_light_tracing(self, radiance, alpha, position, met):
-        """How many light sub-paths pay for each camera path, by a part (`_part`) of an iteration
-        with one."""
-        paths, met = self.integrator.camera_paths, self.chunks * np.array(met)
-        border, weight = (
-            self.sensor.film().rfilter().border_size(),
-            np.array(self.expected_weight)[:, :, 0],
-        )
-        corner = to_numpy(position) - np.array(self.sensor.film().crop_offset())[:, None] + border
-        noise = observed_noise(
-            np.floor(corner).astype(int),
-            np.array(channel_mean(radiance)),
-            paths,
-            met[:, :, :3].mean(axis=2),
-            met[:, :, 3],
-            weight,
-        )
-        return best_ratio(noise, *path_costs(self.integrator.plugin, self.vertices, paths))
 
     def _take_weights(self, iteration):
         """Sets the weights of an iteration. They must not depend on its own light sub-paths: the
@@ -541,16 +460,12 @@ class ResampledSession(IterativeSession):
         if not self.integrator.aware:
             return
         if iteration > 0 and self.known is None:
-            self.known = tabulate(self.grid, *self._integrals(self.first_light, self._spectral(0)))
+            spectral = self._spectral(0)
+            light = self.first_light or self._light(0, 0, spectral)
+            self.known = tabulate(self.grid, *self._integrals(light, spectral))
             self.first_light = None
         self.records, self.shares = self.known if iteration > 0 else uniform_tables(self.grid)
         self._fill_tables()
-
-    def _take_light(self, iteration):
-        """Sets how many light sub-paths an iteration has."""
-        if self.shared != self._wanted_light(iteration):
-            self._share_light(*self._wanted_light(iteration))
-            self._freeze("light")
 
     def _cache_points(self, camera, vertices, count):
         """`count` of the camera's vertices, at random (a single one in nothingness if there is
@@ -581,23 +496,14 @@ class ResampledSession(IterativeSession):
         return cache
 
     def _integrals(self, light, spectral):
-        """`Q_s`, `Q_blind`, `pmf_mismatches` and `ends_s` as `tabulate` takes them."""
+        """`Q_s`, `Q_blind` and `ends_s` as `tabulate` takes them."""
         M, points, cache = (
             self.integrator.resampled_light_paths,
             dr.width(self.cache["depth"]),
             self.cache,
         )
         sets = max(min(-(-KNOWN_PATHS // M), MOST_KNOWN_SETS, self.light_chunk // M), 1)
-        normals = to_numpy(seen_normal(cache)).T
-        near = around(
-            to_numpy(cache["p"]).T, normals, self.integrator.cache_neighbors, self.grid.normal_cost
-        )
-        Q_s, Q_blind, pmf_mismatches, ends_s = (
-            np.zeros((points, LENGTHS)),
-            np.zeros(points),
-            np.zeros(points),
-            np.zeros(LENGTHS),
-        )
+        Q_s, Q_blind, ends_s = np.zeros((points, LENGTHS)), np.zeros(points), np.zeros(LENGTHS)
         for k in range(sets):
             r, seen, _, _, found, vertices, _ = self._ends_fit(
                 lambda k=k: self._pilot_pass(
@@ -618,9 +524,8 @@ class ResampledSession(IterativeSession):
             length = np.minimum(np.array(vertices)[:used], LENGTHS) - 1
             Q_s += np.where(seen, r, 0) @ np.eye(LENGTHS)[length]
             Q_blind += r.sum(axis=1)
-            pmf_mismatches += pmf_mismatch(near, r, seen)
             ends_s += np.bincount(length, minlength=LENGTHS)
-        return Q_s / (sets * M), Q_blind / (sets * M), pmf_mismatches / sets, ends_s / (sets * M)
+        return Q_s / (sets * M), Q_blind / (sets * M), ends_s / (sets * M)
 
     # ------------------------------------------------------------------ iterations
 
@@ -674,26 +579,17 @@ class ResampledSession(IterativeSession):
         )
         return light[0], *ends, self._pmfs(r, seen, ends[-1])
 
-    def _draws(self, camera, count, expected, seed):
-        """What `list_draws` returns."""
-        while True:
-            draws = self._draw_pass(self._tables, camera, count, expected, seed)
-            if not self._grown("draws", draws[-1]):
-                return draws
-
     def _radiance(self, iteration, chunk, traced, proposals, spectral):
         """Radiance of camera paths (`trace_camera_vertices`) with everything that they meet and are
         connected to."""
         radiance, _, _, camera, count, hits, hit_count = traced
-        *_, (*_, expected) = proposals
-        draws = self._draws(camera, count, expected, self._seed(iteration, THIN, chunk))
         radiance = self._connection_pass(
             self.scene,
             self.sensor,
             self._tables,
             radiance,
             camera,
-            draws,
+            count,
             proposals,
             self._seed(iteration, DRAW, chunk),
             spectral,
@@ -704,17 +600,16 @@ class ResampledSession(IterativeSession):
 
     def _meet_sensor(self, light, seed, spectral):
         """Block of the light sub-paths (`trace_light_subpaths`) that meet the sensor: three
-        channels, and the square of their mean."""
+        channels."""
         vertices, found, _ = light
         return self._sensor_pass(
             self.scene, self.sensor, self._tables, vertices, found, seed, spectral
         )
 
-    def _part(self, iteration, chunk, spectral, light, proposals, traced=None):
-        """One part of an iteration: radiance, alpha and film position of its camera paths
-        (`traced`, if they are already), and the block of the light that met the sensor (or None).
-        `light`: the first part's light sub-paths."""
-        traced = traced or self._camera(iteration, chunk, spectral)
+    def _chunk(self, iteration, chunk, spectral, light, proposals):
+        """Blocks of one part of an iteration: of its camera paths, and of the light that met the
+        sensor (or None). `light`: the first part's light sub-paths."""
+        traced = self._camera(iteration, chunk, spectral)
         radiance, alpha, position, *_ = traced
         block = None
         if self.lit:
@@ -730,10 +625,6 @@ class ResampledSession(IterativeSession):
                     spectral,
                 )
                 block = met if block is None else block + met
-        return radiance, alpha, position, block
-
-    def _chunk(self, spectral, chunk, radiance, alpha, position, block):
-        """Blocks of one part (`_part`): of camera paths, and of light that met the sensor."""
         if self.integrator.hide_emitters:
             radiance = dr.select(
                 alpha > 0, radiance, 0
@@ -753,37 +644,24 @@ class ResampledSession(IterativeSession):
 
     def _iteration(self, iteration):
         spectral = self._spectral(iteration)
-        proposals, begun = self.begun if iteration == 0 and self.begun else (None, None)
-        self.begun = light = None
+        light = proposals = None
         if self.lit:
             self._take_weights(iteration)
-            self._take_light(iteration)
-            light = (
-                self.first_light
-                if iteration == 0 and self.first_light
-                else self._light(iteration, 0, spectral)
-            )
-            if not self.integrator.aware or self.known is not None:
-                self.first_light = None  # nobody will ask for it again
-            proposals = proposals or self._proposals(iteration, spectral, light)
-
-        def render(chunk, _):
-            part = (
-                begun
-                if begun and chunk == 0
-                else self._part(iteration, chunk, spectral, light, proposals)
-            )
-            return self._chunk(spectral, chunk, *part)
-
-        block, light = self.sum_of_chunks(render)
+            light = self._light(iteration, 0, spectral)
+            if iteration == 0 and self.integrator.aware and self.known is None:
+                self.first_light = light
+            proposals = self._proposals(iteration, spectral, light)
+        block, met = self.sum_of_chunks(
+            lambda chunk, _: self._chunk(iteration, chunk, spectral, light, proposals)
+        )
         return (
             block
-            if light is None
-            else with_colour(block, as_camera_weights(light[:, :, :3], block, self.expected_weight))
+            if met is None
+            else with_colour(block, as_camera_weights(met, block, self.expected_weight))
         )
 
 
-LIGHT, CAMERA, APERTURE, START, DRAW, THIN = 0, 1, 3, 4, 5, 6
+LIGHT, CAMERA, APERTURE, START, DRAW = 0, 1, 3, 4, 5
 """Purposes of an iteration's random seeds, besides `IterativeSession.WAVELENGTH`."""
 PILOT = 1 << 31
 """The number of the iteration that never is: what only the weights and the cache are made of draws

@@ -4,14 +4,14 @@ The state (`mis.state.ConnectionState`) of `paths.subpaths` and `paths.camera_ve
 resampling makes of each technique of a joint path. All techniques of a path evaluate one function:
 a technique that joins a light sub-path Y to the camera vertex z is taken to draw it with
 
-    q/p = (a + c) r + b  if a cache point of z sees what z sees, else  c r + b,
+    q/p = (a + c) r + b,
     r = f_y rho G softened,    G softened = G d^2 / (d^2 + h^2)
 
-where the parts are the cached pmfs' visible, blind and uniform ones (`proposals`), and the second
-case has a probability e. The four numbers of z and the lengths' shares Q_s/Q are looked up by place
-and by the side from which the light comes (`CacheGrid.row`); they are averages over the N_c cache
-points there, made once from the light sub-paths of the first iteration (which weights by densities
-alone). So the weights depend neither on an iteration's own light sub-paths nor on its pmfs, and the
+where a, c and b are the cached pmfs' visible, blind and uniform parts (`proposals`). The record of
+z, the two numbers a + c and b, and the lengths' shares Q_s/Q are looked up by place and by the side
+from which the light comes (`CacheGrid.row`); they are averages over the N_c cache points there,
+made once from the light sub-paths of the first iteration (which weights by densities alone). So the
+weights depend neither on an iteration's own light sub-paths nor on its pmfs, and the
 sum of the techniques stays unbiased. h is the spacing of the cache points: the cached pmf, made for
 their places, does not know that G has a pole at z. Left out are visibility (the ends of a joint
 path see each other), the camera's BSDF of `f_y_f_yz`, the guess of the weight that the pmfs contain
@@ -27,7 +27,6 @@ import numpy as np
 from ..core.packing import from_numpy
 from ..core.spectra import channel_mean
 from ..paths.light_starts import seen_from
-from ..resampling.cache_points import least_columns
 from ..resampling.light_vertices import END
 from ..resampling.proposals import BLIND_SHARE, uniform_share
 from ..weights import bidirectional as theory
@@ -37,14 +36,6 @@ LENGTHS = 16
 """Lengths of light sub-paths whose shares are told apart; longer ones count with the last."""
 MANY = 100
 """Light sub-paths from which on Q_s / (M Q), at most 1 / M, is not worth a lookup."""
-UNEXPECTED = 0.1
-"""A cache point's light is unexpected if the points around it have less than this share of its own
-pmf for it."""
-LEAST_DOUBT = 0.05
-"""Some of the light may always be unexpected."""
-LINES = 64
-"""Cache points that are compared with all others at once: their distances fit in a processor's
-cache."""
 LEAST_GAIN, MOST_GAIN = 1.0, 2.0
 """A draw counts as so many connections to a light sub-path of its own. A cache that promises more
 is not to be believed (fireflies). Where it promises less, a heuristic that goes by second moments
@@ -53,7 +44,7 @@ the more, the more there is to draw from: with a single light sub-path the formu
 
 
 class ResampledWeights:
-    """`lights`, `grid` (a `CacheGrid`), `records` (float, four a row: a, b, c, e), `shares` (float,
+    """`lights`, `grid` (a `CacheGrid`), `records` (float, two a row: a + c, b), `shares` (float,
     `LENGTHS` a row), M light sub-paths, N draws; `aware`: whether the weights know of the
     resampling (else every technique has the density of its path alone); `ratio`: N_t, light
     sub-paths that are joined to the sensor over camera paths, of all the film."""
@@ -81,7 +72,7 @@ class ResampledWeights:
         q*/p, to a camera vertex of that row."""
         if not self.aware:
             return mi.Float(1)
-        record = dr.gather(mi.Vector4f, self.records, row, active)
+        record = dr.gather(mi.Vector2f, self.records, row, active)
         share = mi.Float(0)
         if self.M < MANY:
             share = dr.gather(
@@ -90,10 +81,8 @@ class ResampledWeights:
                 row * LENGTHS + dr.minimum(dr.maximum(s, 1), LENGTHS) - 1,
                 active,
             )
-        spare = record.z * r + record.y
-        ratio = resampling.doubtful_ratio(record.x * r + spare, spare, record.w)
         return dr.clip(
-            resampling.gain(ratio, share, self.M, self.N),
+            resampling.gain(record.x * r + record.y, share, self.M, self.N),
             LEAST_GAIN * (1 - 1 / self.M),
             MOST_GAIN * self.N,
         )
@@ -175,51 +164,21 @@ def guessed_weight(z, joined):
     )
 
 
-def around(p, n, neighbors, normal_cost):
-    """Places of the other cache points that each of C is nearest to (C x `neighbors`, or as many as
-    there are): those that `CacheGrid` would mix with it. NumPy arrays `p`, `n` (C x 3);
-    `normal_cost` as of `CacheGrid` [length^2]."""
-    p, n = (p - p.mean(axis=0)).astype(np.float32), n.astype(np.float32)
-    squared, count = np.sum(p**2, axis=1), min(neighbors, len(p) - 1)
-    neighbours = np.empty((len(p), count), dtype=np.intp)
-    for first in range(0, len(p), LINES):
-        some = np.arange(first, min(first + LINES, len(p)))
-        cost = (
-            squared - 2 * p[some] @ p.T - np.float32(normal_cost) * n[some] @ n.T
-        )  # but for what is the same in a row
-        cost[some - first, some] = np.inf
-        neighbours[some] = least_columns(cost, count)
-    return neighbours
-
-
-def pmf_mismatch(neighbours, r, seen):
-    """How much of a cache point's light comes from light vertices that the cache points around it,
-    `neighbours`, do not expect: a number each (C).
-
-    NumPy arrays `r`, `seen` (C x light vertices, as for `cumulative_sums`)."""
-    if not neighbours.shape[1]:
-        return np.ones(len(r))
-    pmf = np.where(seen, r, 0)
-    pmf = pmf / np.maximum(pmf.sum(axis=1, keepdims=True), 1e-30)
-    expected = sum(pmf[column] for column in neighbours.T) / neighbours.shape[1]
-    return np.sum(pmf * (expected < UNEXPECTED * pmf), axis=1)
-
-
 def uniform_tables(grid):
     """`(records, shares)` of the rows that have every draw count as one connection, where nothing
     is known of Q and Q_s."""
     return tuple(
         from_numpy(mi.Float, np.tile(values, grid.rows))
-        for values in ([0.0, 1.0, 0.0, 0.0], np.ones(LENGTHS))
+        for values in ([0.0, 1.0], np.ones(LENGTHS))
     )
 
 
-def tabulate(grid, Q_s, Q_blind, pmf_mismatches, ends_s):
+def tabulate(grid, Q_s, Q_blind, ends_s):
     """`(records, shares)` of the rows, as `ResampledWeights` takes them.
 
     NumPy arrays: `Q_s` (C x LENGTHS), integrals at the C cache points, visibility included;
-    `Q_blind` (C), of all lengths, visibility not; `pmf_mismatches` (C); `ends_s` (LENGTHS): light
-    vertices that a light sub-path has of each length on average.
+    `Q_blind` (C), of all lengths, visibility not; `ends_s` (LENGTHS): light vertices that a light
+    sub-path has of each length on average.
     """
     neighbours = np.array(grid.table).reshape(-1, grid.neighbors)
 
@@ -235,9 +194,8 @@ def tabulate(grid, Q_s, Q_blind, pmf_mismatches, ends_s):
     # 1/Q.
     a = ((1 - own) * (1 - blind))[neighbours].mean(axis=1) * inverse(Q[neighbours].mean(axis=1))
     c = ((1 - own) * blind)[neighbours].mean(axis=1) * inverse(Q_blind[neighbours].mean(axis=1))
-    e = np.clip(pmf_mismatches[neighbours].mean(axis=1), LEAST_DOUBT, 1)
     shares = (Q_s * inverse(Q)[:, None])[neighbours].mean(axis=1) + (~(Q > 0))[neighbours].mean(
         axis=1
     )[:, None] * (ends_s / ends)
-    records = np.stack([a, uniform / ends, c, e], axis=1)
+    records = np.stack([a + c, uniform / ends], axis=1)
     return tuple(from_numpy(mi.Float, values.ravel()) for values in (records, shares))

@@ -15,11 +15,10 @@ import mitsuba as mi
 
 from ..core.packing import Store
 from ..core.random import vertex_streams
-from ..core.recording import lanes
 from ..core.spectra import channel_mean
 from .sensor import unblocked, unblocked_by_visible
 from .setting import Limits, World
-from .subpaths import STATES, Kept, read_vertices, seen_normal, vertex_bsdf_of
+from .subpaths import STATES, Kept, read_vertices, vertex_bsdf_of
 from .vertex import SMALLEST_COSINE
 
 Array = Any
@@ -169,61 +168,6 @@ def list_pairs(
         place += 1
         left -= 1
     return store.camera, store.light, store.factor, store.count
-
-
-SLIGHT, LEAST_CHANCE = 0.2, 0.2
-"""Camera vertices that are promised less than this share of what the brightest one of their path is
-are thinned out, at most to that share of them: the promise is one of cache points some way off."""
-
-
-def list_draws(grid, expected, camera: Kept, paths: int, states, capacity: int, seed):
-    """The camera vertices (of `paths` sub-paths, with `states`) that are to be joined to light
-    vertices drawn for them.
-
-    Lambertian ones are thinned out (Russian roulette) by the light that they are promised, next to
-    their path's others: the throughput decides, mostly, and shadows. `expected` (as of
-    `cumulative_sums`): what each cache point of the `CacheGrid` promises. Returns `(places, one
-    over the probability of staying, count)`.
-    """
-    index = lanes(camera.capacity)
-    active = index < dr.gather(mi.UInt32, camera.count, 0)
-    z = read_vertices(
-        camera.vertices,
-        index,
-        active,
-        ("p", "path", "throughput", "density", "towards", "number", "value", "n"),
-        states,
-    )
-    row = grid.row(z["p"], seen_normal(z))
-    simple = active & (z["density"] >= 0)
-    expected_contribution = dr.select(
-        simple, channel_mean(z["throughput"] * z["value"]) * grid.mean(expected, row, simple), 0
-    )
-    brightest = dr.zeros(mi.UInt32, paths)  # as bits: positive numbers have the same order
-    dr.scatter_reduce(
-        dr.ReduceOp.Max,
-        brightest,
-        dr.reinterpret_array(mi.UInt32, expected_contribution),
-        z["path"],
-        simple,
-    )
-    dr.eval(brightest, expected_contribution)
-    level = SLIGHT * dr.reinterpret_array(
-        mi.Float, dr.gather(mi.UInt32, brightest, z["path"], simple)
-    )
-    chance = dr.select(
-        simple & (expected_contribution < level),
-        dr.maximum(expected_contribution * dr.rcp(dr.maximum(level, 1e-30)), LEAST_CHANCE),
-        1,
-    )
-    keep = active & (vertex_streams(z["path"], z["number"], seed).next_float32() < chance)
-    count = dr.zeros(mi.UInt32, 1)
-    slot = dr.scatter_inc(count, mi.UInt32(0), keep)
-    keep &= slot < dr.opaque(mi.UInt32, capacity)
-    places, factor = dr.empty(mi.UInt32, capacity), dr.empty(mi.Float, capacity)
-    dr.scatter(places, index, slot, keep)
-    dr.scatter(factor, dr.rcp(chance), slot, keep)
-    return places, factor, count
 
 
 def visible(scene, connection, camera, active):

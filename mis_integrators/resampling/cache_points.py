@@ -36,7 +36,7 @@ class CacheGrid:
 
     Attributes: `table` (uint32, indices of cache points: entry `rows` times N_c and on, nearest
     first), `rows` (number of rows), `spacing` (of the cache points [length]) and `squared_spacing`
-    (opaque, [length^2]), `normal_cost` (what a right angle between normals costs [length^2]).
+    (opaque, [length^2]).
     """
 
     def __init__(self, points, normals, neighbors):
@@ -47,7 +47,6 @@ class CacheGrid:
         # Surfaces: C points cover about the box's faces, each an equal share.
         area = 2 * (size[0] * size[1] + size[1] * size[2] + size[2] * size[0])
         self.spacing = float(np.sqrt(area / len(p)))
-        self.normal_cost = 0.5 * NORMAL_COST * self.spacing**2
         edge = FINENESS * self.spacing
         while np.prod(np.maximum(np.ceil(size / edge), 1)) > CELLS:
             edge *= 1.05
@@ -75,7 +74,7 @@ class CacheGrid:
                 p,
                 to_numpy(normals).astype(np.float64).T,
                 neighbors,
-                self.normal_cost,
+                0.5 * NORMAL_COST * self.spacing**2,
             ).ravel(),
         )
 
@@ -94,16 +93,6 @@ class CacheGrid:
         """Index of the cache point `number` (0: nearest) of a row."""
         return dr.gather(mi.UInt32, self.table, row * self.neighbors + number, active)
 
-    def mean(self, values, row, active=True):
-        """Mean of `values`, one a cache point, over those of a row."""
-        return (
-            sum(
-                dr.gather(mi.Float, values, self.neighbor(row, number, active), active)
-                for number in range(self.neighbors)
-            )
-            / self.neighbors
-        )
-
 
 def facing(n):
     """Which of the six axis directions a normal is nearest to."""
@@ -119,7 +108,8 @@ def _nearest(centres, blocks, p, n, neighbors, normal_cost):
     """The table, a NumPy array (rows, neighbors).
 
     `centres` (cells, 3) of the cells, `blocks` (cells,) numbers of the blocks that they belong to,
-    `p`, `n` (C, 3) of the cache points. Only points that can be among the nearest somewhere in a
+    `p`, `n` (C, 3) of the cache points, `normal_cost` of a right angle between normals [length^2].
+    Only points that can be among the nearest somewhere in a
     block are tried for its cells."""
     wanted = min(neighbors, len(p))
     table = np.empty((len(centres), FACINGS, wanted), dtype=np.uint32)

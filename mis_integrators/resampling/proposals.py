@@ -21,8 +21,7 @@ def uniform_share(visible):
 
 def cumulative_sums(r, seen, count, width):
     """Cumulative sums, up to one in each row, of the pmfs of C cache points over up to `width`
-    light vertices; `uniform_share` of each row; and what the row expects of all light vertices
-    together, what is not seen for `BLIND_SHARE`.
+    light vertices; and `uniform_share` of each row.
 
     `r` (float, C x width, one row a cache point): q*/p of each light vertex if nothing stood
     between, zero in unused places; `seen` (bool, alike): whether nothing does; `count` (uint32 of
@@ -44,14 +43,8 @@ def cumulative_sums(r, seen, count, width):
     )
     end = dr.arange(mi.UInt32, dr.width(r) // width) * width + (width - 1)
     every, some = (dr.gather(mi.Float, x, end) for x in (all_sums, seen_sums))
-    expected = dr.fma(BLIND_SHARE, every, (1 - BLIND_SHARE) * some)
-    return (
-        sums,
-        uniform_share(
-            dr.minimum(dr.select(every > 0, some / dr.select(every > 0, every, 1), 0), 1)
-        ),
-        expected,
-    )
+    visible = dr.select(every > 0, some / dr.select(every > 0, every, 1), 0)
+    return sums, uniform_share(dr.minimum(visible, 1))
 
 
 class Proposals:

@@ -96,18 +96,6 @@ def technique_weights(densities: Sequence[Array], counts: Sequence[Array]) -> li
     return [part / total for part in parts]
 
 
-def doubtful_ratio(whole: Array, spare: Array, pmf_mismatch: Array) -> Array:
-    """q/p to put into `gain` where the pmf is a cached one, made for a place near by: 1 / E[p/q],
-    for 1/q is what the variance is linear in.
-
-    `whole`: q/p if the cache sees what can be seen here; `spare`: what is left of it if it does
-    not, which happens with the probability `pmf_mismatch`."""
-    return 1 / (
-        (1 - pmf_mismatch) / at_least(whole, SMALLEST_DENOMINATOR)
-        + pmf_mismatch / at_least(spare, SMALLEST_DENOMINATOR)
-    )
-
-
 # ---------------------------------------------------------------- the noise
 
 

@@ -134,13 +134,7 @@ def test_prices(rgb):
     """Whatever counts costs has a price for every event, and more of anything is dearer."""
     from mis_integrators.integrators.choice import PHOTON_MAPPERS
 
-    # the last two: `light_tracing`
-    assert set(costs.PRICES) == {
-        "path",
-        *(plugin for plugin, _ in PHOTON_MAPPERS),
-        "pcbpt",
-        "bdpt_ris",
-    }
+    assert set(costs.PRICES) == {"path", *(plugin for plugin, _ in PHOTON_MAPPERS)}
     for plugin in costs.PRICES:
         few, many = (
             costs.cost(plugin, (1.0, 1.0, 1.0, 1.0)),

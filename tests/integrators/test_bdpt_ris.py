@@ -20,7 +20,6 @@ from mis_integrators.paths.connect import join_sensor
 from mis_integrators.paths.setting import Limits, World
 from mis_integrators.paths.subpaths import (
     NO_PARENT,
-    Kept,
     hit_record,
     new_vertices,
     read_vertices,
@@ -561,65 +560,6 @@ def test_dark_and_short(rgb, parameters):
     np.testing.assert_allclose(*[x.mean(axis=(0, 1)) for x in images], rtol=0.03)
 
 
-# --- Which camera vertices draw -----------------------------------------------
-
-
-def test_slight_vertices_are_thinned_out(rgb):
-    """Each camera vertex stays with the probability whose inverse it is given, worked out apart:
-    rough ones and the brightest of a path always, others by what the nearest cache points promise.
-    A chi-square of 200 rounds, false alarms 1e-6."""
-    from mis_integrators.paths.connect import LEAST_CHANCE, SLIGHT, list_draws
-
-    session, rounds = plugin("pcbpt", max_depth=6).session(glossy_box(size=32), 0, 1, 0), 200
-    session.start()
-    spectral = session._spectral(1)
-    light, (_, _, _, camera, count, *_) = (
-        session._light(1, 0, spectral),
-        session._camera(1, 0, spectral),
-    )
-    *_, pmfs = session._proposals(1, spectral, light)
-    number = int(count[0])
-    z = read_vertices(camera, dr.arange(mi.UInt32, number), True, states=STEP)
-    row = np.array(session.grid.row(z["p"], dr.mulsign(z["n"], dr.dot(z["n"], z["towards"]))))
-    expected = np.array(pmfs[2])[np.array(session.grid.table).reshape(-1, 3)[row]].mean(axis=1)
-    promised = np.array(z["throughput"] * z["value"]).mean(axis=0) * expected
-    path, rough = np.array(z["path"]), np.array(z["density"]) < 0
-    promised[rough] = 0
-    brightest = np.zeros(session.chunk)
-    np.maximum.at(brightest, path, promised)
-    level = SLIGHT * brightest[path]
-    chance = np.where(
-        rough | (promised >= level),
-        1,
-        np.maximum(promised / np.where(level > 0, level, 1), LEAST_CHANCE),
-    )
-    slight = chance < 1
-    assert (
-        0.05 < slight.mean() < 0.95 and rough.any() and (chance[slight] > LEAST_CHANCE).mean() > 0.2
-    )
-    stays = np.zeros(number)
-    for seed in range(rounds):
-        places, factor, found = list_draws(
-            session.grid,
-            pmfs[2],
-            Kept(camera, count, session.capacity["camera"]),
-            session.chunk,
-            STEP,
-            session.capacity["camera"],
-            mi.UInt32(seed),
-        )
-        places, factor = (np.array(x)[: int(found[0])] for x in (places, factor))
-        assert len(set(places)) == len(places)
-        np.testing.assert_allclose(factor, 1 / chance[places], rtol=1e-4)
-        stays[places] += 1
-    assert np.all(stays[~slight] == rounds)
-    squares = (stays - rounds * chance)[slight] ** 2 / (rounds * chance * (1 - chance))[
-        slight
-    ].clip(1e-3)
-    mean, error = squares.mean(), squares.std() / np.sqrt(slight.sum())
-    assert abs(mean - 1) < 5 * error and error < 0.1
-
-
 # --- Repeatability, memory, parameters ----------------------------------------
 
 
@@ -759,101 +699,10 @@ def test_pilot_sees_all_of_the_film(rgb, monkeypatch):
 # --- How many light sub-paths -------------------------------------------------
 
 
-def test_best_ratio_is_the_best():
-    """Against a search along n; what no light sub-path brings, and what nothing else brings, end at
-    the bounds."""
-    from mis_integrators.integrators.light_tracing import (
-        LEAST_LIGHT_TRACING,
-        MOST_CHOSEN,
-        LightTracingNoise,
-        best_ratio,
-    )
-
-    n = np.geomspace(LEAST_LIGHT_TRACING, MOST_CHOSEN, 4001)
-    for light, camera, light_cost, camera_cost in np.exp(
-        np.random.default_rng(1).normal(0, 1, (50, 4))
-    ):
-        best = n[np.argmin((camera + light / n) * (camera_cost + n * light_cost))]
-        assert best_ratio(
-            LightTracingNoise(light, camera), light_cost, camera_cost
-        ) == pytest.approx(best, rel=1e-3)
-    assert (
-        best_ratio(LightTracingNoise(0, 1), 1, 1) == LEAST_LIGHT_TRACING
-        and best_ratio(LightTracingNoise(1, 0), 1, 1) == MOST_CHOSEN
-        and best_ratio(LightTracingNoise(0, 0), 1, 1) == LEAST_LIGHT_TRACING
-    )
-
-
-@pytest.mark.parametrize("camera_paths", [1, 4])
-def test_noise_is_seen_in_one_iteration(camera_paths):
-    """Camera paths and splats with the same known variances in each pixel, in an image whose
-    brightness varies a hundredfold: each is found to 5 % (five standard errors and more)."""
-    from mis_integrators.integrators.light_tracing import observed_noise
-    from mis_integrators.pilot.noise import relative_weights
-
-    rng, width, height, rate = np.random.default_rng(2), 104, 96, 0.5
-    brightness = np.repeat(np.repeat(np.geomspace(0.1, 10, 13), 8)[None], height, axis=0)
-    line, column = (np.repeat(x.ravel(), camera_paths) for x in np.indices((height, width)))
-    there = brightness[line, column]
-    values = rng.gamma(4, there / 8)  # mean half the brightness, standard deviation half of that
-    light, squares = np.zeros((2, height, width))
-    splats = rng.poisson(rate * camera_paths * width * height)
-    y, x = rng.integers(0, height, splats), rng.integers(0, width, splats)
-    value = brightness[y, x] / 2 / rate  # their weights sum to `camera_paths`
-    np.add.at(light, (y, x), value)
-    np.add.at(squares, (y, x), value**2)
-    noise = observed_noise(
-        np.stack([column, line]),
-        values,
-        camera_paths,
-        light,
-        squares,
-        np.full((height, width), float(camera_paths)),
-    )
-    relative = relative_weights(brightness.ravel()) * brightness.ravel() ** 2
-    assert noise.camera == pytest.approx(np.mean(relative) / 16 / camera_paths, rel=0.05)
-    assert noise.light == pytest.approx(np.mean(relative) / 4 / rate / camera_paths, rel=0.05)
-
-
-def test_light_tracing_follows_the_scene(rgb):
-    """Where the noise is caustics, as many light sub-paths are traced as camera paths; where almost
-    nothing that they meet is seen but through glass, fewer. What was chosen is told, and makes the
-    same image in another session that recalls it (and has to begin the first iteration anew)."""
-    chosen = []
-    for name in ("caustics", "sds"):
-        scene = mi.load_file(str(SCENES / f"{name}.xml"), resx=32, resy=24)
-        session = plugin("bdpt_ris", max_depth=10).session(scene, 0, 1, 0)
-        session.iterate()
-        assert session.light_chunk == session.chunk
-        session.iterate()
-        chosen.append(session.settings["light_tracing"])
-    other = plugin("bdpt_ris", max_depth=10).session(scene, 0, 1, 0)
-    other.recall(session.learned)
-    for _ in range(2):
-        other.iterate()
-    assert chosen[0] == 1 and chosen[1] < 0.95 and other.light_chunk == session.light_chunk
-    np.testing.assert_allclose(other.image(), session.image(), rtol=1e-4, atol=1e-6)
-
-
-def test_light_tracing_does_not_follow_the_parts(rgb, monkeypatch):
-    """As much for a film in parts as for one in one, but for the noise of the pilot, which sees a
-    part."""
-    from mis_integrators.integrators import resampled
-
-    chosen = []
-    for chunk in (1 << 18, 3000):
-        monkeypatch.setattr(resampled, "CHUNK", chunk)
-        sessions = [
-            plugin("pcbpt").session(
-                mi.load_file(str(SCENES / "door.xml"), resx=48, resy=36), 0, seed, 0
-            )
-            for seed in range(4)
-        ]
-        for session in sessions:
-            session.start()
-        chosen.append(np.log([session.light_tracing for session in sessions]))
-    # log(sqrt(3)) = 0.55
-    assert session.chunks == 3 and abs(np.mean(chosen[0]) - np.mean(chosen[1])) < 0.3
+def test_no_light_tracing_is_the_default(rgb):
+    """0, which once left the number to a pilot."""
+    assert plugin("bdpt_ris", light_tracing=0).settings() == plugin("bdpt_ris").settings()
+    assert plugin("pcbpt").settings()["light_tracing"] == 1
 
 
 @pytest.mark.parametrize("ratio", [0.125, 8])

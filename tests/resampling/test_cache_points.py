@@ -60,7 +60,7 @@ def test_neighbours_are_the_nearest(rgb, count, neighbors, stretch):
 
 def new_proposals(grid, r, seen, count, width):
     count = dr.opaque(mi.UInt32, count)
-    cumulative, uniform, _ = cumulative_sums(r, seen, count, width)
+    cumulative, uniform = cumulative_sums(r, seen, count, width)
     return Proposals(grid, cumulative, uniform, count, width)
 
 
