@@ -29,9 +29,6 @@ LARGEST_SHARE = 2.0
 """Bound on e drive, the weights that are left for a vertex and those beyond. Right ones exceed one
 where the surroundings are brighter; far larger ones mean that the cache does not know the
 vertex."""
-WEIGHT_KEPT, SELDOM = 0.4, 0.02
-"""Strategies of less than this weight are used at random, with a probability in proportion, but no
-smaller than the second number."""
 TRUSTED_PHOTONS = 128
 """Photons in a disk up to which the radiance of typical neighbours is known well enough for the
 means over directions."""
@@ -346,20 +343,6 @@ class OptimalWeights:
     def ends(self, bsdf, vertex, mask):
         """Whether the vertex is the path's last strategy though there are more."""
         return (vertex >= self.first) & self.is_last(bsdf, mask)
-
-    def merge_probability(self, state, share, vertex, last):
-        """Probability with which photons are gathered: where the weights are small, seldom."""
-        _, _, u, _ = state
-        weight = dr.max(dr.abs(u))
-        if self.has_caustics:
-            weight = dr.maximum(weight, dr.max(dr.abs(share)))
-        return dr.select(vertex > self.first, dr.clip(weight / WEIGHT_KEPT, SELDOM, 1), 1)
-
-    def continue_probability(self, state, vertex):
-        """Probability with which the path goes on from an inner vertex: the deeper weights are at
-        most about the drive."""
-        drive, _, _, _ = state
-        return dr.select(vertex > self.first, dr.clip(dr.max(drive) / WEIGHT_KEPT, SELDOM, 1), 1)
 
     def stored(self, state):
         """What the photons merged at a vertex need of its state: u (or the offset), tau, r."""
