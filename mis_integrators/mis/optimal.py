@@ -17,7 +17,7 @@ from ..core.records import Layout
 from ..core.spectra import channel_mean
 from ..core.traits import lookup
 from ..weights import recursion
-from .neighbour_radiance import SHARES
+from .neighbour_radiance import HALVES
 
 AMBIENT_SHARE = 0.02
 """Share of the scene's mean irradiance that is taken to reach every vertex, lest one that the cache
@@ -269,12 +269,11 @@ class OptimalWeights:
         r = recursion.first_ratio(p, self.camera_paths)
         around = self.neighbour_radiance.lookup(self.cache.slot(si.p, self.side(si), mask), mask)
         e = sum(
-            share
-            * response(
+            response(
                 1, self.strategies, self.n, r, typical_node(*radiance, self.albedo), self.albedo
             )[0]
-            for share, radiance in zip(SHARES, around)
-        )
+            for radiance in around
+        ) * (1 / HALVES)
         photons = channel_mean(self.n) * self.cache.level
         return recursion.root_offset(f * (1 - e), e) * dr.rcp(
             1 + dr.square(photons / TRUSTED_PHOTONS)
