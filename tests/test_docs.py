@@ -165,7 +165,7 @@ def test_docstrings_say_what_plugins_take(rgb, monkeypatch, plugin):
     for name, kind, text in rows:
         default = re.search(r"\(Default: (?:yes, i\.e\. |no, i\.e\. )?(.*)\)$", text)
         assert default or not kind, name
-        if default and name != "mix_diffuse":  # whose default depends on the scene
+        if default:
             value = made.settings()[name]
             shown = (
                 str(value).lower()

@@ -16,9 +16,9 @@ from .common import MOST_LIGHT_PATHS
 from .weighted import WeightedBDPM, WeightedSession
 
 USUAL_FROZEN_PATHS = 1 << 17
+"""Tuned: light sub-paths of the frozen pass, unless the parameter says otherwise."""
 USUAL_PHOTONS = 10
-FEW_PHOTONS = 1.0
-"""Photons a merge disk, fewer than which make mixing on diffuse surfaces worth its time."""
+"""Tuned: photons a merge disk of the radius for which the weights of a pilot are made."""
 PHOTONS_A_PATH = 5
 """Room for photons of the frozen pass; it grows where that is not enough."""
 
@@ -47,9 +47,8 @@ class BDPMOpt(WeightedBDPM):
      * - mix_diffuse
        - |bool|
        - Whether strategies go on beyond vertices that scatter as Lambertians do; else a path's
-         first Lambertian vertex is its last strategy. It pays only where a merge disk holds few
-         photons. (Default: where ``initial_radius`` is given, and a typical disk of that radius
-         holds less than one photon)
+         first Lambertian vertex is its last strategy. It makes iterations less noisy and
+         longer. (Default: no, i.e. |false|)
      * - frozen_photons
        - |int|
        - Light sub-paths of the pass from which the weights learn where light is; they do not
@@ -93,18 +92,17 @@ class BDPMOpt(WeightedBDPM):
             "first_vertex", 0, 0, "from 0 to 16", high=16
         )
         self.weights = parameters.choice("weights", "local", ("full", "local"))
-        self.mix_diffuse = parameters.boolean("mix_diffuse", None)
+        self.mix_diffuse = parameters.boolean("mix_diffuse", False)
         self.frozen_photons = parameters.integer(
             "frozen_photons", 0, 0, "at least 0 (0: 131072)", high=MOST_LIGHT_PATHS
         )
 
     def settings(self):
-        mixing = "automatic" if self.mix_diffuse is None else self.mix_diffuse
         return {
             **super().settings(),
             "first_vertex": self.first_vertex,
             "weights": self.weights,
-            "mix_diffuse": mixing,
+            "mix_diffuse": self.mix_diffuse,
             "frozen_photons": self.frozen_photons,
         }
 
@@ -142,25 +140,9 @@ class BDPMOptSession(WeightedSession):
     def __init__(self, integrator, scene, sensor, seed, iterations):
         self.cache = self.neighbour_radiance = None
         super().__init__(integrator, scene, sensor, seed, iterations)
-        self.mix_diffuse = bool(integrator.mix_diffuse)
-        self.undecided = integrator.mix_diffuse is None and self.radii is not None
-
-    @property
-    def settings(self):
-        return {**super().settings, "mix_diffuse": self.mix_diffuse}
 
     def mixes(self):
-        if self.undecided and self.integrator.strategies > 1:
-            self._learn()
-            photons = (
-                self.light_path_count
-                * math.pi
-                * max(self.radii.values()) ** 2
-                * self.cache.mean
-                / max(self.cache.typical_flux, 1e-30)
-            )
-            self.mix_diffuse, self.undecided = photons < FEW_PHOTONS, False
-        if not (self.traits.has_rough or self.mix_diffuse):
+        if not (self.traits.has_rough or self.integrator.mix_diffuse):
             return False
         self._learn()
         return (
@@ -219,7 +201,7 @@ class BDPMOptSession(WeightedSession):
             integrator.first_vertex,
             self.camera_paths,
             integrator.weights == "full",
-            self.mix_diffuse,
+            integrator.mix_diffuse,
         )
 
     def merge_settings(self, radii):

@@ -18,7 +18,6 @@ from ..core.film import (
 from ..core.packing import rounded_up
 from ..core.random import next_2d, vertex_streams
 from ..core.recording import lanes, recorder
-from ..core.spectra import channel_mean
 from ..core.traits import SceneTraits
 from ..lights.lights import Lights
 from ..mis.vertex_merging import ConnectionWeights
@@ -33,9 +32,6 @@ from .pyramid import Ledger, camera_images, sensor_images, technique_channels, w
 CHUNK = 1 << 19
 """Camera paths, and as many light sub-paths, traced at once at most; larger films are traced in
 parts (bounds memory)."""
-THINNING = 0.05
-"""Joined pairs that would bring less than this share of the mean radiance are left out by Russian
-roulette."""
 
 
 class BDPT(IterativeIntegrator):
@@ -82,9 +78,9 @@ class BDPT(IterativeIntegrator):
 
     Each camera path is traced with a light sub-path. Light comes from emitters that the camera path
     meets, from next-event estimation, from joining each of its vertices with each of the light
-    sub-path's (few of those that would bring little), and from joining the latter's with the
-    sensor, on perspective, thin-lens and orthographic sensors. All techniques that could have made
-    a path share it by Veach's heuristic (1997, chapter 10).
+    sub-path's, and from joining the latter's with the sensor, on perspective, thin-lens and
+    orthographic sensors. All techniques that could have made a path share it by Veach's heuristic
+    (1997, chapter 10).
 
     Unbiased, without any parameter to choose. Participating media, polarised variants, gradients
     and the film ``specfilm`` are refused by name.
@@ -216,35 +212,25 @@ class BDPTSession(IterativeSession):
             self.chunk, self.integrator.techniques, self.integrator.technique_weights, entries
         )
 
-    def _list_pairs(self, tables, light, radiance, camera, camera_count, seed, spectral):
+    def _list_pairs(self, light, camera, camera_count):
         vertices, count, lengths = light
-        ordered = by_path(Kept(vertices, count, self.capacity["light"]), lengths)
-        thinning = THINNING if self.integrator.technique_weights else 0
-        level = dr.zeros(mi.Float, self.chunk) + dr.mean(channel_mean(radiance)) * thinning
-        dr.eval(level)
         return list_pairs(
-            self.traits,
-            self.weights(spectral),
             Kept(camera, camera_count, self.capacity["camera"]),
-            ordered,
+            by_path(Kept(vertices, count, self.capacity["light"]), lengths),
             self.integrator.max_depth,
             self.capacity["pairs"],
-            level,
-            seed,
         )
 
     def _connect(self, scene, tables, radiance, camera, light, pairs, spectral, entries):
         """Radiance of camera paths with that of connections added."""
-        camera_place, light_place, factor, count = pairs
+        camera_place, light_place, count = pairs
         index = lanes(self.capacity["pairs"])
         active = index < dr.gather(mi.UInt32, count, 0)
         z = read_vertices(camera, dr.gather(mi.UInt32, camera_place, index, active), active)
         y = read_vertices(light, dr.gather(mi.UInt32, light_place, index, active), active)
         pair = join(self.traits, z, y, spectral["wavelengths"], active)
         seen = visible(scene, pair, z, active & (dr.max(pair.value) > 0))
-        share = self.weights(spectral).connected(pair, z, y) * dr.gather(
-            mi.Float, factor, index, active
-        )
+        share = self.weights(spectral).connected(pair, z, y)
         total = mi.Spectrum(radiance)
         dr.scatter_reduce(dr.ReduceOp.Add, total, pair.value * share, z["path"], seen)
         if entries:
@@ -316,15 +302,7 @@ class BDPTSession(IterativeSession):
                 break
         if self.bidirectional:
             while True:
-                pairs = self._pair_pass(
-                    self._tables,
-                    light,
-                    radiance,
-                    camera,
-                    count,
-                    self._seed(iteration, THIN, chunk),
-                    spectral,
-                )
+                pairs = self._pair_pass(light, camera, count)
                 if not self._grown("pairs", pairs[-1]):
                     break
             radiance, entries = self._connection_pass(
@@ -361,5 +339,5 @@ class BDPTSession(IterativeSession):
         self.accumulator.add(block, iteration, techniques)
 
 
-LIGHT, CAMERA, APERTURE, THIN = 0, 1, 3, 4
+LIGHT, CAMERA, APERTURE = 0, 1, 3
 """Purposes of an iteration's random seeds, besides `IterativeSession.WAVELENGTH`."""

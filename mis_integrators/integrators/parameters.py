@@ -64,9 +64,9 @@ class Parameters:
         return float(value)
 
     def boolean(self, name, default):
-        """True or false; also `None` if that is the default and the parameter is not given."""
+        """True or false."""
         value = self._get(name, default)
-        if type(value) is not bool and (value is not None or default is not None):
+        if type(value) is not bool:
             self._fail(name, value, "true or false")
         return value
 

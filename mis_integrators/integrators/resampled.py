@@ -45,8 +45,8 @@ CHUNK = 1 << 18
 """Camera paths, and as many light sub-paths, traced at once at most; larger films are traced in
 parts (bounds memory), which share their proposals."""
 CACHE_SHARE, FEWEST_CACHE_POINTS = 1 / 300, 256
-"""Cache points: this share of a part's camera vertices, but at least so many. More of them cost
-shadow rays."""
+"""Tuned: cache points: this share of a part's camera vertices, but at least so many. More of them
+cost shadow rays."""
 MOST_PAIRS = 1 << 24
 """Pairs of a cache point and a light vertex at most, four bytes each (and some more while they are
 made); beyond that there are fewer cache points."""
@@ -57,8 +57,8 @@ MORE_ROOM = 1.1
 """Room for vertices of sub-paths over what the first iteration has: a connection takes a lane for
 each place of a camera vertex, used or not."""
 KNOWN_PATHS, MOST_KNOWN_SETS = 200, 8
-"""Light sub-paths of the first iteration from which Q and Q_s are estimated, in sets of M; at most
-so many sets."""
+"""Tuned: light sub-paths of the first iteration from which Q and Q_s are estimated, in sets of M;
+at most so many sets."""
 
 
 class ResampledIntegrator(IterativeIntegrator):

@@ -120,12 +120,6 @@ class HeuristicWeights:
     def ends(bsdf, vertex, mask):
         return mi.Bool(False)
 
-    def merge_probability(self, state, share, vertex, last):
-        return mi.Float(1)
-
-    def continue_probability(self, state, vertex):
-        return mi.Float(1)
-
     def stored(self, state):
         total, p = state
         return [mi.Spectrum(total), mi.Spectrum(p), mi.Spectrum(0)]  # the last is not needed

@@ -3,8 +3,6 @@ neighbours' radiance."""
 
 from __future__ import annotations
 
-import itertools
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -15,15 +13,17 @@ from ..core.spectra import channel_mean
 from ..photons.irradiance_cache import colours
 
 RAYS, SECTORS = 32, 8
-SHARES = (1 / 8, 1 / 8, 1 / 4, 1 / 2)
-"""Neighbours are sorted by radiance, dark ones first, and averaged in groups of these shares: small
-ones where a mean over directions of 1 / (1 + gamma) changes most."""
+"""Tuned: rays of a cell to its neighbours, and sectors of azimuth by which they are stratified."""
+HALVES = 2
+"""Neighbours are sorted by radiance and averaged in two halves, the dark one first: a mean over
+directions of 1 / (1 + gamma) is not that of the mean radiance."""
 DELTA_STEPS = 3
+"""Tuned: delta surfaces that such a ray goes through."""
 OWN_STREAM = 0x6E656172
 
 
 class NeighbourRadiance:
-    """For each cell `len(SHARES)` typical neighbours, each with its radiance by direct and by other
+    """For each cell `HALVES` typical neighbours, each with its radiance by direct and by other
     light (spectra).
 
     Attributes: `table` (float32), `albedo` of a typical neighbour (width one).
@@ -35,7 +35,7 @@ class NeighbourRadiance:
         cache = weights.cache
         cells = dr.width(cache.center)
         channels = colours()
-        self.words = 2 * channels * len(SHARES)
+        self.words = 2 * channels * HALVES
         if cells == 0:
             self.table, self.albedo = dr.zeros(mi.Float, self.words), dr.opaque(mi.Float, 0)
             return
@@ -49,15 +49,14 @@ class NeighbourRadiance:
             cells, RAYS
         )
         order = np.argsort(grey, axis=1)
-        ends = np.round(np.cumsum((0,) + SHARES) * RAYS).astype(int)
-        table = np.zeros((cells + 1, len(SHARES), 2, channels), dtype=np.float32)
+        table = np.zeros((cells + 1, HALVES, 2, channels), dtype=np.float32)
         for number, spectrum in enumerate((node.direct, node.indirect)):
             for channel in range(channels):
                 value = channel_mean(spectrum) if channels == 1 else spectrum[channel]
                 value = np.array(dr.select(active, value, 0)).reshape(cells, RAYS)
                 value = np.take_along_axis(value, order, axis=1)
-                for group, (a, b) in enumerate(itertools.pairwise(ends)):
-                    table[1:, group, number, channel] = value[:, a:b].mean(axis=1)
+                halves = value.reshape(cells, HALVES, RAYS // HALVES)
+                table[1:, :, number, channel] = halves.mean(axis=2)
         self.table = from_numpy(mi.Float, table.ravel())
 
     @staticmethod
@@ -100,7 +99,7 @@ class NeighbourRadiance:
 
     def lookup(self, slot, active=True):
         """Pairs (radiance by direct light, by other light) of the typical neighbours of cell
-        `slot`, in the order of `SHARES`."""
+        `slot`, the darker one first."""
         words = gather_words(self.table, self.words, slot, active)
         channels = colours()
         spectra = [

@@ -17,24 +17,21 @@ from ..core.records import Layout
 from ..core.spectra import channel_mean
 from ..core.traits import lookup
 from ..weights import recursion
-from .neighbour_radiance import SHARES
+from .neighbour_radiance import HALVES
 
 AMBIENT_SHARE = 0.02
-"""Share of the scene's mean irradiance that is taken to reach every vertex, lest one that the cache
-calls dark be left to a strategy that hardly ever makes its paths."""
+"""Tuned: share of the scene's mean irradiance that is taken to reach every vertex, lest one that
+the cache calls dark be left to a strategy that hardly ever makes its paths."""
 STEEPEST_DRIVE = 30.0
-"""Bound on the corrections 1 + G / f_0 and 1 + tau / (1 - theta), which grow without bound where
-the BSDF falls to zero."""
+"""Tuned: bound on the corrections 1 + G / f_0 and 1 + tau / (1 - theta), which grow without bound
+where the BSDF falls to zero."""
 LARGEST_SHARE = 2.0
-"""Bound on e drive, the weights that are left for a vertex and those beyond. Right ones exceed one
-where the surroundings are brighter; far larger ones mean that the cache does not know the
-vertex."""
-WEIGHT_KEPT, SELDOM = 0.4, 0.02
-"""Strategies of less than this weight are used at random, with a probability in proportion, but no
-smaller than the second number."""
+"""Tuned: bound on e drive, the weights that are left for a vertex and those beyond. Right ones
+exceed one where the surroundings are brighter; far larger ones mean that the cache does not know
+the vertex."""
 TRUSTED_PHOTONS = 128
-"""Photons in a disk up to which the radiance of typical neighbours is known well enough for the
-means over directions."""
+"""Tuned: photons in a disk up to which the radiance of typical neighbours is known well enough for
+the means over directions."""
 SMALLEST_COSINE, SMALLEST_LOBE_COSINE = 1e-6, 0.05
 SMALLEST_DENSITY = 1e-6
 
@@ -272,12 +269,11 @@ class OptimalWeights:
         r = recursion.first_ratio(p, self.camera_paths)
         around = self.neighbour_radiance.lookup(self.cache.slot(si.p, self.side(si), mask), mask)
         e = sum(
-            share
-            * response(
+            response(
                 1, self.strategies, self.n, r, typical_node(*radiance, self.albedo), self.albedo
             )[0]
-            for share, radiance in zip(SHARES, around)
-        )
+            for radiance in around
+        ) * (1 / HALVES)
         photons = channel_mean(self.n) * self.cache.level
         return recursion.root_offset(f * (1 - e), e) * dr.rcp(
             1 + dr.square(photons / TRUSTED_PHOTONS)
@@ -346,20 +342,6 @@ class OptimalWeights:
     def ends(self, bsdf, vertex, mask):
         """Whether the vertex is the path's last strategy though there are more."""
         return (vertex >= self.first) & self.is_last(bsdf, mask)
-
-    def merge_probability(self, state, share, vertex, last):
-        """Probability with which photons are gathered: where the weights are small, seldom."""
-        _, _, u, _ = state
-        weight = dr.max(dr.abs(u))
-        if self.has_caustics:
-            weight = dr.maximum(weight, dr.max(dr.abs(share)))
-        return dr.select(vertex > self.first, dr.clip(weight / WEIGHT_KEPT, SELDOM, 1), 1)
-
-    def continue_probability(self, state, vertex):
-        """Probability with which the path goes on from an inner vertex: the deeper weights are at
-        most about the drive."""
-        drive, _, _, _ = state
-        return dr.select(vertex > self.first, dr.clip(dr.max(drive) / WEIGHT_KEPT, SELDOM, 1), 1)
 
     def stored(self, state):
         """What the photons merged at a vertex need of its state: u (or the offset), tau, r."""

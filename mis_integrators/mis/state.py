@@ -109,12 +109,6 @@ class MergeState(Protocol):
     def ends(self, bsdf: Any, vertex: Array, mask: Array) -> Array:
         """Whether no strategy goes on beyond the vertex, although there are more."""
 
-    def merge_probability(self, state: State, share: Array, vertex: Array, last: Array) -> Array:
-        """Probability with which photons are gathered at the vertex."""
-
-    def continue_probability(self, state: State, vertex: Array) -> Array:
-        """Probability with which the path goes on after a smooth scattering."""
-
     def stored(self, state: State) -> list[Array]:
         """Three spectra that are kept with the vertex."""
 

@@ -14,11 +14,9 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.packing import Store
-from ..core.random import vertex_streams
-from ..core.spectra import channel_mean
 from .sensor import unblocked, unblocked_by_visible
 from .setting import Limits, World
-from .subpaths import STATES, Kept, read_vertices, vertex_bsdf_of
+from .subpaths import Kept, read_vertices, vertex_bsdf_of
 from .vertex import SMALLEST_COSINE
 
 Array = Any
@@ -101,38 +99,13 @@ def by_path(light: Kept, lengths):
     return ByPath(light.vertices, start, order, lengths)
 
 
-LAMBERTIAN = (
-    "p",
-    "path",
-    "throughput",
-    "density",
-    "ns",
-    "depth",
-    "towards",
-    "number",
-    "value",
-    "n",
-    *STATES,
-)
-"""Fields of a vertex that a connection of Lambertian vertices needs."""
-
-
 @dr.syntax
-def list_pairs(
-    traits, weights, camera: Kept, light: ByPath, max_depth: int, capacity: int, level, seed
-):
+def list_pairs(camera: Kept, light: ByPath, max_depth: int, capacity: int):
     """Every camera vertex with every vertex of the light sub-path of its own number (modulo
-    theirs), as far as `max_depth` lets them.
-
-    Pairs of Lambertian vertices are thinned out by what they would bring if nothing stood between
-    (Russian roulette): those worth less than `level` [radiance, channel mean; an array with one
-    number a camera path] stay with a probability in proportion. Returns `(camera places, light
-    places, one over that probability, count)`.
-    """
+    theirs), as far as `max_depth` lets them: `(camera places, light places, count)`."""
     store = Store(
         camera=dr.empty(mi.UInt32, capacity),
         light=dr.empty(mi.UInt32, capacity),
-        factor=dr.empty(mi.Float, capacity),
         room=dr.opaque(mi.UInt32, capacity),
         count=dr.zeros(mi.UInt32, 1),
     )
@@ -140,34 +113,24 @@ def list_pairs(
     vertices, start, order, lengths = light.vertices, light.start, light.order, light.lengths
     index = dr.arange(mi.UInt32, camera.capacity)
     active = index < dr.gather(mi.UInt32, camera.count, 0)
-    z = read_vertices(camera.vertices, index, active, LAMBERTIAN)
-    rng = vertex_streams(z["path"], z["number"], seed)
-    level = dr.gather(mi.Float, level, z["path"], active)
+    z = read_vertices(camera.vertices, index, active, ("path", "depth"))
     partner = z["path"] % dr.width(lengths)
     place = dr.gather(mi.UInt32, start, partner, active)
     left = dr.gather(mi.UInt32, lengths, partner, active)
 
     while dr.hint(left > 0, label="pairs"):
         vertex = dr.gather(mi.UInt32, order, place)
-        y = read_vertices(vertices, vertex, True, LAMBERTIAN)
         keep = mi.Bool(True)
         if dr.hint(max_depth > 0, mode="scalar"):
+            y = read_vertices(vertices, vertex, True, ("depth",))
             keep &= y["depth"] + z["depth"] + 1 <= max_depth
-        chance = mi.Float(1)
-        if dr.hint(traits.has_lambertian, mode="scalar"):
-            pair = join(traits, z, y, [], keep)
-            worth = channel_mean(pair.value) * weights.connected(pair, z, y)
-            simple = (y["density"] >= 0) & (z["density"] >= 0)
-            chance = dr.select(simple, dr.minimum(worth * dr.rcp(dr.maximum(level, 1e-30)), 1), 1)
-            keep &= rng.next_float32() < chance
         slot = dr.scatter_inc(store.count, mi.UInt32(0), keep)
         keep &= slot < store.room
         dr.scatter(store.camera, index, slot, keep)
         dr.scatter(store.light, vertex, slot, keep)
-        dr.scatter(store.factor, dr.rcp(chance), slot, keep)
         place += 1
         left -= 1
-    return store.camera, store.light, store.factor, store.count
+    return store.camera, store.light, store.count
 
 
 def visible(scene, connection, camera, active):

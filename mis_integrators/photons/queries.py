@@ -135,7 +135,7 @@ class QueryVisitor:
         direct = mi.Spectrum(0)
         if not self.lights.dark:
             direct = self._direct(state, at, rng, smooth)
-        self._ask_for_photons(state, at, rng, smooth)
+        self._ask_for_photons(state, at, smooth)
         return state, direct
 
     def _direct(self, state, at, rng, smooth):
@@ -152,16 +152,12 @@ class QueryVisitor:
         share = dr.select(ds.delta, 1, mis_power(light_pdf, response_pdf)) * share_here
         return dr.select(smooth, at.throughput * share * response * light, 0)
 
-    def _ask_for_photons(self, state, at, rng, smooth):
+    def _ask_for_photons(self, state, at, smooth):
         """Stores the vertices at which photons are to be gathered."""
         vertex, _, _, _, share_here, sums = state
         weights, store, queries = self.weights, self.store, self.queries
         last = (vertex == self.bdd) | (weights is not None)
         wants = smooth & (dr.max(at.throughput) > 0)
-        kept = mi.Float(1)
-        if self.sections > 1:
-            kept = weights.merge_probability(sums, share_here, vertex, at.ends)
-            wants &= rng.next_float32(wants) < kept
         if not queries.has_caustics:
             wants &= last & queries.has_indirect
         slot = mi.UInt32(at.path)
@@ -178,7 +174,7 @@ class QueryVisitor:
             "ray_o": at.ray.o,
             "ray_d": at.ray.d,
             "hit": at.hit,
-            "throughput": at.throughput * dr.rcp(dr.select(wants, kept, 1)),
+            "throughput": at.throughput,
             "path": at.path,
             "depth": at.depth | dr.select(last, mi.UInt32(LAST_VERTEX), mi.UInt32(0)),
         }
@@ -191,15 +187,9 @@ class QueryVisitor:
         vertex, _, scatter_pdf, origin, share_here, sums = state
         if not self.traits.has_light_surfaces:
             active &= delta | ~at.ends
-        if self.weights is not None:
-            smoothly = active & ~delta
-            sums = self.weights.scatter(sums, at.si, at.bsdf, bs, vertex, smoothly)
-            if self.sections > 1:
-                probability = self.weights.continue_probability(sums, vertex)
-                probability = dr.select(smoothly, probability, 1)
-                active &= rng.next_float32(active) < probability
-                weight *= dr.rcp(dr.select(active, probability, 1))
         scattered = active & ~delta
+        if self.weights is not None:
+            sums = self.weights.scatter(sums, at.si, at.bsdf, bs, vertex, scattered)
         beyond = dr.select(at.ends, mi.UInt32(self.bdd), vertex) + 1
         state = [
             dr.select(scattered, beyond, vertex),

@@ -903,18 +903,6 @@ def test_parts_lose_nothing(rgb, monkeypatch):
     assert_same(*collect_until(*batches))
 
 
-def test_pairs_are_thinned_without_bias(rgb, monkeypatch):
-    """What connections alone bring, with all pairs and with most of them left out, to 5 % (6
-    standard errors)."""
-    scene, estimates = box_scene(24), []
-    for thinning in (0, 1.0):
-        monkeypatch.setattr("mis_integrators.integrators.bdpt.THINNING", thinning)
-        found = technique_estimates(scene, bdpt(techniques=3, camera_paths=32, max_depth=3), 32)
-        estimates.append(found[2, 2])
-    assert not differences(*estimates)
-    assert 6 * np.sqrt(sum(e.error2[0, 0] for e in estimates)) < 0.05 * estimates[0].mean[0, 0]
-
-
 def test_variance_is_that_of_the_mean(rgb):
     scene = box_scene(24, "gaussian")
     images = np.array([render(scene, seed, 8, variance=True) for seed in range(12)])

@@ -331,18 +331,6 @@ def test_no_jumps(rooms, ladder, method):
     )
 
 
-def test_no_jump_where_mixing_on_diffuse_surfaces_begins(rooms):
-    """`mix_diffuse` switches where a typical disk holds one photon."""
-    values = halved(20, 5)
-    mixes = []
-    for n_f in values:
-        session = integrator("bdpm_opt3", **disks(n_f)).session(rooms().set(), seed=5)
-        session.mixes()
-        mixes.append(session.mix_diffuse)
-    assert not mixes[0] and mixes[-1]
-    assert not jumps(rooms, "bdpm_opt3", "photons", values, 24)
-
-
 def photons_a_disk(rooms, n_f):
     """Expected photons in a disk at a typical lit place."""
     session = integrator("bdpm_opt3", **disks(n_f)).session(rooms().set(), seed=5)
