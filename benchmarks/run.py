@@ -282,6 +282,7 @@ def _parser() -> argparse.ArgumentParser:
     )
 
     command = _measuring(commands, "constants", constants)
+    command.set_defaults(scenes=[])
     command.add_argument(
         "--file",
         type=Path,
@@ -290,7 +291,7 @@ def _parser() -> argparse.ArgumentParser:
         help="where figures are kept, and added to (default: docs/constants.json)",
     )
     command.add_argument(
-        "--page", action="store_true", help="only print docs/constants.md from code and figures"
+        "--page", action="store_true", help="only write docs/constants.md from code and figures"
     )
     command.add_argument(
         "--only", nargs="+", metavar="TEXT", help="constants whose names contain one of these"

@@ -26,19 +26,20 @@ from report import constants as report
 
 METHODS = {
     "mis.optimal": "bdpm_opt3",
+    "mis.optimal.TRUSTED_PHOTONS": "bdpm_opt3:weights=full",
     "mis.neighbour_radiance": "bdpm_opt3:weights=full",
     "photons.irradiance_cache": "bdpm_opt3",
     "integrators.bdpm_opt": "bdpm_opt3",
-    "mis.resampling": "bdpt_ris",
+    "mis.resampling": "bdpt_ris:light_paths=50",
     "resampling": "bdpt_ris",
     "integrators.resampled": "bdpt_ris",
-    "integrators.light_tracing": "bdpt_ris",
     "integrators.choice": "bdpm_auto",
-    "integrators.bdpt": "bdpt",
     "integrators.vcm": "vcm",
 }
-"""What judges the constants of a module, or of a folder; all others are judged by `USUAL`."""
+"""What judges a constant, or those of a module or of a folder; others are judged by `USUAL`."""
 USUAL = "bdpm:bdd=0"
+OF_SEVERAL_VIEWS = "volume."
+"""Modules that none of these scenes needs."""
 SEEN_BY_ENVIRONMENTS = ("lights.environment_guide", "lights.portals")
 """Modules of no use where no light comes from infinitely far away."""
 
@@ -46,7 +47,8 @@ SEEN_BY_ENVIRONMENTS = ("lights.environment_guide", "lights.portals")
 def method_of(key: str) -> Method:
     """The method that judges the constant of this key."""
     module = key.rpartition(".")[0]
-    return parse_method(METHODS.get(module) or METHODS.get(module.partition(".")[0], USUAL))
+    places = key, module, module.partition(".")[0]
+    return parse_method(next((METHODS[place] for place in places if place in METHODS), USUAL))
 
 
 def variants(constant: Constant) -> dict[str, object]:
@@ -72,6 +74,10 @@ def run(options: argparse.Namespace) -> None:
     if options.page:
         PAGE.write_text(page())
         return
+    if not options.scenes:
+        raise SystemExit("constants: name scenes that they were not tuned on: --scenes FILE.xml")
+    if options.change and options.file == FIGURES:
+        raise SystemExit("constants: --change needs a --file of its own: the table has no such row")
     if options.processor_time:
         time.perf_counter = time.process_time
     experiments = wanted(options)
@@ -110,6 +116,7 @@ def wanted(options: argparse.Namespace) -> list[tuple[str, str, Method, dict[str
     return [
         (constant.key, name, options.method or method_of(constant.key), {constant.key: value})
         for constant in tuned_constants()
+        if not constant.key.startswith(OF_SEVERAL_VIEWS)
         if not options.only or any(part in constant.key for part in options.only)
         for name, value in variants(constant).items()
     ]

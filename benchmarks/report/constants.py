@@ -16,7 +16,7 @@ without the worst 0.1 % of the pixels, and with them."""
 TOP = """# Tuned constants
 
 Numbers that could be others without anything being wrong: shares, costs, sizes of tables. Limits,
-tolerances and formats are not among them. This page is printed from the code, where the docstring
+tolerances and formats are not among them. This page is written from the code, where the docstring
 of each begins with "Tuned:", by `python benchmarks/run.py constants --page`; a test compares.
 
 `halved` and `doubled` are errors at equal time over those with the value as it is: relative squared

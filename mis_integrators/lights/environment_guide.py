@@ -29,7 +29,6 @@ POLAR_CELLS = 16
 """Tuned: cells of directions from pole to pole."""
 AZIMUTH_CELLS = 32
 """Tuned: cells of directions around."""
-DIRECTION_CELLS = POLAR_CELLS * AZIMUTH_CELLS
 POSITION_CELLS = 64
 """Tuned: cells along each edge of the position histograms."""
 DEFENSIVE_SHARE = 0.1
@@ -65,8 +64,13 @@ def infinite_emitters(scene):
     return [(i, e) for i, e in enumerate(scene.emitters()) if e.flags() & mi.EmitterFlags.Infinite]
 
 
+def direction_cells():
+    """Cells of all directions."""
+    return POLAR_CELLS * AZIMUTH_CELLS
+
+
 def direction_cell(d):
-    """Cell number of world directions on an equal-area grid (16 in z, 32 in azimuth)."""
+    """Cell number of world directions on an equal-area grid."""
     row = dr.clip(mi.UInt32((d.z + 1) * (0.5 * POLAR_CELLS)), 0, POLAR_CELLS - 1)
     azimuth = dr.atan2(d.y, d.x) * dr.inv_two_pi
     azimuth = dr.select(azimuth < 0, azimuth + 1, azimuth)
@@ -176,7 +180,7 @@ class EnvironmentGuide:
         first_rows, row = np.zeros(len(scene.emitters()), dtype=np.uint32), 0
         for index, emitter in self.infinite:
             first_rows[index] = row
-            row += DIRECTION_CELLS if emitter.is_environment() else 1
+            row += direction_cells() if emitter.is_environment() else 1
         self.row_count = row
         self._first_row = mi.UInt32(first_rows)
         self.direction_share = 1.0
@@ -284,7 +288,7 @@ class EnvironmentGuide:
         for index, emitter in self.infinite:
             if emitter.is_environment():
                 first = int(np.array(self._first_row)[index])
-                rows[first : first + DIRECTION_CELLS] = True
+                rows[first : first + direction_cells()] = True
         return rows
 
     def _learn_directions(self, places):
@@ -294,31 +298,31 @@ class EnvironmentGuide:
         if environment is None:
             return
         _, emitter = environment
-        tests, seen = np.zeros(DIRECTION_CELLS), np.zeros(DIRECTION_CELLS)
+        tests, seen = np.zeros(direction_cells()), np.zeros(direction_cells())
         for place, rng in places:
             towards = mi.warp.square_to_uniform_sphere(next_2d(rng))
             tested = self._scatters(place, towards)
             reached = _sees_sky(self.scene, place.si.spawn_ray(towards), tested)
             cell, tested, reached = self._numpy((direction_cell(towards), tested, reached))
-            tests += np.bincount(cell[tested], minlength=DIRECTION_CELLS)
-            seen += np.bincount(cell[reached], minlength=DIRECTION_CELLS)
+            tests += np.bincount(cell[tested], minlength=direction_cells())
+            seen += np.bincount(cell[reached], minlength=direction_cells())
         reach = seen / np.maximum(tests, 1)
         draws = 64
-        cell = dr.arange(mi.UInt32, DIRECTION_CELLS * draws) // draws
-        rng = streams(dr.arange(mi.UInt32, DIRECTION_CELLS * draws), mi.UInt32(0x64697273))
+        cell = dr.arange(mi.UInt32, direction_cells() * draws) // draws
+        rng = streams(dr.arange(mi.UInt32, direction_cells() * draws), mi.UInt32(0x64697273))
         smooth = (
             self._radiance(emitter, cell_direction(cell, next_2d(rng))).numpy().reshape(-1, draws)
         )
         smooth = np.minimum(
             smooth, 4 * np.median(smooth, axis=1, keepdims=True) + 1e-6 * smooth.mean()
         ).mean(axis=1)
-        smooth_power = smooth * reach * (4 * np.pi / DIRECTION_CELLS)
+        smooth_power = smooth * reach * (4 * np.pi / direction_cells())
         ds, weight = emitter.sample_direction(
             self._point(self.center, mi.Float(0)), next_2d(streams(cell, mi.UInt32(1)))
         )
         drawn = np.array(direction_cell(ds.d))
         weight = np.nan_to_num(np.broadcast_to(np.array(channel_mean(weight)), drawn.shape))
-        total_power = np.bincount(drawn, weights=weight, minlength=DIRECTION_CELLS) / len(drawn)
+        total_power = np.bincount(drawn, weights=weight, minlength=direction_cells()) / len(drawn)
         if smooth_power.sum() <= 0:
             return
         self.direction_share = float(
@@ -500,7 +504,7 @@ class EnvironmentGuide:
         own = extra < share
         extra = dr.select(own, extra / share, (extra - share) / (1 - share))
         cell, leftover = draw_cell(
-            self._direction_cdf, mi.UInt32(0), DIRECTION_CELLS, sample.x, active
+            self._direction_cdf, mi.UInt32(0), direction_cells(), sample.x, active
         )
         ds.d = dr.select(own, ds.d, cell_direction(cell, mi.Point2f(leftover, sample.y)))
         return (
@@ -516,7 +520,7 @@ class EnvironmentGuide:
         if self.direction_share == 1.0:
             return own_pdf
         table_pdf = dr.gather(mi.Float, self._direction_pmf, direction_cell(towards), active) * (
-            DIRECTION_CELLS / (4 * dr.pi)
+            direction_cells() / (4 * dr.pi)
         )
         return self.direction_share * own_pdf + (1 - self.direction_share) * table_pdf
 

@@ -26,8 +26,9 @@ class World:
 class Limits:
     """How far paths go, and what they show.
 
-    `max_depth`: segments of a whole path (0 or less: unlimited); `rr_depth`: segments from which
-    Russian roulette may end a sub-path; `hide_emitters`: emitters met directly are left out.
+    `max_depth`: segments of a whole path (negative: unlimited; 0: nothing is seen); `rr_depth`:
+    segments from which Russian roulette may end a sub-path; `hide_emitters`: emitters met directly
+    are left out.
     """
 
     max_depth: int

@@ -342,11 +342,11 @@ def trace_camera_subpaths(
     """Traces the camera paths of a pass, with the light that they meet and that next-event
     estimation finds at each smooth vertex, weighted.
 
-    Returns `(radiance, alpha, splat position, vertices, count)`: the kept vertices are those that a
-    light sub-path, of at least `shortest` segments with what joins the two, may be joined with;
-    `count` as in `trace_light_subpaths`. `ledger`, if given, learns every contribution: `met(path,
-    depth, value, share, mask)` and `direct(...)`, with the length of the joint path in segments,
-    and the weight apart.
+    Returns `(radiance, alpha, splat position, vertices, count)`: the kept vertices are those
+    that a light sub-path, of at least `shortest` segments with what joins the two, may be
+    joined with; `count` as in `trace_light_subpaths`. `ledger`, if given, learns every
+    contribution (`integrators.pyramid`): `hit_emitter(path, depth, value, share, mask)` and
+    `next_event(...)`, with the length of the joint path in segments, and the weight apart.
     """
     visitor = CameraVertexVisitor(
         world, limits, camera_pass.sensor, weights, capacity, ledger, shortest

@@ -16,9 +16,6 @@ from .gather import SAME_SURFACE_COSINE, SAME_SURFACE_OFFSET
 
 PROBES = 8
 """Tuned: probe rays of a merge disk."""
-OUTER = PROBES // 2
-"""Probes of the outer half of the disk, which are made first, a quarter turn apart: where they all
-find surface there is no edge, and the others are not made."""
 HEIGHT = 0.25
 """Tuned: probes start this share of the radius above the vertex, or halfway to what is closer."""
 SMALLEST_SHARE = 0.4
@@ -45,11 +42,14 @@ def covered_share(scene, vertices, radius, seed, active):
         scene.ray_intersect_preliminary(above, coherent=False, active=active).t, above.maxt
     )
     start = si.p + normal * height
+    # Probes of the outer half of the disk come first, a quarter turn apart: where they all find
+    # surface there is no edge, and the others are not made.
+    outer = PROBES // 2
     covered, probe = mi.UInt32(0), mi.UInt32(0)
     while dr.hint(active & (probe < PROBES), label="coverage probes"):
         distance = radius * dr.sqrt((mi.Float(PROBES - 1 - probe) + shift) * (1 / PROBES))
         sine, cosine = dr.sincos(
-            turn + dr.two_pi / OUTER * (mi.Float(probe) + dr.select(probe < OUTER, 0, 0.5))
+            turn + dr.two_pi / outer * (mi.Float(probe) + dr.select(probe < outer, 0, 0.5))
         )
         towards = distance * (cosine * frame.s + sine * frame.t) - height * normal
         hit = scene.ray_intersect(
@@ -68,7 +68,7 @@ def covered_share(scene, vertices, radius, seed, active):
         )
         covered += dr.select(same, 1, 0)
         probe += 1
-        if (probe == OUTER) & (covered == OUTER):
+        if (probe == outer) & (covered == outer):
             covered = mi.UInt32(PROBES)
             probe = mi.UInt32(PROBES)
     return dr.maximum(mi.Float(covered) * (1 / PROBES), SMALLEST_SHARE)

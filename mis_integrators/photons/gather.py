@@ -183,7 +183,7 @@ def gather_photons(
     vertices : QueryVertices or KeptVertices
     radii : ascending; each of width one, or one a vertex
     light_path_count : light sub-paths that made the photons
-    max_depth : segments of a whole path (0 or less: unlimited)
+    max_depth : segments of a whole path (negative: unlimited)
     weigh : None, or the weight of a photon, ``weigh(index, f, p, back, active)``, a spectrum or a
         number: its index in the map, and what its `Scattering` says
     grey : sums the mean over channels only (fewer sums to keep for many radii)

@@ -36,10 +36,11 @@ def iteration_cost(
 
 
 def measured_camera_share(of_one: float, of_two: float, ratio: float, assumed: float) -> float:
-    """The camera share, where an iteration of two camera paths took `ratio` times as long as one of
-    one.
+    """The camera share s, where an iteration of two camera paths took `ratio` times as long as one
+    of one: `iteration_cost` is linear in s, with the slope of one over 1 + `GATHER_COST`
+    `USUAL_PHOTONS`.
 
     `of_one`, `of_two`: `iteration_cost` of both with the share that was `assumed`.
     """
-    share = (ratio - 1) * of_one + assumed - (of_two - of_one)
+    share = assumed + (1 + GATHER_COST * USUAL_PHOTONS) * (ratio * of_one - of_two)
     return min(max(share, LEAST_CAMERA_SHARE), MOST_CAMERA_SHARE)

@@ -113,8 +113,8 @@ def direct_variance(direct: np.ndarray, weights: np.ndarray) -> float:
     return trimmed_mean(weights * np.var(direct, axis=0, ddof=1).mean(axis=0))
 
 
-def trimmed_mean(values: np.ndarray, rare: float = RARE_PIXELS, fewest: int = 0) -> float:
-    """Mean over pixels without the largest `rare` (a share) of them, `fewest` at least: one pixel
-    at the edge of a lamp can outweigh all others."""
-    kept = np.sort(values)[: max(len(values) - max(round(len(values) * rare), fewest), 1)]
+def trimmed_mean(values: np.ndarray) -> float:
+    """Mean over pixels without the share `RARE_PIXELS` of the largest: one pixel at the edge of a
+    lamp can outweigh all others."""
+    kept = np.sort(values)[: max(len(values) - round(len(values) * RARE_PIXELS), 1)]
     return float(np.mean(kept))

@@ -23,8 +23,8 @@ Radii = TypeVar("Radii", float, np.ndarray)
 NUMBERS_OF_PATHS = (1, 2, 4, 8)
 """Tuned: camera paths a pixel and iteration that are considered."""
 LONG = 16
-"""Tuned: iterations that a render must have time for, lest several camera paths not be worth
-trying."""
+"""Tuned: several camera paths are tried only in renders with time for more iterations than
+this."""
 WORTH_TRYING = 0.92
 """Tuned: two camera paths are tried where the best number is expected to make the error smaller by
 this factor, if a camera path costs the least that it may."""

@@ -2,8 +2,9 @@
 alike.
 
 Nothing here knows a renderer. `recursion` holds the optimal weights of any number of merging
-strategies, `mis2` and `mis3` the published closed forms for two and three of them, `heuristics`
-Veach's balance and power heuristic.
+strategies, `heuristics` Veach's balance and power heuristic, `bidirectional` the sums by which
+sub-paths carry it, `resampling` the weights that know of resampled light sub-paths, `multiview`
+those of views that share their paths.
 """
 
 from typing import Any

@@ -1,11 +1,20 @@
 """The table of tuned constants says what stands in the code, and changing one reaches all who read
 it."""
 
+import ast
+
 from mis_integrators.photons import gather, irradiance_cache
 from mis_integrators.pilot import radius
 
 from common import tuned
 from experiments import constants
+
+ALLOWED = {
+    "pilot/bias.py": {"LEAST_BIAS"},
+    "pilot/cost.py": {"CAMERA_SHARE"},
+    "pilot/result.py": {"CAMERA_SHARE"},
+}
+"""Defaults that callers overrule wherever it matters."""
 
 
 def test_page_is_up_to_date():
@@ -25,6 +34,27 @@ def test_every_importer_sees_a_change():
     with tuned.changed({"photons.gather.SAME_SURFACE_COSINE": 0.25}):
         assert gather.SAME_SURFACE_COSINE == irradiance_cache.SAME_SURFACE_COSINE == 0.25
     assert gather.SAME_SURFACE_COSINE == irradiance_cache.SAME_SURFACE_COSINE == before
+
+
+def test_nothing_is_computed_from_them_before_they_can_change():
+    """Values at the top of modules, and defaults of functions, would keep what they were."""
+    names = {constant.name for constant in tuned.tuned_constants()}
+    for path in tuned.PACKAGE.rglob("*.py"):
+        early = []
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.FunctionDef):
+                early += [*node.args.defaults, *filter(None, node.args.kw_defaults)]
+            elif isinstance(node, ast.Module):
+                early += [part.value for part in node.body if isinstance(part, ast.Assign)]
+        read = {part.id for node in early for part in ast.walk(node) if isinstance(part, ast.Name)}
+        allowed = ALLOWED.get(path.relative_to(tuned.PACKAGE).as_posix(), set())
+        assert not (read & names) - allowed, path
+
+
+def test_every_method_judges_something():
+    keys = [constant.key for constant in tuned.tuned_constants()]
+    for place in constants.METHODS:
+        assert any(key.startswith(place) for key in keys), place
 
 
 def test_halves_and_doubles():

@@ -330,10 +330,7 @@ LEARNED = {
     ],
     "bdpt": [{"radius": 1}],
     "bdpt_ris": [
-        {"light_tracing": 0},
-        {"light_tracing": "1"},
-        {"light_tracing": 1e30},
-        {"light_tracing": 1e-30},
+        {"light_tracing": 1.0},
         {"radius": 1},
     ],
     "vcm": [
