@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import sys
 import time
 from collections.abc import Callable, Sequence
 
@@ -30,11 +31,19 @@ class Interrupt:
             number: signal.signal(number, self._handle)
             for number in (signal.SIGINT, signal.SIGTERM)
         }
+        self._hook, sys.unraisablehook = sys.unraisablehook, self._unraisable
         return self
 
     def __exit__(self, *_: object) -> None:
         for number, handler in self._previous.items():
             signal.signal(number, handler)
+        sys.unraisablehook = self._hook
+
+    def _unraisable(self, dropped: sys.UnraisableHookArgs) -> None:
+        """Says nothing of an interrupt that Python has to drop, within a callback of its own
+        imports: ``stopped`` remembers it."""
+        if not isinstance(dropped.exc_value, KeyboardInterrupt):
+            self._hook(dropped)
 
     def _handle(self, *_: object) -> None:
         if self.requested or not self.have_result:

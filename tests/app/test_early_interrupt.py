@@ -7,7 +7,10 @@ import signal
 import subprocess
 import sys
 import time
+import weakref
 from pathlib import Path
+
+from mis_integrators.app.render_loop import Interrupt
 
 import pytest
 
@@ -134,3 +137,22 @@ def test_render_as_before(tmp_path):
         env={**os.environ, "PYTHONPATH": str(ROOT)},
     )
     assert wrong.returncode == 2
+
+
+def test_interrupt_that_python_drops_is_remembered_in_silence(capfd, monkeypatch):
+    """Python drops what is raised within a weak reference's callback, and says so."""
+
+    class Thing:
+        pass
+
+    def interrupted(_):
+        signal.raise_signal(signal.SIGINT)
+
+    hook = sys.__unraisablehook__
+    monkeypatch.setattr(sys, "unraisablehook", hook)
+    with Interrupt() as interrupt:
+        thing = Thing()
+        reference = weakref.ref(thing, interrupted)
+        del thing
+        assert reference() is None and interrupt.stopped
+    assert sys.unraisablehook is hook and capfd.readouterr().err == ""
