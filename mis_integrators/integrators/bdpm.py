@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import drjit as dr
@@ -15,7 +16,7 @@ from ..core.spectra import channel_mean
 from ..core.traits import SceneTraits, lookup
 from ..lights.lights import Lights
 from ..paths.camera import film_sample_count, film_size
-from ..paths.setting import CameraPass, World
+from ..paths.setting import World
 from ..photons.coverage import covered_share
 from ..photons.gather import QueryVertices, gather_photons, mean_photon_count
 from ..photons.grid import PhotonMap, build_photon_map, smallest_cell
@@ -412,15 +413,13 @@ class SubsetPasses:
         ) % 2**32  # from a path of the last pixel to the next one of the first
         self._camera = session.recorded(
             lambda scene, sensor, tables, seed, spectral: session._trace_camera(
-                CameraPass(
-                    sensor,
-                    session.integrator,
-                    seed,
-                    lanes(pixels.paths) // pixels.count * back,
-                    pixels.paths,
-                    pixels.camera_paths,
-                    spectral["sample"],
-                    stride,
+                replace(
+                    session.describe_camera_pass(
+                        sensor, seed, lanes(pixels.paths) // pixels.count * back, spectral
+                    ),
+                    count=pixels.paths,
+                    camera_paths=pixels.camera_paths,
+                    stride=stride,
                 ),
                 capacity,
                 spectral,

@@ -430,8 +430,8 @@ class ResampledSession(IterativeSession):
     # ------------------------------------------------------------------ before the first iteration
 
     def _prepare(self):
-        """Draws the cache points from the first part of the first iteration. All sessions of a
-        render see the same here."""
+        """Begins the first iteration: traces its light, and draws the cache points from its first
+        part. All sessions of a render see the same here."""
         spectral = self._spectral(0)
         light, traced = self._light(0, 0, spectral), self._camera(0, 0, spectral)
         vertices, M = (
@@ -452,6 +452,7 @@ class ResampledSession(IterativeSession):
         )
         self.records, self.shares = uniform_tables(self.grid)
         self._freeze()
+        self.first_light = light
 
     def _take_weights(self, iteration):
         """Sets the weights of an iteration. They must not depend on its own light sub-paths: the
@@ -460,10 +461,7 @@ class ResampledSession(IterativeSession):
         if not self.integrator.aware:
             return
         if iteration > 0 and self.known is None:
-            spectral = self._spectral(0)
-            light = self.first_light or self._light(0, 0, spectral)
-            self.known = tabulate(self.grid, *self._integrals(light, spectral))
-            self.first_light = None
+            self.known = tabulate(self.grid, *self._integrals(self.first_light, self._spectral(0)))
         self.records, self.shares = self.known if iteration > 0 else uniform_tables(self.grid)
         self._fill_tables()
 
@@ -647,9 +645,10 @@ class ResampledSession(IterativeSession):
         light = proposals = None
         if self.lit:
             self._take_weights(iteration)
-            light = self._light(iteration, 0, spectral)
-            if iteration == 0 and self.integrator.aware and self.known is None:
-                self.first_light = light
+            light = self.first_light if iteration == 0 else None
+            light = light or self._light(iteration, 0, spectral)
+            if not self.integrator.aware or self.known is not None:
+                self.first_light = None  # nobody will ask for it again
             proposals = self._proposals(iteration, spectral, light)
         block, met = self.sum_of_chunks(
             lambda chunk, _: self._chunk(iteration, chunk, spectral, light, proposals)

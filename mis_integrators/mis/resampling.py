@@ -38,7 +38,7 @@ last."""
 MANY = 100
 """Tuned: light sub-paths from which on Q_s / (M Q), at most 1 / M, is not worth a lookup."""
 LEAST_GAIN, MOST_GAIN = 1.0, 2.0
-"""Tuned: A draw counts as so many connections to a light sub-path of its own. A cache that promises
+"""Tuned: a draw counts as so many connections to a light sub-path of its own. A cache that promises
 more is not to be believed (fireflies). Where it promises less, a heuristic that goes by second
 moments would hand paths to techniques that are noisier: what is drawn seldom is mostly small. That
 is so the more, the more there is to draw from: with a single light sub-path the formula stands."""

@@ -7,7 +7,7 @@ import numpy as np
 from .bias import expected_products, jackknife
 
 STUDENT_WIDENING = 2
-"""Tuned: A standard error estimated from n + 1 iterations counts for 1 + STUDENT_WIDENING / n times
+"""Tuned: a standard error estimated from n + 1 iterations counts for 1 + STUDENT_WIDENING / n times
 what it says, about as Student's 95 % intervals are wider than normal ones."""
 STEP_DEVIATION, RETURN_TO_ONE = 0.3, 0.5
 """Tuned: the share that plain estimates lack, from one step of the ladder to the next smaller one:
