@@ -1,6 +1,8 @@
-"""Independent streams of random numbers: one generator a path, one seed an iteration and pass."""
+"""Random numbers: seeds, independent streams, and draws from whatever makes numbers."""
 
 import mitsuba as mi
+
+from .sequences import VertexNumbers
 
 
 def mix(*words):
@@ -29,6 +31,13 @@ def vertex_streams(path, number, seed):
     return streams(path, seed + number * mi.UInt32(0x9E3779B9))
 
 
+def next_floats(rng, dimensions, active=True):
+    """So many uniform numbers in [0, 1), stratified together where `rng` can (a `VertexNumbers`)."""
+    if isinstance(rng, VertexNumbers):
+        return rng.next_floats(dimensions)
+    return [rng.next_float32(active) for _ in range(dimensions)]
+
+
 def next_2d(rng, active=True):
     """Two uniform numbers in [0, 1) as a point; advances `rng`."""
-    return mi.Point2f(rng.next_float32(active), rng.next_float32(active))
+    return mi.Point2f(*next_floats(rng, 2, active))

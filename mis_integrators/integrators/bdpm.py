@@ -234,11 +234,11 @@ class BDPMSession(PilotedSession):
         self._map_pass = self.recorded(self._build_maps)
         self._record_camera_pass()
 
-    def _trace_light(self, scene, sensor, tables, seed, spectral):
+    def _trace_light(self, scene, sensor, tables, sequence, spectral):
         return trace_light_paths(
             self.world,
             self.limits,
-            self.describe_light_pass(sensor, seed, self.light_path_count, spectral),
+            self.describe_light_pass(sensor, sequence, self.light_path_count, spectral),
             self.photon_capacity,
             light_state=self._light_state(spectral),
         )
@@ -322,9 +322,9 @@ class BDPMSession(PilotedSession):
     def _build_maps(self, photons, radii):
         return {kind: self._map(photons, kind, radius).arrays() for kind, radius in radii.items()}
 
-    def _render_chunk(self, scene, sensor, tables, maps, seed, first, spectral, radii):
+    def _render_chunk(self, scene, sensor, tables, maps, sequence, first, spectral, radii):
         radiance, alpha, position, vertices, count = self._trace_camera(
-            self.describe_camera_pass(sensor, seed, first, spectral),
+            self.describe_camera_pass(sensor, sequence, first, spectral),
             self.vertex_capacity,
             spectral,
         )
@@ -336,7 +336,9 @@ class BDPMSession(PilotedSession):
             )
             (gathered,) = self._gather(photon_map, vertices, kind, [radius], spectral)
             if self.corrected[kind]:
-                gathered *= dr.rcp(self._covered(scene, tables, vertices, radius, seed))
+                gathered *= dr.rcp(
+                    self._covered(scene, tables, vertices, radius, sequence.own_seed())
+                )
             radiance += self._per_path(gathered, vertices, self.chunk)
         if self.integrator.hide_emitters:
             radiance = dr.select(
@@ -354,7 +356,11 @@ class BDPMSession(PilotedSession):
         with some room."""
         while True:
             photons = self._light_pass(
-                self.scene, self.sensor, self._tables, self._seed(iteration, LIGHT), spectral
+                self.scene,
+                self.sensor,
+                self._tables,
+                self._sequence(iteration, LIGHT, self.light_path_count),
+                spectral,
             )
             dr.eval(photons)
             found = self.photons_found = int(photons[2][0])
@@ -381,7 +387,7 @@ class BDPMSession(PilotedSession):
                     self.sensor,
                     self._tables,
                     maps,
-                    self._seed(iteration, CAMERA),
+                    self._sequence(iteration, CAMERA, self.camera_paths),
                     first,
                     spectral,
                     radii,
@@ -412,10 +418,10 @@ class SubsetPasses:
             1 - pixels.count * stride
         ) % 2**32  # from a path of the last pixel to the next one of the first
         self._camera = session.recorded(
-            lambda scene, sensor, tables, seed, spectral: session._trace_camera(
+            lambda scene, sensor, tables, sequence, spectral: session._trace_camera(
                 replace(
                     session.describe_camera_pass(
-                        sensor, seed, lanes(pixels.paths) // pixels.count * back, spectral
+                        sensor, sequence, lanes(pixels.paths) // pixels.count * back, spectral
                     ),
                     count=pixels.paths,
                     camera_paths=pixels.camera_paths,
@@ -449,17 +455,17 @@ class SubsetPasses:
         photons = session._photons(number, spectral)
         if self.photon_capacity != session.photon_capacity:
             self._record_gather()
-        seed = session._seed(number, CAMERA)
-        radiance, vertices = self._trace_camera(seed, spectral)
-        return SubsetIteration(self, photons, vertices, radiance, seed, spectral)
+        sequence = session._sequence(number, CAMERA, self.pixels.camera_paths)
+        radiance, vertices = self._trace_camera(sequence, spectral)
+        return SubsetIteration(self, photons, vertices, radiance, sequence.own_seed(), spectral)
 
-    def _trace_camera(self, seed, spectral):
+    def _trace_camera(self, sequence, spectral):
         """Radiance and vertices of the camera paths. Where the vertices overflow their buffer, it
         grows and the pass runs again."""
         session = self.session
         while True:
             radiance, _, _, vertices, count = self._camera(
-                session.scene, session.sensor, session._tables, seed, spectral
+                session.scene, session.sensor, session._tables, sequence, spectral
             )
             found = 0 if session.one_vertex else int(dr.max(count)[0])
             if found <= self.capacity:

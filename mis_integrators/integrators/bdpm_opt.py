@@ -168,7 +168,7 @@ class BDPMOptSession(WeightedSession):
         while found > capacity:
             capacity = found
             light_pass = self.describe_light_pass(
-                self.sensor, self._seed(0, FROZEN), paths, spectral
+                self.sensor, self._sequence(0, FROZEN, paths), paths, spectral
             )
             photons = trace_light_paths(
                 self.world, self.limits, light_pass, capacity, keep_direct=True

@@ -187,19 +187,19 @@ class BDPTSession(IterativeSession):
 
     # ------------------------------------------------------------------ passes
 
-    def _trace_light(self, scene, sensor, tables, seed, spectral):
-        light_pass = self.describe_light_pass(sensor, seed, self.light_chunk, spectral)
+    def _trace_light(self, scene, sensor, tables, sequence, spectral):
+        light_pass = self.describe_light_pass(sensor, sequence, self.light_chunk, spectral)
         return trace_light_subpaths(
             self.world, self.limits, light_pass, self.weights(spectral), self.capacity["light"]
         )
 
-    def _trace_camera(self, scene, sensor, tables, seed, first, skip, spectral):
+    def _trace_camera(self, scene, sensor, tables, sequence, first, skip, spectral):
         ledger = self._ledger() if self.integrator.techniques else None
         first = with_gaps(first, skip, self.chunk, self.camera_paths)
         radiance, alpha, position, vertices, count = trace_camera_subpaths(
             self.world,
             self.limits,
-            self.describe_camera_pass(sensor, seed, first, spectral),
+            self.describe_camera_pass(sensor, sequence, first, spectral),
             self.weights(spectral),
             self.capacity["camera"],
             ledger,
@@ -278,13 +278,21 @@ class BDPTSession(IterativeSession):
 
     # ------------------------------------------------------------------ iterations
 
+    def _light_sequence(self, iteration, chunk):
+        """The random numbers of a part's light sub-paths."""
+        return self._sequence(iteration, LIGHT, self.light_path_count, chunk * self.light_chunk)
+
     def _chunk(self, iteration, spectral, chunk, first):
         """Blocks of one part of the paths: of camera paths, of their techniques, of light that met
         the sensor (None where there is none)."""
         light = lit = None
         while self.bidirectional:
             light = self._light_pass(
-                self.scene, self.sensor, self._tables, self._seed(iteration, LIGHT, chunk), spectral
+                self.scene,
+                self.sensor,
+                self._tables,
+                self._light_sequence(iteration, chunk),
+                spectral,
             )
             if not self._grown("light", light[1]):
                 break
@@ -293,7 +301,7 @@ class BDPTSession(IterativeSession):
                 self.scene,
                 self.sensor,
                 self._tables,
-                self._seed(iteration, CAMERA),
+                self._sequence(iteration, CAMERA, self.camera_paths),
                 first,
                 dr.opaque(mi.UInt32, 0),
                 spectral,

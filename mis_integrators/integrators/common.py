@@ -14,11 +14,16 @@ from ..core.packing import rounded_up
 from ..core.random import mix
 from ..core.recording import settle
 from ..core.render_lock import RENDER_LOCK, under_render_lock
+from ..core.sequences import SampleSequence
 from ..core.traits import UnsupportedScene, check_film, check_scene, check_variant, unfinite_data
 from ..core.untrusted import Fields
 from ..paths.camera import film_sample_count, with_gaps
 from ..paths.setting import CameraPass, LightPass, Limits
+from ..pilot.run import PILOT_INDEX
 from .parameters import Parameters
+
+SAMPLERS = "sobol", "independent"
+"""Values of the parameter `sampler`; the first is the default."""
 
 MOST_PATHS = 2**32 - 1
 """Camera paths of an iteration at most: their numbers have 32 bits."""
@@ -45,6 +50,7 @@ class IterativeIntegrator(mi.AdjointIntegrator):
         self.hide_emitters = parameters.boolean("hide_emitters", False)
         self.camera_paths = parameters.integer("camera_paths", *self.CAMERA_PATHS)
         self.variance = parameters.boolean("variance", False)
+        self.sampler = parameters.choice("sampler", SAMPLERS[0], SAMPLERS)
         self.read_parameters(parameters)
         parameters.finish()
         super().__init__(props)
@@ -82,6 +88,7 @@ class IterativeIntegrator(mi.AdjointIntegrator):
             "hide_emitters": self.hide_emitters,
             "camera_paths": self.camera_paths,
             "variance": self.variance,
+            "sampler": self.sampler,
         }
 
     def session(self, scene, sensor=0, seed=0, spp=0):
@@ -304,17 +311,17 @@ class IterativeSession:
         self.chunk = -(-self.path_count // (self.chunks * self.camera_paths)) * self.camera_paths
 
     @staticmethod
-    def describe_light_pass(sensor, seed, count, spectral):
+    def describe_light_pass(sensor, sequence, count, spectral):
         """`count` light sub-paths under the wavelengths of an iteration."""
         shutter = sensor.shutter_open(), sensor.shutter_open_time()
-        return LightPass(seed, count, spectral["wavelengths"], *shutter)
+        return LightPass(sequence, count, spectral["wavelengths"], *shutter)
 
-    def describe_camera_pass(self, sensor, seed, first, spectral):
+    def describe_camera_pass(self, sensor, sequence, first, spectral):
         """The camera paths of a part, from number `first` on."""
         return CameraPass(
             sensor,
             self.integrator,
-            seed,
+            sequence,
             first,
             self.chunk,
             self.camera_paths,
@@ -362,6 +369,20 @@ class IterativeSession:
 
     def _seed(self, iteration, *purpose):
         return dr.opaque(mi.UInt32, mix(self.seed, iteration, *purpose))
+
+    def _sequence(self, iteration, purpose, paths, first=0):
+        """The random numbers of a pass whose groups have `paths` paths an iteration each, from
+        number `first` of these on. Pilots draw independent numbers: their laws are about these."""
+        low_discrepancy = self.integrator.sampler == "sobol" and iteration < PILOT_INDEX
+        first += iteration * paths
+        seed = (
+            mix(self.seed, purpose, first >> 32)
+            if low_discrepancy
+            else (mix(self.seed, iteration, purpose))
+        )
+        return SampleSequence(
+            dr.opaque(mi.UInt32, seed), dr.opaque(mi.UInt32, first % 2**32), low_discrepancy
+        )
 
     def _grown(self, name, count):
         """Whether the `count` (an array of width one) found more than there is room for in the

@@ -60,9 +60,10 @@ class PathSession(IterativeSession):
         """Radiance and alpha of camera paths `first`, `first + stride`, ..., and their positions on
         the film. Where `first` and `variation` are arrays, each lane has its own, and the paths of
         one number differ with the variation."""
-        seed = self._seed(iteration, PATHS) + variation
+        sequence = self._sequence(iteration, PATHS, self.camera_paths)
+        sequence.first += variation * self.camera_paths
         camera_pass = CameraPass(
-            self.sensor, None, seed, first, paths, self.camera_paths, spectral["sample"], stride
+            self.sensor, None, sequence, first, paths, self.camera_paths, spectral["sample"], stride
         )
         _, active, _, ray, weight, position, _ = start_camera_paths(camera_pass)
         differential = mi.RayDifferential3f(ray)

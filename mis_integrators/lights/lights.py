@@ -15,7 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.packing import from_numpy
-from ..core.random import next_2d, streams
+from ..core.random import next_2d, next_floats, streams
 from ..core.spectra import channel_mean
 from ..core.traits import UnsupportedScene, lookup, registry_table
 from .environment_guide import AIMED_SHARE, EnvironmentGuide, direction_cell, infinite_emitters
@@ -440,7 +440,8 @@ class Lights:
             rng.next_float32() if self.choice.count > 1 else mi.Float(0)
         )
         emitter = self.pointer(index)
-        sample_a, sample_b = next_2d(rng), next_2d(rng)
+        a, b, c, d = next_floats(rng, 4)
+        sample_a, sample_b = mi.Point2f(a, b), mi.Point2f(c, d)
         extra = rng.next_float32() if self.guide is not None else mi.Float(0)
         kind = (
             mi.UInt32(_KINDS.index(self.kinds[0]))

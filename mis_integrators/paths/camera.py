@@ -8,7 +8,7 @@ from typing import Any, Protocol
 import drjit as dr
 import mitsuba as mi
 
-from ..core.random import next_2d, streams
+from ..core.random import next_2d
 from .camera_rays import sample_camera_ray
 from .roulette import russian_roulette
 from .setting import CameraPass, Limits, World
@@ -68,15 +68,16 @@ def within_crop(film, splat):
 def start_camera_paths(camera_pass: CameraPass):
     """Camera rays of a pass.
 
-    Returns `(path, active, rng, ray, weight, splat, aperture)`: the index of each, whether there is
-    a path of that number, its random numbers, the ray and its weight, the position for splatting,
+    Returns `(path, active, numbers, ray, weight, splat, aperture)`: the index of each, whether there
+    is a path of that number, its random numbers (`PathNumbers`), the ray and its weight, the position for splatting,
     and the sample that chose the point of the lens.
     """
     sensor, camera_paths = camera_pass.sensor, camera_pass.camera_paths
     path = dr.arange(mi.UInt32, camera_pass.count)
     number = path * camera_pass.stride + camera_pass.first
     active = number < film_sample_count(sensor) * camera_paths
-    rng = streams(number, camera_pass.seed)
+    numbers = camera_pass.sequence.of_paths(number // camera_paths, number % camera_paths)
+    rng = numbers.at(0)
     unit, splat = film_samples(sensor, number, camera_paths, rng)
     aperture = next_2d(rng) if sensor.needs_aperture_sample() else mi.Point2f(0.5)
     time = mi.Float(sensor.shutter_open())
@@ -85,7 +86,7 @@ def start_camera_paths(camera_pass: CameraPass):
     ray, weight = sample_camera_ray(
         sensor, time, camera_pass.wavelength_sample, unit, aperture, active
     )
-    return path, active, rng, mi.Ray3f(ray), weight, splat, aperture
+    return path, active, numbers, mi.Ray3f(ray), weight, splat, aperture
 
 
 def with_gaps(first, skip, n_paths: int, camera_paths: int):
@@ -168,7 +169,7 @@ def trace_camera(world: World, limits: Limits, camera_pass: CameraPass, visitor:
     scene, traits = world.scene, world.traits
     max_depth, rr_depth = limits.max_depth, limits.rr_depth
     hide_emitters = limits.hide_emitters
-    path, active, rng, ray, sensor_weight, splat, aperture = start_camera_paths(camera_pass)
+    path, active, numbers, ray, sensor_weight, splat, aperture = start_camera_paths(camera_pass)
     throughput = mi.Spectrum(sensor_weight)
     radiance = mi.Spectrum(0)
     depth = mi.UInt32(0)
@@ -186,6 +187,7 @@ def trace_camera(world: World, limits: Limits, camera_pass: CameraPass, visitor:
     while dr.hint(active, label="camera sub-paths"):
         si = hit.compute_surface_interaction(ray, mi.RayFlags.All, active=active)
         depth += 1
+        rng = numbers.at(depth)
         at = CameraArrival(si, hit, ray, -ray.d, throughput, path, depth, visible, si.bsdf(ray))
 
         # ---- Emission met by the path

@@ -40,11 +40,11 @@ class Limits:
 class LightPass:
     """`count` light sub-paths.
 
-    `seed`: uint32 of width one; `wavelengths` that they share (empty in rgb and mono variants);
+    `sequence`: their random numbers (a `SampleSequence`); `wavelengths` that they share (empty in rgb and mono variants);
     `shutter_open`, `shutter_time`: when the shutter opens, and for how long.
     """
 
-    seed: Array
+    sequence: Any
     count: int
     wavelengths: Array
     shutter_open: float = 0.0
@@ -56,14 +56,15 @@ class CameraPass:
     """`count` camera paths through a `sensor`: numbers `first`, `first + stride`, ... of
     `camera.film_samples`, where each pixel has `camera_paths`.
 
-    `integrator`: what moves rays on behind emitters that are hidden (None: none are); `seed`,
-    `first`: uint32 of width one, or one a path (see `camera.with_gaps`); `wavelength_sample`: in
+    `integrator`: what moves rays on behind emitters that are hidden (None: none are);
+    `sequence`: their random numbers (a `SampleSequence`), where a pixel is a group; `first`: uint32
+    of width one, or one a path (see `camera.with_gaps`); `wavelength_sample`: in
     [0, 1), makes the wavelengths that all paths share.
     """
 
     sensor: Any
     integrator: Any
-    seed: Array
+    sequence: Any
     first: Array
     count: int
     camera_paths: int
