@@ -109,18 +109,20 @@ def unit(bits):
 
 @dataclass
 class SampleSequence:
-    """The random numbers of a pass. `seed`: of a render's low-discrepancy numbers, or of this pass
-    alone; `first`: the number of the pass's first path in its group, modulo 2^32; both uint32 of
-    width one."""
+    """The random numbers of a pass, whose paths form groups of `group_size`. `seed`: of a render's
+    low-discrepancy numbers, or of this pass alone; `first`: the index of each group's first path,
+    modulo 2^32; both uint32 of width one."""
 
     seed: Array
     first: Array
+    group_size: int
     low_discrepancy: bool
 
-    def of_paths(self, group, number) -> PathNumbers:
-        """The numbers of the paths `number` of this pass, of a `group` (uint32 arrays)."""
-        key = hash_bits(hash_bits(mi.UInt32(group)) + self.seed)
-        return PathNumbers(self.first + number, key, self.low_discrepancy)
+    def of_paths(self, number) -> PathNumbers:
+        """Those of the paths `number` of the pass (a uint32 array)."""
+        group, own = number // self.group_size, number % self.group_size
+        key = hash_bits(hash_bits(group) + self.seed)
+        return PathNumbers(self.first + own, key, self.low_discrepancy)
 
     def own_seed(self):
         """A seed of this pass alone."""

@@ -187,8 +187,8 @@ class BDPTSession(IterativeSession):
 
     # ------------------------------------------------------------------ passes
 
-    def _trace_light(self, scene, sensor, tables, sequence, spectral):
-        light_pass = self.describe_light_pass(sensor, sequence, self.light_chunk, spectral)
+    def _trace_light(self, scene, sensor, tables, sequence, first, spectral):
+        light_pass = self.describe_light_pass(sensor, sequence, self.light_chunk, spectral, first)
         return trace_light_subpaths(
             self.world, self.limits, light_pass, self.weights(spectral), self.capacity["light"]
         )
@@ -278,10 +278,6 @@ class BDPTSession(IterativeSession):
 
     # ------------------------------------------------------------------ iterations
 
-    def _light_sequence(self, iteration, chunk):
-        """The random numbers of a part's light sub-paths."""
-        return self._sequence(iteration, LIGHT, self.light_path_count, chunk * self.light_chunk)
-
     def _chunk(self, iteration, spectral, chunk, first):
         """Blocks of one part of the paths: of camera paths, of their techniques, of light that met
         the sensor (None where there is none)."""
@@ -291,7 +287,8 @@ class BDPTSession(IterativeSession):
                 self.scene,
                 self.sensor,
                 self._tables,
-                self._light_sequence(iteration, chunk),
+                self._sequence(iteration, LIGHT, 1),
+                dr.opaque(mi.UInt32, chunk * self.light_chunk),
                 spectral,
             )
             if not self._grown("light", light[1]):

@@ -11,7 +11,7 @@ import numpy as np
 
 from ..core.film import Accumulator, shared_wavelengths, variance_channels
 from ..core.packing import rounded_up
-from ..core.random import mix
+from ..core.random import mix, reversed_bits
 from ..core.recording import settle
 from ..core.render_lock import RENDER_LOCK, under_render_lock
 from ..core.sequences import SampleSequence
@@ -25,6 +25,8 @@ from .parameters import Parameters
 SAMPLERS = "sobol", "independent"
 """Values of the parameter `sampler`; the first is the default."""
 
+RENDER = 1 << 40
+"""In the place of an iteration's number: seeds that all iterations of a render share."""
 MOST_PATHS = 2**32 - 1
 """Camera paths of an iteration at most: their numbers have 32 bits."""
 MOST_LIGHT_PATHS = 2**28
@@ -311,10 +313,11 @@ class IterativeSession:
         self.chunk = -(-self.path_count // (self.chunks * self.camera_paths)) * self.camera_paths
 
     @staticmethod
-    def describe_light_pass(sensor, sequence, count, spectral):
-        """`count` light sub-paths under the wavelengths of an iteration."""
+    def describe_light_pass(sensor, sequence, count, spectral, first=0):
+        """`count` light sub-paths, from number `first` on, under the wavelengths of an
+        iteration."""
         shutter = sensor.shutter_open(), sensor.shutter_open_time()
-        return LightPass(sequence, count, spectral["wavelengths"], *shutter)
+        return LightPass(sequence, count, spectral["wavelengths"], *shutter, first)
 
     def describe_camera_pass(self, sensor, sequence, first, spectral):
         """The camera paths of a part, from number `first` on."""
@@ -365,23 +368,31 @@ class IterativeSession:
     def _spectral(self, iteration):
         """The wavelengths that all sub-paths of an iteration share, the sample that makes them, and
         their conversion to colour."""
-        return shared_wavelengths(self.sensor, mix(self.seed, iteration, self.WAVELENGTH))
+        if self._low_discrepancy(iteration):
+            number = reversed_bits(iteration) ^ mix(self.seed, RENDER, self.WAVELENGTH)
+        else:
+            number = mix(self.seed, iteration, self.WAVELENGTH)
+        return shared_wavelengths(self.sensor, number)
+
+    def _low_discrepancy(self, iteration):
+        return self.integrator.sampler == "sobol" and iteration < PILOT_INDEX
 
     def _seed(self, iteration, *purpose):
         return dr.opaque(mi.UInt32, mix(self.seed, iteration, *purpose))
 
-    def _sequence(self, iteration, purpose, paths, first=0):
-        """The random numbers of a pass whose groups have `paths` paths an iteration each, from
-        number `first` of these on. Pilots draw independent numbers: their laws are about these."""
-        low_discrepancy = self.integrator.sampler == "sobol" and iteration < PILOT_INDEX
-        first += iteration * paths
-        seed = (
-            mix(self.seed, purpose, first >> 32)
-            if low_discrepancy
-            else (mix(self.seed, iteration, purpose))
-        )
+    def _sequence(self, iteration, purpose, group_size):
+        """The random numbers of a pass whose groups have `group_size` paths an iteration each: all
+        paths of a group, over the iterations, share a low-discrepancy sequence. Pilots draw
+        independent numbers: their laws are about these."""
+        low_discrepancy = self._low_discrepancy(iteration)
+        first = iteration * group_size
         return SampleSequence(
-            dr.opaque(mi.UInt32, seed), dr.opaque(mi.UInt32, first % 2**32), low_discrepancy
+            self._seed(RENDER, purpose, first >> 32)
+            if low_discrepancy
+            else self._seed(iteration, purpose),
+            dr.opaque(mi.UInt32, first % 2**32),
+            group_size,
+            low_discrepancy,
         )
 
     def _grown(self, name, count):

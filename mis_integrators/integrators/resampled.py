@@ -189,8 +189,8 @@ class ResampledSession(IterativeSession):
 
     # ------------------------------------------------------------------ passes
 
-    def _trace_light(self, scene, sensor, tables, sequence, spectral):
-        light_pass = self.describe_light_pass(sensor, sequence, self.light_chunk, spectral)
+    def _trace_light(self, scene, sensor, tables, sequence, first, spectral):
+        light_pass = self.describe_light_pass(sensor, sequence, self.light_chunk, spectral, first)
         return trace_light_subpaths(
             self.world, self.limits, light_pass, self.weights(), self.capacity["light"]
         )
@@ -508,7 +508,7 @@ class ResampledSession(IterativeSession):
                     self.scene,
                     self.sensor,
                     self._tables,
-                    self._sequence(PILOT, START, M, k * M),
+                    self._sequence(PILOT + k, START, M),
                     light,
                     dr.opaque(mi.UInt32, k * M),
                     cache,
@@ -527,11 +527,6 @@ class ResampledSession(IterativeSession):
 
     # ------------------------------------------------------------------ iterations
 
-    def _light_sequence(self, iteration, chunk):
-        """The random numbers of a part's light sub-paths."""
-        parts = self.light_rounds * self.chunks
-        return self._sequence(iteration, LIGHT, parts * self.light_chunk, chunk * self.light_chunk)
-
     def _light(self, iteration, chunk, spectral):
         """What `trace_light_subpaths` returns."""
         while True:
@@ -539,7 +534,8 @@ class ResampledSession(IterativeSession):
                 self.scene,
                 self.sensor,
                 self._tables,
-                self._light_sequence(iteration, chunk),
+                self._sequence(iteration, LIGHT, self.integrator.resampled_light_paths),
+                dr.opaque(mi.UInt32, chunk * self.light_chunk),
                 spectral,
             )
             if not self._grown("light", light[1]):

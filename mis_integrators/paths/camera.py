@@ -8,7 +8,7 @@ from typing import Any, Protocol
 import drjit as dr
 import mitsuba as mi
 
-from ..core.random import next_2d
+from ..core.random import next_1d_and_2d, next_2d
 from .camera_rays import sample_camera_ray
 from .roulette import russian_roulette
 from .setting import CameraPass, Limits, World
@@ -76,7 +76,7 @@ def start_camera_paths(camera_pass: CameraPass):
     path = dr.arange(mi.UInt32, camera_pass.count)
     number = path * camera_pass.stride + camera_pass.first
     active = number < film_sample_count(sensor) * camera_paths
-    numbers = camera_pass.sequence.of_paths(number // camera_paths, number % camera_paths)
+    numbers = camera_pass.sequence.of_paths(number)
     rng = numbers.at(0)
     unit, splat = film_samples(sensor, number, camera_paths, rng)
     aperture = next_2d(rng) if sensor.needs_aperture_sample() else mi.Point2f(0.5)
@@ -203,7 +203,7 @@ def trace_camera(world: World, limits: Limits, camera_pass: CameraPass, visitor:
         radiance += direct
 
         # ---- Go on
-        bs, weight = at.bsdf.sample(context, si, rng.next_float32(met), next_2d(rng, met), met)
+        bs, weight = at.bsdf.sample(context, si, *next_1d_and_2d(rng, met), met)
         delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         visible |= met & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
         state, weight, active = visitor.leave(state, at, rng, bs, weight, delta, active)

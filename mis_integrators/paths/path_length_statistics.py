@@ -26,7 +26,7 @@ def count_segments(scene, sensor, seed, stride: int, paths: int, max_depth: int,
     camera_pass = CameraPass(
         sensor,
         None,
-        SampleSequence(seed, mi.UInt32(0), False),
+        SampleSequence(seed, mi.UInt32(0), 1, False),
         mi.UInt32(0),
         paths,
         1,

@@ -38,7 +38,7 @@ class Limits:
 
 @dataclass(frozen=True)
 class LightPass:
-    """`count` light sub-paths.
+    """`count` light sub-paths, numbers `first`, `first` + 1, ... of an iteration.
 
     `sequence`: their random numbers (a `SampleSequence`); `wavelengths` that they share (empty in rgb and mono variants);
     `shutter_open`, `shutter_time`: when the shutter opens, and for how long.
@@ -49,6 +49,7 @@ class LightPass:
     wavelengths: Array
     shutter_open: float = 0.0
     shutter_time: float = 0.0
+    first: Array = 0
 
 
 @dataclass(frozen=True)
@@ -57,7 +58,7 @@ class CameraPass:
     `camera.film_samples`, where each pixel has `camera_paths`.
 
     `integrator`: what moves rays on behind emitters that are hidden (None: none are);
-    `sequence`: their random numbers (a `SampleSequence`), where a pixel is a group; `first`: uint32
+    `sequence`: their random numbers (a `SampleSequence`); `first`: uint32
     of width one, or one a path (see `camera.with_gaps`); `wavelength_sample`: in
     [0, 1), makes the wavelengths that all paths share.
     """
