@@ -314,7 +314,8 @@ class ResampledSession(IterativeSession):
         camera,
         count,
         proposals,
-        seed,
+        sequence,
+        first,
         spectral,
     ):
         """Radiance of camera paths with that of connections of their `count` vertices to drawn
@@ -332,9 +333,8 @@ class ResampledSession(IterativeSession):
         slot = index // integrator.resamples
         active = slot < dr.gather(mi.UInt32, count, 0)
         z = read_vertices(camera, slot, active, states=STEP)
-        rng = vertex_streams(
-            z["path"] * integrator.resamples + index % integrator.resamples, z["number"], seed
-        )
+        number = (first + z["path"]) * integrator.resamples + index % integrator.resamples
+        rng = sequence.of_paths(number).at(z["number"])
         row = self.grid.row(z["p"], seen_normal(z))
         drawn = pmf.draw(row, rng, active)
         active &= drawn < dr.gather(mi.UInt32, ends.count, 0)
@@ -594,7 +594,8 @@ class ResampledSession(IterativeSession):
             camera,
             count,
             proposals,
-            self._seed(iteration, DRAW, chunk),
+            self._sequence(iteration, DRAW, self.integrator.resamples),
+            dr.opaque(mi.UInt32, chunk * self.chunk),
             spectral,
         )
         radiance = self._hit_pass(self._tables, radiance, camera, hits, hit_count)
