@@ -37,7 +37,7 @@ def vertex_streams(path, number, seed):
 
 
 def next_floats(rng, dimensions, active=True):
-    """So many uniform numbers in [0, 1), stratified together where `rng` can (a `VertexNumbers`)."""
+    """So many uniform numbers in [0, 1); of a `VertexNumbers`, stratified together."""
     if isinstance(rng, VertexNumbers):
         return rng.next_floats(dimensions)
     return [rng.next_float32(active) for _ in range(dimensions)]

@@ -15,7 +15,7 @@ from ..photons.gather import KeptVertices, gather_photons
 from ..photons.grid import smallest_cell
 from ..photons.vertex_map import state_of, vertex_map
 from ..pilot.run import PILOT_INDEX
-from .bdpt import CAMERA, BDPT, BDPTSession
+from .bdpt import BDPT, CAMERA, BDPTSession
 from .common import MOST_LIGHT_PATHS
 from .schedule import LARGEST_RADIUS, SMALLEST_RADIUS, read_radius, shrunk
 

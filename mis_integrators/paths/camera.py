@@ -68,9 +68,9 @@ def within_crop(film, splat):
 def start_camera_paths(camera_pass: CameraPass):
     """Camera rays of a pass.
 
-    Returns `(path, active, numbers, ray, weight, splat, aperture)`: the index of each, whether there
-    is a path of that number, its random numbers (`PathNumbers`), the ray and its weight, the position for splatting,
-    and the sample that chose the point of the lens.
+    Returns `(path, active, numbers, ray, weight, splat, aperture)`: the index of each, whether
+    there is a path of that number, its random numbers (`PathNumbers`), the ray and its weight, the
+    position for splatting, and the sample that chose the point of the lens.
     """
     sensor, camera_paths = camera_pass.sensor, camera_pass.camera_paths
     path = dr.arange(mi.UInt32, camera_pass.count)

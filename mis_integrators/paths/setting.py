@@ -40,8 +40,9 @@ class Limits:
 class LightPass:
     """`count` light sub-paths, numbers `first`, `first` + 1, ... of an iteration.
 
-    `sequence`: their random numbers (a `SampleSequence`); `wavelengths` that they share (empty in rgb and mono variants);
-    `shutter_open`, `shutter_time`: when the shutter opens, and for how long.
+    `sequence`: their random numbers (a `SampleSequence`); `wavelengths` that they share (empty in
+    rgb and mono variants); `shutter_open`, `shutter_time`: when the shutter opens, and for how
+    long; `first`: uint32 of width one.
     """
 
     sequence: Any
