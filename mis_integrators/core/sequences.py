@@ -136,6 +136,14 @@ class PathNumbers:
     def __init__(self, index, key, low_discrepancy):
         self.index, self.key, self.low_discrepancy = index, key, low_discrepancy
 
+    def where(self, mask, other) -> PathNumbers:
+        """These where the mask is set, elsewhere those of the `other`, of the same kind."""
+        return PathNumbers(
+            dr.select(mask, self.index, other.index),
+            dr.select(mask, self.key, other.key),
+            self.low_discrepancy,
+        )
+
     def at(self, vertex) -> VertexNumbers:
         """Those of one vertex (an integer, or an array)."""
         return VertexNumbers(self, vertex)

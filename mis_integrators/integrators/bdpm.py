@@ -29,6 +29,9 @@ from .schedule import read_radius
 
 SPARE_PHOTONS = 1 << 20
 """Unused room beyond half of a photon buffer that is worth the time to record the passes anew."""
+USUAL_DIRECT_PATHS = 4
+"""Tuned: camera paths that see direct light, for each that gathers photons."""
+MOST_DIRECT_PATHS = 1024
 CAMERA_CHUNK = 1 << 21
 """Camera paths traced at once at most; larger films are traced in parts (bounds memory)."""
 
@@ -129,6 +132,9 @@ class BDPM(IterativeIntegrator):
             "photon_count", 0, 0, "at least 0 (0: as many as pixels)", high=MOST_LIGHT_PATHS
         )
         self.initial_radius, self.alpha = read_radius(parameters)
+        self.direct_paths = parameters.integer(
+            "direct_paths", USUAL_DIRECT_PATHS, 1, "at least 1", high=MOST_DIRECT_PATHS
+        )
 
     def settings(self):
         return {
@@ -136,6 +142,7 @@ class BDPM(IterativeIntegrator):
             "photon_count": self.photon_count,
             "initial_radius": self.initial_radius,
             "alpha": self.alpha,
+            "direct_paths": self.direct_paths,
             "bdd": self.bdd,
         }
 
@@ -254,7 +261,13 @@ class BDPMSession(PilotedSession):
     def _trace_camera(self, camera_pass, capacity, spectral):
         """Traces the paths of a `CameraPass`, with room for so many vertices."""
         queries = Queries(
-            self.last_vertex, capacity, self.has_caustics, self.has_indirect, self.one_vertex
+            self.last_vertex,
+            capacity,
+            self.has_caustics,
+            self.has_indirect,
+            self.one_vertex,
+            camera_pass.count,
+            1 + camera_pass.extra,
         )
         return trace_camera_paths(
             self.world, self.limits, camera_pass, queries, self._merge_state(spectral)
@@ -322,11 +335,15 @@ class BDPMSession(PilotedSession):
     def _build_maps(self, photons, radii):
         return {kind: self._map(photons, kind, radius).arrays() for kind, radius in radii.items()}
 
-    def _render_chunk(self, scene, sensor, tables, maps, sequence, first, spectral, radii):
-        radiance, alpha, position, vertices, count = self._trace_camera(
+    def _render_chunk(self, scene, sensor, tables, maps, sequences, first, spectral, radii):
+        sequence, of_extra_paths = sequences
+        camera_pass = replace(
             self.describe_camera_pass(sensor, sequence, first, spectral),
-            self.vertex_capacity,
-            spectral,
+            extra=self.integrator.direct_paths - 1,
+            extra_sequence=of_extra_paths,
+        )
+        radiance, alpha, position, vertices, count = self._trace_camera(
+            camera_pass, self.vertex_capacity, spectral
         )
         if radii:
             dr.eval(radiance, alpha, position, vertices, count)
@@ -339,16 +356,39 @@ class BDPMSession(PilotedSession):
                 gathered *= dr.rcp(
                     self._covered(scene, tables, vertices, radius, sequence.own_seed())
                 )
-            radiance += self._per_path(gathered, vertices, self.chunk)
+            gathered = self._per_path(gathered, vertices, self.chunk) * (1 + camera_pass.extra)
+            radiance += _widened(gathered, camera_pass)
         if self.integrator.hide_emitters:
             radiance = dr.select(
                 alpha > 0, radiance, 0
             )  # as `path` does: what is behind nothing but null surfaces is hidden
         return splat_samples(
-            sensor.film(), position, radiance, alpha, spectral["matrix"], self.in_chunk(first)
+            sensor.film(),
+            position,
+            radiance,
+            alpha,
+            spectral["matrix"],
+            self._there_are(camera_pass),
         ), count
 
+    def _there_are(self, camera_pass):
+        """Which paths of a pass there are: the last part may have fewer."""
+        there_are = self.in_chunk(camera_pass.first)
+        if not camera_pass.extra:
+            return there_are
+        extra = dr.arange(mi.UInt32, camera_pass.count * camera_pass.extra)
+        extra += camera_pass.first * camera_pass.extra
+        return dr.concat([there_are, extra < self.path_count * camera_pass.extra])
+
     # ------------------------------------------------------------------ iterations
+
+    def _camera_sequences(self, iteration):
+        """The random numbers of the camera paths that gather, and of those that do not."""
+        extra = max(self.integrator.direct_paths - 1, 1)
+        return (
+            self._sequence(iteration, CAMERA, self.camera_paths),
+            self._sequence(iteration, EXTRA, self.camera_paths * extra),
+        )
 
     def _photons(self, iteration, spectral):
         """An iteration's photons. Where they overflow the buffers, these grow and the pass runs
@@ -387,7 +427,7 @@ class BDPMSession(PilotedSession):
                     self.sensor,
                     self._tables,
                     maps,
-                    self._sequence(iteration, CAMERA, self.camera_paths),
+                    self._camera_sequences(iteration),
                     first,
                     spectral,
                     radii,
@@ -400,6 +440,14 @@ class BDPMSession(PilotedSession):
 
         (block,) = self.sum_of_chunks(render)
         return block
+
+
+def _widened(values, camera_pass):
+    """Values of the camera paths that gather, for all those of a pass: zero for the others."""
+    if not camera_pass.extra:
+        return values
+    path = dr.arange(mi.UInt32, camera_pass.lanes)
+    return dr.gather(type(values), values, path, path < camera_pass.count)
 
 
 class SubsetPasses:
@@ -535,5 +583,5 @@ class SubsetIteration(NamedTuple):
         return self.passes.by_pixel(channel_mean(self.radiance))
 
 
-LIGHT, CAMERA = range(2)
+LIGHT, CAMERA, EXTRA = 0, 1, 3
 """Purposes of an iteration's random seeds, besides `IterativeSession.WAVELENGTH`."""

@@ -16,16 +16,14 @@ from .setting import CameraPass, Limits, World
 Array = Any
 
 
-def film_samples(sensor, index, camera_paths: int, rng):
-    """Film positions of camera paths `index` (in pixels, crop offset included), in the order pixel
-    by pixel, row by row.
+def film_samples(sensor, pixel, rng):
+    """Film positions in pixels, which are numbered row by row (crop offset included).
 
     Returns `(position in [0, 1]^2 of the crop window, position for splatting)`; with a film that
     samples its border the grid covers the border too, as in Mitsuba's own integrators.
     """
     film = sensor.film()
     width, _ = film_size(sensor)
-    pixel = index // camera_paths
     corner = (
         mi.Vector2i(mi.Int32(pixel % width), mi.Int32(pixel // width))
         - border_size(film)
@@ -72,13 +70,12 @@ def start_camera_paths(camera_pass: CameraPass):
     there is a path of that number, its random numbers (`PathNumbers`), the ray and its weight, the
     position for splatting, and the sample that chose the point of the lens.
     """
-    sensor, camera_paths = camera_pass.sensor, camera_pass.camera_paths
-    path = dr.arange(mi.UInt32, camera_pass.count)
-    number = path * camera_pass.stride + camera_pass.first
-    active = number < film_sample_count(sensor) * camera_paths
-    numbers = camera_pass.sequence.of_paths(number)
+    sensor = camera_pass.sensor
+    path = dr.arange(mi.UInt32, camera_pass.lanes)
+    pixel, numbers = _pixels_and_numbers(camera_pass, path)
+    active = pixel < film_sample_count(sensor)
     rng = numbers.at(0)
-    unit, splat = film_samples(sensor, number, camera_paths, rng)
+    unit, splat = film_samples(sensor, pixel, rng)
     aperture = next_2d(rng) if sensor.needs_aperture_sample() else mi.Point2f(0.5)
     time = mi.Float(sensor.shutter_open())
     if sensor.shutter_open_time() > 0:
@@ -87,6 +84,20 @@ def start_camera_paths(camera_pass: CameraPass):
         sensor, time, camera_pass.wavelength_sample, unit, aperture, active
     )
     return path, active, numbers, mi.Ray3f(ray), weight, splat, aperture
+
+
+def _pixels_and_numbers(camera_pass: CameraPass, path):
+    """The pixel of each path, and its random numbers (`PathNumbers`)."""
+    number = path * camera_pass.stride + camera_pass.first
+    pixel = number // camera_pass.camera_paths
+    numbers = camera_pass.sequence.of_paths(number)
+    if not camera_pass.extra:
+        return pixel, numbers
+    usual = path < camera_pass.count
+    number = path - camera_pass.count + camera_pass.first * camera_pass.extra
+    others = number // (camera_pass.camera_paths * camera_pass.extra)
+    own = camera_pass.extra_sequence.of_paths(number)
+    return dr.select(usual, pixel, others), numbers.where(usual, own)
 
 
 def with_gaps(first, skip, n_paths: int, camera_paths: int):
@@ -175,7 +186,7 @@ def trace_camera(world: World, limits: Limits, camera_pass: CameraPass, visitor:
     depth = mi.UInt32(0)
     eta = mi.Float(1)
     context = mi.BSDFContext()
-    state = visitor.begin(camera_pass.count, splat, aperture)
+    state = visitor.begin(camera_pass.lanes, splat, aperture)
     visible = mi.Bool((scene.environment() is not None) and not hide_emitters)
     if dr.hint(max_depth == 0, mode="scalar"):
         active &= False

@@ -61,7 +61,9 @@ class CameraPass:
     `integrator`: what moves rays on behind emitters that are hidden (None: none are);
     `sequence`: their random numbers (a `SampleSequence`); `first`: uint32
     of width one, or one a path (see `camera.with_gaps`); `wavelength_sample`: in
-    [0, 1), makes the wavelengths that all paths share.
+    [0, 1), makes the wavelengths that all paths share; `extra`: camera paths of the same pixels
+    that follow for each, numbers `first` `extra` and on, with random numbers of their own
+    (`extra_sequence`); what they are for is the visitor's affair.
     """
 
     sensor: Any
@@ -72,3 +74,10 @@ class CameraPass:
     camera_paths: int
     wavelength_sample: Array
     stride: int = 1
+    extra: int = 0
+    extra_sequence: Any = None
+
+    @property
+    def lanes(self) -> int:
+        """Camera paths in all."""
+        return self.count * (1 + self.extra)
