@@ -1,4 +1,4 @@
-"""Random numbers: seeds, independent streams, and draws from whatever makes numbers."""
+"""Random numbers: seeds, independent streams, and draws from streams and sequences alike."""
 
 import mitsuba as mi
 

@@ -27,7 +27,7 @@ Setting = str | int | float
 
 
 class Session(Protocol):
-    """One render in progress: ``iterate`` adds an independent iteration, ``image`` is the mean of
+    """One render in progress: ``iterate`` adds an iteration, ``image`` is the mean of
     those done.
 
     A session may have a method ``plan_time(seconds: float) -> None``. It is called once, before the

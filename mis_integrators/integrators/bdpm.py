@@ -447,6 +447,7 @@ def _widened(values, camera_pass):
     if not camera_pass.extra:
         return values
     path = dr.arange(mi.UInt32, camera_pass.lanes)
+    dr.eval(values)  # else each channel would be gathered in a kernel of its own
     return dr.gather(type(values), values, path, path < camera_pass.count)
 
 

@@ -100,7 +100,7 @@ def handed_on(integrator):
     """The parameters that every integrator of this package shares."""
     return {
         name: getattr(integrator, name)
-        for name in ("max_depth", "rr_depth", "hide_emitters", "camera_paths", "variance")
+        for name in ("max_depth", "rr_depth", "hide_emitters", "camera_paths", "variance", "sampler")
     }
 
 

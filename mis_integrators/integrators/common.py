@@ -34,7 +34,7 @@ MOST_LIGHT_PATHS = 2**28
 
 
 class IterativeIntegrator(mi.AdjointIntegrator):
-    """Base of integrators that render by independent iterations and average them.
+    """Base of integrators that render by iterations and average them.
 
     A subclass reads its own parameters in `read_parameters` and makes the object that runs
     iterations in `new_session`.
@@ -194,8 +194,9 @@ class IterativeSession:
     """Runs iterations and accumulates them; a subclass implements `_iteration(index) -> block
     tensor`.
 
-    `seed` is an integer; iteration `i` draws all its random numbers from (seed, i), so iterations
-    are independent and any subset of them can be rendered anywhere.
+    `seed` is an integer; iteration `i` draws all its random numbers from (seed, i), so any subset
+    of the iterations can be rendered anywhere. Under low-discrepancy sampling they are not
+    independent: together they are better than that.
     """
 
     def __init__(self, integrator, scene, sensor, seed, iterations):
