@@ -73,9 +73,13 @@ class BDPM(IterativeIntegrator):
        - |float|
        - Radius reduction of progressive photon mapping, in (0, 1]: iteration i uses R_i^2 = R_0^2
          (i + 1)^(alpha - 1). 1 keeps the radius. (Default: 1)
+     * - direct_paths
+       - |int|
+       - Camera paths that see emission and direct light at their first smooth vertex, for each one
+         that gathers photons. (Default: 4)
      * - camera_paths
        - |int|
-       - Camera paths per pixel and iteration. 0 stands for one; in a render of a given time whose
+       - Camera paths per pixel and iteration that gather photons. 0 stands for one; in a render of a given time whose
          radius is automatic, for as many of 1, 2, 4 and 8 as make the least error. (Default: 0)
      * - variance
        - |bool|
@@ -159,7 +163,7 @@ class BDPMSession(PilotedSession):
             SceneTraits(scene), Lights.seen_by(scene, sensor, integrator.plugin)
         )
         self.world = World(scene, self.lights, self.traits)
-        self.split_paths(CAMERA_CHUNK)
+        self.split_paths(CAMERA_CHUNK // integrator.direct_paths)
         self.light_path_count = integrator.photon_count or min(
             film_sample_count(sensor), MOST_LIGHT_PATHS
         )
@@ -201,7 +205,7 @@ class BDPMSession(PilotedSession):
 
     def set_camera_paths(self, camera_paths):
         super().set_camera_paths(camera_paths)
-        self.split_paths(CAMERA_CHUNK)
+        self.split_paths(CAMERA_CHUNK // self.integrator.direct_paths)
         self.vertex_capacity = self._vertex_room(self.chunk)
         self._record_camera_pass()
 
@@ -336,12 +340,7 @@ class BDPMSession(PilotedSession):
         return {kind: self._map(photons, kind, radius).arrays() for kind, radius in radii.items()}
 
     def _render_chunk(self, scene, sensor, tables, maps, sequences, first, spectral, radii):
-        sequence, of_extra_paths = sequences
-        camera_pass = replace(
-            self.describe_camera_pass(sensor, sequence, first, spectral),
-            extra=self.integrator.direct_paths - 1,
-            extra_sequence=of_extra_paths,
-        )
+        camera_pass = self._describe_camera_paths(sensor, sequences, first, spectral)
         radiance, alpha, position, vertices, count = self._trace_camera(
             camera_pass, self.vertex_capacity, spectral
         )
@@ -354,7 +353,7 @@ class BDPMSession(PilotedSession):
             (gathered,) = self._gather(photon_map, vertices, kind, [radius], spectral)
             if self.corrected[kind]:
                 gathered *= dr.rcp(
-                    self._covered(scene, tables, vertices, radius, sequence.own_seed())
+                    self._covered(scene, tables, vertices, radius, camera_pass.sequence.own_seed())
                 )
             gathered = self._per_path(gathered, vertices, self.chunk) * (1 + camera_pass.extra)
             radiance += _widened(gathered, camera_pass)
@@ -371,23 +370,33 @@ class BDPMSession(PilotedSession):
             self._there_are(camera_pass),
         ), count
 
+    def _describe_camera_paths(self, sensor, sequences, first, spectral):
+        """The `CameraPass` of a part. `sequences`: as of `_camera_sequences`."""
+        sequence, of_extra_paths = sequences
+        return replace(
+            self.describe_camera_pass(sensor, sequence, first, spectral),
+            extra=self.integrator.direct_paths - 1,
+            extra_sequence=of_extra_paths,
+        )
+
     def _there_are(self, camera_pass):
-        """Which paths of a pass there are: the last part may have fewer."""
-        there_are = self.in_chunk(camera_pass.first)
+        """Which paths of a part there are: the last part may have fewer."""
         if not camera_pass.extra:
-            return there_are
-        extra = dr.arange(mi.UInt32, camera_pass.count * camera_pass.extra)
-        extra += camera_pass.first * camera_pass.extra
-        return dr.concat([there_are, extra < self.path_count * camera_pass.extra])
+            return self.in_chunk(camera_pass.first)
+        path = dr.arange(mi.UInt32, camera_pass.lanes)
+        others = (path - camera_pass.count) // camera_pass.extra
+        number = dr.select(path < camera_pass.count, path, others) + camera_pass.first
+        return number < self.path_count
 
     # ------------------------------------------------------------------ iterations
 
-    def _camera_sequences(self, iteration):
-        """The random numbers of the camera paths that gather, and of those that do not."""
+    def _camera_sequences(self, iteration, camera_paths):
+        """The random numbers of the camera paths that gather, so many a pixel, and of those that do
+        not."""
         extra = max(self.integrator.direct_paths - 1, 1)
         return (
-            self._sequence(iteration, CAMERA, self.camera_paths),
-            self._sequence(iteration, EXTRA, self.camera_paths * extra),
+            self._sequence(iteration, CAMERA, camera_paths),
+            self._sequence(iteration, EXTRA, camera_paths * extra),
         )
 
     def _photons(self, iteration, spectral):
@@ -427,7 +436,7 @@ class BDPMSession(PilotedSession):
                     self.sensor,
                     self._tables,
                     maps,
-                    self._camera_sequences(iteration),
+                    self._camera_sequences(iteration, self.camera_paths),
                     first,
                     spectral,
                     radii,
@@ -467,10 +476,10 @@ class SubsetPasses:
             1 - pixels.count * stride
         ) % 2**32  # from a path of the last pixel to the next one of the first
         self._camera = session.recorded(
-            lambda scene, sensor, tables, sequence, spectral: session._trace_camera(
+            lambda scene, sensor, tables, sequences, spectral: session._trace_camera(
                 replace(
-                    session.describe_camera_pass(
-                        sensor, sequence, lanes(pixels.paths) // pixels.count * back, spectral
+                    session._describe_camera_paths(
+                        sensor, sequences, lanes(pixels.paths) // pixels.count * back, spectral
                     ),
                     count=pixels.paths,
                     camera_paths=pixels.camera_paths,
@@ -504,17 +513,17 @@ class SubsetPasses:
         photons = session._photons(number, spectral)
         if self.photon_capacity != session.photon_capacity:
             self._record_gather()
-        sequence = session._sequence(number, CAMERA, self.pixels.camera_paths)
-        radiance, vertices = self._trace_camera(sequence, spectral)
-        return SubsetIteration(self, photons, vertices, radiance, sequence.own_seed(), spectral)
+        sequences = session._camera_sequences(number, self.pixels.camera_paths)
+        radiance, vertices = self._trace_camera(sequences, spectral)
+        return SubsetIteration(self, photons, vertices, radiance, sequences[0].own_seed(), spectral)
 
-    def _trace_camera(self, sequence, spectral):
+    def _trace_camera(self, sequences, spectral):
         """Radiance and vertices of the camera paths. Where the vertices overflow their buffer, it
         grows and the pass runs again."""
         session = self.session
         while True:
             radiance, _, _, vertices, count = self._camera(
-                session.scene, session.sensor, session._tables, sequence, spectral
+                session.scene, session.sensor, session._tables, sequences, spectral
             )
             found = 0 if session.one_vertex else int(dr.max(count)[0])
             if found <= self.capacity:
@@ -581,7 +590,11 @@ class SubsetIteration(NamedTuple):
         return self.passes.gather(self.photons, self.vertices, radii, self.seed, self.spectral)
 
     def direct(self):
-        return self.passes.by_pixel(channel_mean(self.radiance))
+        passes = self.passes
+        paths, of_each = passes.pixels.paths, passes.session.integrator.direct_paths
+        values = np.broadcast_to(np.array(channel_mean(self.radiance)), paths * of_each)
+        others = values[paths:].reshape(paths, of_each - 1).sum(axis=1)
+        return passes.by_pixel((values[:paths] + others) / of_each)
 
 
 LIGHT, CAMERA, EXTRA = 0, 1, 3

@@ -100,7 +100,14 @@ def handed_on(integrator):
     """The parameters that every integrator of this package shares."""
     return {
         name: getattr(integrator, name)
-        for name in ("max_depth", "rr_depth", "hide_emitters", "camera_paths", "variance", "sampler")
+        for name in (
+            "max_depth",
+            "rr_depth",
+            "hide_emitters",
+            "camera_paths",
+            "variance",
+            "sampler",
+        )
     }
 
 
@@ -263,7 +270,8 @@ def _trial(plugin, parameters, session, segments):
         session,
         prediction.squared_bias,
         prediction.variance,
-        costs.cost(plugin, counted) * prediction.cost_of_paths,
+        (costs.cost(plugin, counted) + costs.of_direct_paths(session, segments))
+        * prediction.cost_of_paths,
     )
 
 

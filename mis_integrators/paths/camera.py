@@ -88,16 +88,19 @@ def start_camera_paths(camera_pass: CameraPass):
 
 def _pixels_and_numbers(camera_pass: CameraPass, path):
     """The pixel of each path, and its random numbers (`PathNumbers`)."""
-    number = path * camera_pass.stride + camera_pass.first
-    pixel = number // camera_pass.camera_paths
-    numbers = camera_pass.sequence.of_paths(number)
-    if not camera_pass.extra:
-        return pixel, numbers
+    first, extra = camera_pass.first, camera_pass.extra
     usual = path < camera_pass.count
-    number = path - camera_pass.count + camera_pass.first * camera_pass.extra
-    others = number // (camera_pass.camera_paths * camera_pass.extra)
-    own = camera_pass.extra_sequence.of_paths(number)
-    return dr.select(usual, pixel, others), numbers.where(usual, own)
+    if extra:
+        other = dr.select(usual, 0, path - camera_pass.count)
+        path = dr.select(usual, path, other // extra)
+        if dr.width(first) > 1:
+            first = dr.gather(mi.UInt32, first, path)
+    number = path * camera_pass.stride + first
+    numbers = camera_pass.sequence.of_paths(number)
+    if extra:
+        own = camera_pass.extra_sequence.of_paths(number * extra + other % extra)
+        numbers = numbers.where(usual, own)
+    return number // camera_pass.camera_paths, numbers
 
 
 def with_gaps(first, skip, n_paths: int, camera_paths: int):

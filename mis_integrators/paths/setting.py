@@ -61,9 +61,9 @@ class CameraPass:
     `integrator`: what moves rays on behind emitters that are hidden (None: none are);
     `sequence`: their random numbers (a `SampleSequence`); `first`: uint32
     of width one, or one a path (see `camera.with_gaps`); `wavelength_sample`: in
-    [0, 1), makes the wavelengths that all paths share; `extra`: camera paths of the same pixels
-    that follow for each, numbers `first` `extra` and on, with random numbers of their own
-    (`extra_sequence`); what they are for is the visitor's affair.
+    [0, 1), makes the wavelengths that all paths share; `extra`: further paths of the same pixel for
+    each of these, with random numbers of their own (`extra_sequence`); they follow after all of
+    these, those of a path side by side. What they are for is the visitor's affair.
     """
 
     sensor: Any
