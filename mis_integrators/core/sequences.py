@@ -165,9 +165,10 @@ class VertexNumbers:
         seed = hash_bits(self._key + mi.UInt32(self._draws * 0x632BE5AB % 2**32))
         if self._path.low_discrepancy:
             return sobol(self._path.index, seed, dimensions)
-        found = []
+        # Of indices that differ in their lowest bits alone, TEA would make similar numbers.
+        word, found = hash_bits(mi.UInt32(self._path.index)), []
         for _ in range(-(-dimensions // 2)):
-            pair = mi.sample_tea_32(self._path.index, seed)
+            pair = mi.sample_tea_32(word, seed)
             found += [unit(word) for word in pair]
             seed += mi.UInt32(0x2545F491)
         return found[:dimensions]

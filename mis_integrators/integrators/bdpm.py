@@ -96,6 +96,11 @@ class BDPM(IterativeIntegrator):
      * - hide_emitters
        - |bool|
        - Hide directly visible emitters. (Default: no, i.e. |false|)
+     * - sampler
+       - |string|
+       - Random numbers of sub-paths: ``sobol``, scrambled Sobol' sequences, one a pixel over all
+         iterations; or ``independent``. The scene's ``<sampler>`` is not used but for its sample
+         count. (Default: ``sobol``)
 
     Each iteration traces light sub-paths, stores them as photons in a grid, traces camera paths,
     and estimates the light that photons bring to the camera paths' vertices from their density.

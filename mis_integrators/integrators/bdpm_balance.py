@@ -28,7 +28,7 @@ class BDPMBalance(WeightedBDPM):
        - Exponent of the heuristic, from 1 to 8: 1 is Veach's balance heuristic, 2 his power
          heuristic. (Default: 1)
      * - photon_count, initial_radius, alpha, camera_paths, variance, max_depth, rr_depth,
-         hide_emitters
+         hide_emitters, sampler
        -
        - As of :monosp:`bdpm`.
 

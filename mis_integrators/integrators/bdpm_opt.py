@@ -55,7 +55,7 @@ class BDPMOpt(WeightedBDPM):
          contribute to the image. 0 stands for
          131072. (Default: 0)
      * - photon_count, initial_radius, alpha, camera_paths, variance, max_depth, rr_depth,
-         hide_emitters
+         hide_emitters, sampler
        -
        - As of :monosp:`bdpm`.
 

@@ -75,6 +75,11 @@ class BDPT(IterativeIntegrator):
      * - hide_emitters
        - |bool|
        - Hide directly visible emitters. (Default: no, i.e. |false|)
+     * - sampler
+       - |string|
+       - Random numbers of sub-paths: ``sobol``, scrambled Sobol' sequences, one a pixel over all
+         iterations; or ``independent``. The scene's ``<sampler>`` is not used but for its sample
+         count. (Default: ``sobol``)
 
     Each camera path is traced with a light sub-path. Light comes from emitters that the camera path
     meets, from next-event estimation, from joining each of its vertices with each of the light

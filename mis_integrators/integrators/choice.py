@@ -294,14 +294,13 @@ def _try_path(path, segments, pixels, mean):
     first = trial * (-count * stride % 2**32)  # back to the first pixel
     for number in range(PILOT_INDEX, PILOT_INDEX + passes):
         radiance, *_ = path.trace(
-            number, 0, first, stride, at_once * count, path._spectral(number), trial
+            number, first, stride, at_once * count, path._spectral(number), trial
         )
         values += list(
             np.broadcast_to(np.array(channel_mean(radiance)), at_once * count).reshape(
                 at_once, count
             )
         )
-    path.sampler.seed(0, 1)
     variance = trimmed_mean(relative_weights(mean) * np.var(values, axis=0, ddof=1))
     return Trial(
         "path",

@@ -53,6 +53,7 @@ class IterativeIntegrator(mi.AdjointIntegrator):
         self.camera_paths = parameters.integer("camera_paths", *self.CAMERA_PATHS)
         self.variance = parameters.boolean("variance", False)
         self.sampler = parameters.choice("sampler", SAMPLERS[0], SAMPLERS)
+        self.warned_of_sampler = False
         self.read_parameters(parameters)
         parameters.finish()
         super().__init__(props)
@@ -142,6 +143,23 @@ class IterativeIntegrator(mi.AdjointIntegrator):
                 f"camera_paths = {camera_paths}",
             )
 
+    def about_samplers(self, sensors):
+        """Lines that say which kinds of samplers of these sensors are not used. (`independent`,
+        Mitsuba's default, asks for nothing.)"""
+        kinds = {sensor.sampler().class_name() for sensor in sensors} - {"IndependentSampler"}
+        return [
+            f"{self.plugin}: of the sensor's {kind}, nothing but the sample count is used; random "
+            f'numbers are those of the parameter "sampler" = {self.sampler}'
+            for kind in sorted(kinds)
+        ]
+
+    def say_sampler(self, sensors):
+        """Warns, once, where samplers of these sensors are not used."""
+        lines = self.about_samplers(sensors)
+        if lines and not self.warned_of_sampler:
+            self.warned_of_sampler = True
+            mi.Log(mi.LogLevel.Warn, "; ".join(lines))
+
     def say_unfinite(self, session):
         """Warns where values of a session that are not finite were left out, and names the data of
         the scene that may be to blame."""
@@ -171,6 +189,7 @@ class IterativeIntegrator(mi.AdjointIntegrator):
             spp = spp or sensor.sampler().sample_count()
             session = self.session(scene, sensor, seed, spp)
             self.say_rounded(session, spp)
+            self.say_sampler([sensor])
             for _ in range(session.iterations_planned):
                 session.iterate()
             with RENDER_LOCK:
@@ -268,6 +287,11 @@ class IterativeSession:
                 self.iterations_planned * self.camera_paths / camera_paths
             )
         self.camera_paths = camera_paths
+
+    @property
+    def remarks(self):
+        """What the user should know, line by line."""
+        return self.integrator.about_samplers([self.sensor])
 
     @property
     def settings(self):

@@ -1,5 +1,6 @@
 """Behaviour of the plugin `bdpm`: strategies, seeds, films, limits, and errors."""
 
+import contextlib
 import dataclasses
 import gc
 import sys
@@ -529,12 +530,14 @@ def test_numbers_of_paths_leave_the_mean(rgb, camera_paths, photon_count):
     )
 
 
-def test_rounding_up_is_said_once(rgb):
-    said = []
+@contextlib.contextmanager
+def said():
+    """The lines that Mitsuba's log gets meanwhile."""
+    lines = []
 
     class Listener(mi.Appender):
         def append(self, level, text):
-            said.append(text)
+            lines.append(text)
 
         def log_progress(self, *args):
             pass
@@ -543,14 +546,48 @@ def test_rounding_up_is_said_once(rgb):
     logger = mi.Thread.thread().logger() if hasattr(mi, "Thread") else mi.logger()
     logger.add_appender(listener)
     try:
-        mi.render(box_scene(8), integrator=bdpm(camera_paths=4), spp=10)
-        rounded = [text for text in said if "rounded up" in text]
-        assert len(rounded) == 1 and "10 samples" in rounded[0] and "3 iterations" in rounded[0]
-        said.clear()
-        mi.render(box_scene(8), integrator=bdpm(camera_paths=4), spp=8)
-        assert not [text for text in said if "rounded up" in text]
+        yield lines
     finally:
         logger.remove_appender(listener)
+
+
+def test_rounding_up_is_said_once(rgb):
+    with said() as lines:
+        mi.render(box_scene(8), integrator=bdpm(camera_paths=4), spp=10)
+        rounded = [text for text in lines if "rounded up" in text]
+        assert len(rounded) == 1 and "10 samples" in rounded[0] and "3 iterations" in rounded[0]
+        lines.clear()
+        mi.render(box_scene(8), integrator=bdpm(camera_paths=4), spp=8)
+        assert not [text for text in lines if "rounded up" in text]
+
+
+@pytest.mark.parametrize("plugin", ("bdpm", "bdpt", "bdpm_auto", "volpath_multiview"))
+@pytest.mark.parametrize("sampler", ("independent", "multijitter"))
+def test_samplers_that_are_not_used_are_named_once(rgb, plugin, sampler):
+    """By `mi.render`, and for `mis-render` in the remarks of the session."""
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "lamp": {"type": "constant"},
+            "ball": {"type": "sphere", "bsdf": {"type": "diffuse"}},
+            "sensor": {
+                "type": "perspective",
+                "to_world": look((0, 0, 5), (0, 0, 0), (0, 1, 0)),
+                "film": film(4),
+                "sampler": {"type": sampler, "sample_count": 4},
+            },
+        }
+    )
+    integrator = mi.load_dict({"type": plugin, "max_depth": 2, "sampler": "independent"})
+    with said() as lines:
+        for seed in range(2):
+            mi.render(scene, integrator=integrator, seed=seed)
+    session = integrator.session(scene, spp=4)
+    session.iterate()
+    for texts in (lines, session.remarks):
+        found = [text for text in texts if "Sampler" in text]
+        assert len(found) == (sampler != "independent")
+        assert all("Multijitter" in t and '"sampler" = independent' in t for t in found)
 
 
 # --- Buffers ------------------------------------------------------------------
