@@ -26,7 +26,7 @@ def draw_by_share(path: Path, curves: Mapping[str, list[tuple[float, float]]]) -
 
 
 def draw_convergence_of_samplers(path: Path, rows: Sequence[Mapping]) -> None:
-    """Variances of images against iterations, a panel a scene: rows as of `experiments.sampling`."""
+    """Variances of images against iterations: rows as of `experiments.sampling`."""
     charts.save(charts.convergence_of_samplers(rows), path)
 
 

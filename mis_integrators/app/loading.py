@@ -197,11 +197,11 @@ def _replace_samplers(state: Any, plugin: str) -> None:
     """Make all samplers such plugins, also where Mitsuba would choose one."""
     for sensor in [node for node in state.nodes if node.type == mi.ObjectType.Sensor]:
         own = [index for index in _children(sensor) if _is_sampler(state.nodes[index])]
-        counts = {
-            "sample_count": state.nodes[index].props["sample_count"]
+        counts = [
+            {"sample_count": state.nodes[index].props["sample_count"]}
             for index in own
             if "sample_count" in state.nodes[index].props
-        }
+        ]
         if not own:
             node = mi.parser.SceneNode()
             node.type = mi.ObjectType.Sampler
@@ -209,7 +209,7 @@ def _replace_samplers(state: Any, plugin: str) -> None:
             own = [len(state.nodes) - 1]
             sensor.props["_sampler"] = mi.Properties.ResolvedReference(own[0])
         for index in own:
-            state.nodes[index].props = _properties(plugin, counts)
+            state.nodes[index].props = _properties(plugin, counts[0] if counts else {})
 
 
 def _is_sampler(node: Any) -> bool:

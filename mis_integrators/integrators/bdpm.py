@@ -79,8 +79,9 @@ class BDPM(IterativeIntegrator):
          that gathers photons. (Default: 4)
      * - camera_paths
        - |int|
-       - Camera paths per pixel and iteration that gather photons. 0 stands for one; in a render of a given time whose
-         radius is automatic, for as many of 1, 2, 4 and 8 as make the least error. (Default: 0)
+       - Camera paths per pixel and iteration that gather photons. 0 stands for one; in a render of
+         a given time whose radius is automatic, for as many of 1, 2, 4 and 8 as make the least
+         error. (Default: 0)
      * - variance
        - |bool|
        - Adds the channels ``var.R``, ``var.G``, ``var.B`` (mono: ``var.Y``): the estimated variance

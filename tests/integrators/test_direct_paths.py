@@ -12,9 +12,7 @@ POWER = {"whole": 0.02, "block": 0.05}
 
 
 def integrator(plugin="bdpm", **parameters):
-    return mi.load_dict(
-        {"type": plugin, "initial_radius": RADIUS, "max_depth": 4, **parameters}
-    )
+    return mi.load_dict({"type": plugin, "initial_radius": RADIUS, "max_depth": 4, **parameters})
 
 
 @pytest.mark.parametrize(
