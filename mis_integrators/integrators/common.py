@@ -201,7 +201,9 @@ class IterativeSession:
         self.limits = Limits(integrator.max_depth, integrator.rr_depth, integrator.hide_emitters)
         self.iterations_planned = iterations
         self.camera_paths = integrator.initial_camera_paths
-        self.accumulator = Accumulator(sensor.film(), integrator.variance)
+        self.accumulator = Accumulator(
+            sensor.film(), integrator.variance, stratified=integrator.sampler == "sobol"
+        )
         self.variant = mi.variant()
         settle(scene)
 
