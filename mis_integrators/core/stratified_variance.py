@@ -112,27 +112,33 @@ def extrapolated(
     def basis(power):
         return scales**-power - (2 * scales) ** -power
 
-    def law(power):
-        return variance_law(power, below, beyond) * block**power
-
-    p, q = basis(1.0), basis(2.0)
+    laws = {p: variance_law(p, below, beyond) * block**p for p in (1.0, 2.0, 3.0)}
     weight = np.sqrt(counts)[:, None]
-    size = (weight * contrast / p).sum(axis=0) / weight.sum()
+    size = (weight * contrast / basis(1.0)).sum(axis=0) / weight.sum()
     if len(lengths) == 1:
-        return size * law(1.0)
+        return size * laws[1.0]
     d = contrast / np.where(size > 0, size, 1)
-    expected = p
+    a, b = _fitted(basis(1.0), basis(2.0), d, weight)
+    b_steep, c = _fitted(basis(2.0), basis(3.0), d, weight)
+    variance = np.where(
+        a < 0, b_steep * laws[2.0] + c * laws[3.0], a * laws[1.0] + b * laws[2.0]
+    )
+    least = d[-1] * min(law / basis(p)[-1] for p, law in laws.items())
+    return size * np.maximum(variance, least)
+
+
+def _fitted(p: np.ndarray, q: np.ndarray, d: np.ndarray, weight: np.ndarray):
+    """a and b of a p + b q, each (groups,), fitted to d (scales, groups)."""
+    expected = p * ((weight * d / p).sum(axis=0) / weight.sum())
     for _ in range(FITS):
-        w = weight / np.square(expected)
+        w = weight / np.square(np.maximum(expected, 1e-6 * p))
         pp, qq, pq = ((w * product).sum(axis=0) for product in (p * p, q * q, p * q))
         pd, qd = (w * p * d).sum(axis=0), (w * q * d).sum(axis=0)
         determinant = pp * qq - pq * pq
         a, b = (pd * qq - qd * pq) / determinant, (qd * pp - pd * pq) / determinant
         without_a, without_b = np.where(b < 0, pd / pp, a), np.where(a < 0, qd / qq, b)
         expected = np.where(a < 0, 0, without_a) * p + np.where(b < 0, 0, without_b) * q
-        expected = np.maximum(expected, 1e-6 * p)
-    least = d[-1] * min(law(power) / basis(power)[-1] for power in (1.0, 2.0, 3.0))
-    return size * np.maximum(a * law(1.0) + b * law(2.0), least)
+    return a, b
 
 
 def groups_of_alike(values: np.ndarray) -> np.ndarray:
