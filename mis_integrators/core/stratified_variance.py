@@ -24,7 +24,7 @@ from collections.abc import Collection, Sequence
 
 import numpy as np
 
-TILE, GROUP = 16, 32
+TILE, GROUP = 16, 16
 """Tuned: width of the tiles in which pixels are grouped, and pixels a group, about."""
 FITS = 4
 """Times that the extrapolation is fitted, each with weights by the one before."""
