@@ -99,17 +99,15 @@ def extrapolated(
     """The variance of the mean over a set of iterations (as of `variance_law`), shape (groups,),
     from the `contrasts` of blocks, (scales, groups).
 
-    It is a V_1 + b V_2, with V_p the law of power p, fitted to contrasts a (m^-1 - (2 m)^-1) +
-    b (m^-2 - (2 m)^-2). The errors of contrasts are about proportional to what is expected: the
-    weights are by the squares of that, as the last fit has it (without negative a, b), and by the
-    square roots of `counts`: few of them are noisy, but many are far from where it matters. a and b
-    themselves may be negative, or the noise of one would be a bias of the sum. The sum is not
-    less than the least that power 1, 2 or 3 alone makes of the last contrast. With one scale,
-    power 1 is assumed."""
+    It is a V_1 + b V_2, with V_p the law of power p, or where that has a < 0 (the variance falls
+    faster than 1/m^2), a V_2 + b V_3. a and b are fitted to contrasts, which are a (m^-p -
+    (2 m)^-p) + b (m^-q - (2 m)^-q). a and b may be negative: where they may not, the noise of one
+    is a bias of the sum. But the sum is not less than the least that one power alone makes of the
+    last contrast. With contrasts at one scale only, power 1 is assumed."""
     block = 2 * lengths[-1]
     scales = (lengths / block)[:, None]
 
-    def basis(power):
+    def basis(power: float) -> np.ndarray:
         return scales**-power - (2 * scales) ** -power
 
     laws = {p: variance_law(p, below, beyond) * block**p for p in (1.0, 2.0, 3.0)}
@@ -120,15 +118,20 @@ def extrapolated(
     d = contrast / np.where(size > 0, size, 1)
     a, b = _fitted(basis(1.0), basis(2.0), d, weight)
     b_steep, c = _fitted(basis(2.0), basis(3.0), d, weight)
-    variance = np.where(
-        a < 0, b_steep * laws[2.0] + c * laws[3.0], a * laws[1.0] + b * laws[2.0]
-    )
+    variance = np.where(a < 0, b_steep * laws[2.0] + c * laws[3.0], a * laws[1.0] + b * laws[2.0])
     least = d[-1] * min(law / basis(p)[-1] for p, law in laws.items())
     return size * np.maximum(variance, least)
 
 
-def _fitted(p: np.ndarray, q: np.ndarray, d: np.ndarray, weight: np.ndarray):
-    """a and b of a p + b q, each (groups,), fitted to d (scales, groups)."""
+def _fitted(
+    p: np.ndarray, q: np.ndarray, d: np.ndarray, weight: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """a and b of a p + b q, each (groups,), fitted to d (scales, groups) by least squares.
+
+    The errors of contrasts are about proportional to what is expected: the weights are by the
+    squares of that, as the last fit has it (there without negative a, b), and by `weight`, the
+    square roots of how many contrasts there are: few are noisy, but many are far from where it
+    matters."""
     expected = p * ((weight * d / p).sum(axis=0) / weight.sum())
     for _ in range(FITS):
         w = weight / np.square(np.maximum(expected, 1e-6 * p))
@@ -177,7 +180,7 @@ def variance_ratio(
         return np.ones_like(naive)
     group = groups_of_alike(naive)
 
-    def pooled(values):
+    def pooled(values: np.ndarray) -> np.ndarray:
         return np.bincount(group.ravel(), values.ravel())
 
     variance = extrapolated(

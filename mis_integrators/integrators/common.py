@@ -192,8 +192,8 @@ class IterativeSession:
     """Runs iterations and accumulates them; a subclass implements `_iteration(index) -> block
     tensor`.
 
-    `seed` is an integer; iteration `i` draws all its random numbers from (seed, i), so iterations
-    are independent and any subset of them can be rendered anywhere.
+    `seed` is an integer; iteration `i` draws all its random numbers from (seed, i), so any subset
+    of them can be rendered anywhere. They are independent, or parts of sequences (`sampler`).
     """
 
     def __init__(self, integrator, scene, sensor, seed, iterations):
