@@ -214,8 +214,8 @@ class IterativeSession:
     tensor`.
 
     `seed` is an integer; iteration `i` draws all its random numbers from (seed, i), so any subset
-    of the iterations can be rendered anywhere. Under low-discrepancy sampling they are not
-    independent: together they are better than that.
+    of the iterations can be rendered anywhere. They are independent, or parts of sequences
+    (`sampler`).
     """
 
     def __init__(self, integrator, scene, sensor, seed, iterations):
@@ -223,7 +223,9 @@ class IterativeSession:
         self.limits = Limits(integrator.max_depth, integrator.rr_depth, integrator.hide_emitters)
         self.iterations_planned = iterations
         self.camera_paths = integrator.initial_camera_paths
-        self.accumulator = Accumulator(sensor.film(), integrator.variance)
+        self.accumulator = Accumulator(
+            sensor.film(), integrator.variance, stratified=integrator.sampler == "sobol"
+        )
         self.variant = mi.variant()
         settle(scene)
 
