@@ -164,7 +164,9 @@ def test_bias_falls_with_the_square_of_the_radius(rgb):
         for r in radii
     ]
     for estimate, expected in zip(estimates, disk):  # the mean over the disk in closed form
-        assert not differences(estimate, Estimate.exact(np.full_like(estimate.mean, expected)))
+        # The pane lifts rays by Mitsuba's 1e-4 or so: for the floor, the lamp is that much lower.
+        exactly = Estimate.exact(np.full_like(estimate.mean, expected))
+        assert not differences(estimate, exactly, slack=6e-4)
     bias = [1 - e.mean[0, 0] / exact for e in estimates]
     slope = np.polyfit(np.log(radii), np.log(bias), 1)[0]
     assert 1.6 < slope < 2.3, (slope, bias)
@@ -239,10 +241,10 @@ def test_seeds_and_iterations_are_uncorrelated(rgb):
     """Correlation of the pixels' noise over pairs of renders, of different seeds and iterations:
     below 0.2, four to five standard deviations of chance (0.04 to 0.06: neighbouring pixels share
     photons). With random numbers in common it is far above."""
-    scene = glossy_box(size=32)
+    scene, sampler = glossy_box(size=32), "independent"
     mean = render(scene, 1000, 256).mean(axis=2)
-    session = bdpm(camera_paths=1, photon_count=3000).session(scene, 0, 3, 0)
-    images = [render(scene, seed, 1).mean(axis=2) for seed in (0, 1, 2, 3)]
+    session = bdpm(camera_paths=1, photon_count=3000, sampler=sampler).session(scene, 0, 3, 0)
+    images = [render(scene, seed, 1, sampler=sampler).mean(axis=2) for seed in (0, 1, 2, 3)]
     images += [picture.mean(axis=2) for picture in pictures(session, 3)]
     noise = [(i - mean).ravel() for i in images[:3]] + [(i - mean).ravel() for i in images[4:]]
     # a caustic's fireflies would be all that counts
@@ -995,13 +997,15 @@ def test_camera_paths_average_their_own_noise_only(rgb, shared):
 )
 def test_noise_of_several_camera_paths_is_foreseen(rgb, plugin, given, camera_paths):
     """The pilot's two camera paths a pixel say what an iteration of more, or fewer, of them will
-    have: within a factor 1.3 of twelve renders."""
+    have: within a factor 1.3 of twelve renders. (Its law is that of independent numbers.)"""
     session = mi.load_dict(
         {
             "type": plugin,
             "max_depth": 4,
             "photon_count": 20000,
             "camera_paths": camera_paths,
+            "sampler": "independent",
+            "direct_paths": 1,
             **given,
         }
     ).session(glossy_box(size=48), spp=16 * camera_paths)
