@@ -231,12 +231,13 @@ class Accumulator:
         the block's border."""
         n, done = self.iterations, self.sums.done
         mean, weight = (self._inside(tensor) for tensor in self.mean())
-        mean, cross = grey_of(mean), grey_of(self._inside(self.sums["cross"]))
-        square, weight_square = (
-            self._inside(self.sums[name]) for name in ("grey_square", "weight_square")
-        )
-        squares = square - 2 * mean * cross + mean * mean * weight_square
-        naive = np.maximum(squares, 0) * (n / ((n - 1) * weight * weight))
+        mean = grey_of(mean)
+        grey = {
+            "square": self._inside(self.sums["grey_square"]),
+            "cross": grey_of(self._inside(self.sums["cross"])),
+            "weight_square": self._inside(self.sums["weight_square"]),
+        }
+        naive = np.maximum(spread(grey, mean), 0) * (n / ((n - 1) * weight * weight))
         length, complete = segments.complete(done.below, done.beyond, done.end)
         sums = np.array([self._inside(self.sums[name]) for name in segments.NAMES])
         deviations = (sums[..., :1] - mean * sums[..., 1:]) * (n / (weight * length))
