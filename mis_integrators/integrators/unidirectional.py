@@ -78,10 +78,10 @@ class PathSession(IterativeSession):
 
     def trace(self, iteration, first, stride, paths, spectral, variation=0):
         """Radiance and alpha of camera paths `first`, `first + stride`, ..., and their positions on
-        the film. Where `first` and `variation` are arrays, each lane has its own, and the paths of
-        one number differ with the variation."""
+        the film. Where `first` and `variation` are arrays, each lane has its own; the variations of
+        a pixel's first path are parts of one sequence."""
         sequence = self._sequence(iteration, PATHS, self.camera_paths)
-        sequence.first += variation * self.camera_paths
+        sequence.first += variation
         camera_pass = CameraPass(
             self.sensor, None, sequence, first, paths, self.camera_paths, spectral["sample"], stride
         )

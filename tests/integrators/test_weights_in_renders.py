@@ -368,6 +368,8 @@ def test_noise_law(rgb):
                 "camera_paths": n_b,
                 "variance": True,
                 "max_depth": 8,
+                "sampler": "independent",
+                "direct_paths": 1,
             }
         )
         session = integrator.session(scene, seed=n_b + n_f)
