@@ -158,19 +158,22 @@ class SessionMaker:
         return session
 
     def _samples_per_pass(self) -> int:
-        """Samples per pixel that one of Mitsuba's own integrators takes in about
-        ``PASS_SECONDS``."""
-        spp = 4
-        session = MitsubaSession(self._integrator, self.opened.scene, self._sensor, 0, spp)
-        session.iterate()
-        start = time.perf_counter()
-        session.iterate()
-        seconds = time.perf_counter() - start
-        if self.method.sampler in STRATIFYING and self.seconds:
-            wanted = round(spp * self.seconds / seconds)
-            return max(1, min(wanted, MOST_SAMPLES // self.opened.pixels))
+        """Samples per pixel that one of Mitsuba's own integrators takes in about ``PASS_SECONDS``;
+        under a stratifying sampler, in all of the time."""
+        spp, seconds = 4, self._seconds_of_pass(4)
         while spp > 1 and seconds > 1.5 * PASS_SECONDS:
             spp, seconds = spp // 2, seconds / 2
         while seconds < PASS_SECONDS / 1.5 and spp * self.opened.pixels < 1 << 20:
             spp, seconds = spp * 2, seconds * 2
+        if self.method.sampler in STRATIFYING and self.seconds:
+            wanted = round(spp * self.seconds / self._seconds_of_pass(spp))
+            return max(1, min(wanted, MOST_SAMPLES // self.opened.pixels))
         return spp
+
+    def _seconds_of_pass(self, spp: int) -> float:
+        """Seconds that the second of two passes takes."""
+        session = MitsubaSession(self._integrator, self.opened.scene, self._sensor, 0, spp)
+        session.iterate()
+        start = time.perf_counter()
+        session.iterate()
+        return time.perf_counter() - start
