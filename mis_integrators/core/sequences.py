@@ -24,6 +24,10 @@ PRIMITIVE = {2: (2, 1, (1, 3)), 3: (3, 1, (1, 3, 1))}
 """By dimension, counted from 0: degree and inner coefficients of its primitive polynomial, and the
 first odd direction numbers (Joe and Kuo 2008)."""
 MOST_DIMENSIONS = 4
+BLOCK_BITS = 16
+"""Points of more than two dimensions are nets of 2^16 points each, which are scrambled apart: beyond
+so many, the coordinates from the third on are no longer stratified with those before. (Half the
+instructions.)"""
 
 
 def hash_bits(x):
@@ -80,13 +84,14 @@ def direction_numbers(dimension: int) -> list[int]:
 
 
 def _coordinate(order, reversed_order, dimension: int):
-    """A coordinate, as 32 bits after the binary point, of the Sobol' points of these numbers."""
+    """A coordinate, as 32 bits after the binary point, of the Sobol' points of these numbers; from
+    dimension 2 on, of their lowest `BLOCK_BITS` bits."""
     if dimension == 0:
         return reversed_order
     if dimension == 1:
         return _pascal(reversed_order)
     total = mi.UInt32(0)
-    for bit, column in enumerate(direction_numbers(dimension)):
+    for bit, column in enumerate(direction_numbers(dimension)[:BLOCK_BITS]):
         total ^= dr.select((order >> bit) & 1 == 1, mi.UInt32(column), 0)
     return total
 
@@ -95,11 +100,16 @@ def sobol(index, seed, dimensions: int = 1) -> list[Array]:
     """Scrambled Sobol' points in [0, 1)^dimensions, in an order of their own: the points of numbers
     a 2^k to (a + 1) 2^k - 1 stay together for all a, k. `index`, `seed`: uint32 arrays."""
     reversed_order = _scramble_reversed(dr.brev(mi.UInt32(index)), hash_bits(mi.UInt32(seed)))
-    order = dr.brev(reversed_order) if dimensions > 2 else None
-    return [
-        unit(scramble(_coordinate(order, reversed_order, k), hash_bits(seed + mi.UInt32(k + 1))))
-        for k in range(dimensions)
-    ]
+    order = block = mi.UInt32(0)
+    if dimensions > 2:
+        order = dr.brev(reversed_order)
+        block = (order >> BLOCK_BITS) * mi.UInt32(0x9E3779B9)
+    found = []
+    for k in range(dimensions):
+        own = seed + mi.UInt32(k + 1)
+        coordinate = _coordinate(order, reversed_order, k)
+        found.append(unit(scramble(coordinate, hash_bits(own if k < 2 else own + block))))
+    return found
 
 
 def unit(bits):
