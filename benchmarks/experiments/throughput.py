@@ -202,7 +202,10 @@ def radius_for(session, photons_a_gather: float) -> tuple[float, int, int, float
     spectral = session._spectral(0)
     photons = session._photons(0, spectral)
     camera_pass = session.describe_camera_pass(
-        session.sensor, session._seed(0, 1), mi.UInt32(0), spectral
+        session.sensor,
+        session._sequence(0, 1, session.camera_paths),
+        mi.UInt32(0),
+        spectral,
     )
     *_, vertices, _ = session._trace_camera(camera_pass, session.vertex_capacity, spectral)
     vertices = read_queries(vertices)

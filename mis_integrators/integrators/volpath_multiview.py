@@ -220,10 +220,6 @@ class MultiViewSession(IterativeSession):
 
     # ------------------------------------------------------------------ passes
 
-    def _numbers(self, sequence, number):
-        """The random numbers of paths `number`: a pixel's share a sequence."""
-        return sequence.of_paths(number // self.camera_paths, number % self.camera_paths)
-
     def _trace_first(self, scene, tables, number, seed, sequence, spectral):
         integrator = self.integrator
         active = (number < self.views.paths) & (integrator.max_depth != 0)
@@ -233,7 +229,7 @@ class MultiViewSession(IterativeSession):
             self.traits,
             number,
             seed,
-            self._numbers(sequence, number),
+            sequence.of_paths(number),
             spectral["wavelengths"],
             spectral["weight"],
             integrator.hide_emitters,
@@ -322,7 +318,7 @@ class MultiViewSession(IterativeSession):
             connections,
             number,
             seed,
-            self._numbers(sequence, number),
+            sequence.of_paths(number),
             self.views.count,
             integrator.max_depth,
             integrator.rr_depth,

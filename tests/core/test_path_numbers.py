@@ -13,10 +13,10 @@ def numbers(low_discrepancy, dimensions, vertices=4):
     from mis_integrators.core.sequences import SampleSequence
 
     sequence = SampleSequence(
-        dr.opaque(mi.UInt32, 2027), dr.opaque(mi.UInt32, 3 * PATHS), low_discrepancy
+        dr.opaque(mi.UInt32, 2027), dr.opaque(mi.UInt32, 3 * PATHS), PATHS, low_discrepancy
     )
     path = dr.arange(mi.UInt32, GROUPS * PATHS)
-    paths = sequence.of_paths(path // PATHS, path % PATHS)
+    paths = sequence.of_paths(path)
     draws = [
         np.array(number, dtype=np.float64)
         for vertex in range(vertices)

@@ -83,8 +83,9 @@ def test_groups_are_of_like_pixels(shape):
 def points(count, seed):
     """Scrambled Sobol' points, a sequence a pixel: (count, SIZE^2, 2)."""
     index, group = np.divmod(np.arange(count * SIZE**2), SIZE**2)
+    number = group * count + index
     seed, first = dr.opaque(mi.UInt32, seed), dr.opaque(mi.UInt32, 0)
-    paths = SampleSequence(seed, first, True).of_paths(mi.UInt32(group), mi.UInt32(index))
+    paths = SampleSequence(seed, first, count, True).of_paths(mi.UInt32(number))
     x, y = paths.at(0).next_floats(2)
     return np.stack([np.array(x), np.array(y)], axis=-1).astype(float).reshape(count, -1, 2)
 

@@ -442,6 +442,7 @@ def measured_in_sphere(iterations):
             "initial_radius": SPHERE["radius"],
             "photon_count": SPHERE["light_paths"],
             "variance": True,
+            "sampler": "independent",
         }
     )
     session = integrator.session(scene, seed=1)
