@@ -32,6 +32,7 @@ def session(scene, radius, seed, **parameters):
             "type": "bdpm",
             "bdd": 0,
             "initial_radius": radius,
+            "direct_paths": 1,
             "hide_emitters": True,  # see `test_variance_channels_tell_the_variance`
             **parameters,
         }

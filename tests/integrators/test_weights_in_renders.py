@@ -373,7 +373,7 @@ def test_noise_law(rgb):
             }
         )
         session = integrator.session(scene, seed=n_b + n_f)
-        for _ in range(48):
+        for _ in range(96):
             session.iterate()
         return session.image()[..., -3:].mean() * session.iterations
 
