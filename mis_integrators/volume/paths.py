@@ -5,7 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from ..core.random import next_2d
+from ..core.random import next_1d_and_2d
 from ..lights.lights import mis_power
 from ..paths.roulette import russian_roulette
 from .media import collision, section, transmittance
@@ -150,7 +150,7 @@ def incident_radiance(
             radiance[lit] += gain * kept
 
         # ---- Scattering in a medium
-        choice, point = draws.next_float32(), next_2d(draws)
+        choice, point = next_1d_and_2d(draws)
         wo, phase_weight, phase_pdf = phase.sample(phase_context, mei, choice, point, scatters)
         scatters &= phase_pdf > 0
 

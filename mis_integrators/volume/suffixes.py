@@ -5,7 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from ..core.random import next_2d, streams
+from ..core.random import next_1d_and_2d, streams
 from ..lights.lights import mis_power
 from .paths import direct_light, incident_radiance, scattering_interaction
 from .pivots import IN_MEDIUM, LATER, NOWHERE, ON_SURFACE, OWN, PIVOT, pivot_surface
@@ -43,7 +43,7 @@ def sample_scattering(pivot, surface, d, traits, draws, active):
     own = on_surface & (pivot["branch"] == OWN)
     seen = mi.SurfaceInteraction3f(surface)
     seen.wi = surface.to_local(d)
-    choice, point = draws.next_float32(), next_2d(draws)
+    choice, point = next_1d_and_2d(draws)
     bs, weight = surface.bsdf().sample(mi.BSDFContext(), seen, choice, point, on_surface)
     if traits.has_delta and not traits.has_masks:
         context = mi.BSDFContext()
