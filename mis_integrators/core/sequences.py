@@ -25,8 +25,8 @@ PRIMITIVE = {2: (2, 1, (1, 3)), 3: (3, 1, (1, 3, 1))}
 first odd direction numbers (Joe and Kuo 2008)."""
 MOST_DIMENSIONS = 4
 BLOCK_BITS = 16
-"""Points of more than two dimensions are nets of 2^16 points each, which are scrambled apart: beyond
-so many, the coordinates from the third on are no longer stratified with those before. (Half the
+"""Points of more than two dimensions are nets of 2^16 points each, which are scrambled apart: with
+more, coordinates from the third on are no longer stratified with those before. (Half the
 instructions.)"""
 
 
