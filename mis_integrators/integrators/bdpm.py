@@ -169,7 +169,6 @@ class BDPMSession(PilotedSession):
             SceneTraits(scene), Lights.seen_by(scene, sensor, integrator.plugin)
         )
         self.world = World(scene, self.lights, self.traits)
-        self.split_paths(CAMERA_CHUNK // integrator.direct_paths)
         self.light_path_count = integrator.photon_count or min(
             film_sample_count(sensor), MOST_LIGHT_PATHS
         )
@@ -183,6 +182,9 @@ class BDPMSession(PilotedSession):
         self.one_vertex = not self.traits.has_mixed and (
             integrator.bdd == 0 or not self.has_caustics
         )
+        # Where nothing is gathered, more paths are more samples, no cheaper than those.
+        self.direct_paths = integrator.direct_paths if self.kinds() else 1
+        self.split_paths(CAMERA_CHUNK // self.direct_paths)
         self.photon_capacity = rounded_up(3 * self.light_path_count)
         self.vertex_capacity = self._vertex_room(self.chunk)
         if integrator.initial_radius:
@@ -211,7 +213,7 @@ class BDPMSession(PilotedSession):
 
     def set_camera_paths(self, camera_paths):
         super().set_camera_paths(camera_paths)
-        self.split_paths(CAMERA_CHUNK // self.integrator.direct_paths)
+        self.split_paths(CAMERA_CHUNK // self.direct_paths)
         self.vertex_capacity = self._vertex_room(self.chunk)
         self._record_camera_pass()
 
@@ -381,7 +383,7 @@ class BDPMSession(PilotedSession):
         sequence, of_extra_paths = sequences
         return replace(
             self.describe_camera_pass(sensor, sequence, first, spectral),
-            extra=self.integrator.direct_paths - 1,
+            extra=self.direct_paths - 1,
             extra_sequence=of_extra_paths,
         )
 
@@ -399,7 +401,7 @@ class BDPMSession(PilotedSession):
     def _camera_sequences(self, iteration, camera_paths):
         """The random numbers of the camera paths that gather, so many a pixel, and of those that do
         not."""
-        extra = max(self.integrator.direct_paths - 1, 1)
+        extra = max(self.direct_paths - 1, 1)
         return (
             self._sequence(iteration, CAMERA, camera_paths),
             self._sequence(iteration, EXTRA, camera_paths * extra),
@@ -597,7 +599,7 @@ class SubsetIteration(NamedTuple):
 
     def direct(self):
         passes = self.passes
-        paths, of_each = passes.pixels.paths, passes.session.integrator.direct_paths
+        paths, of_each = passes.pixels.paths, passes.session.direct_paths
         values = np.broadcast_to(np.array(channel_mean(self.radiance)), paths * of_each)
         others = values[paths:].reshape(paths, of_each - 1).sum(axis=1)
         return passes.by_pixel((values[:paths] + others) / of_each)
