@@ -390,24 +390,27 @@ def test_camera_paths_of_the_chosen_are_its_own(rgb, monkeypatch):
     assert other.camera_paths == 3
 
 
-def test_prediction_is_checked(rgb):
-    """The error that is predicted for `path` is what independent renders have: within a factor of
-    two, the pilot's pixels being few."""
+@pytest.mark.parametrize("sampler", ["independent", "sobol"])
+def test_prediction_is_checked(rgb, sampler):
+    """The error that is predicted for `path` is what twelve renders have: within a factor of two,
+    the pilot's pixels being few."""
     scene = tray("lambertian", "rectangle")
-    session = auto().session(scene, spp=64)
+    session = auto(sampler=sampler).session(scene, spp=64)
     session.iterate()
     predicted = session.settings["choice.relmse.path"]
     trial = next(t for t in session.decision.trials if t.name == "path")
     # as many as cost the same as 64 iterations of bdpm
-    samples = 64 * session.decision.usual_cost / trial.cost
-    images = [
-        np.array(mi.render(scene, integrator=path(), spp=16, seed=seed)).mean(axis=-1)
-        for seed in range(12)
-    ]
+    samples = round(64 * session.decision.usual_cost / trial.cost)
+    images = []
+    for seed in range(12):
+        one = Unidirectional(sampler=sampler).session(scene, 0, seed, 0)
+        for _ in range(samples):
+            one.iterate()
+        images.append(one.image().mean(axis=-1))
     mean = np.mean(images, axis=0)
     weights = 1 / (mean**2 + 0.1 * np.mean(np.minimum(mean, np.quantile(mean, 0.95))) ** 2)
     relative = np.sort((weights * np.var(images, axis=0, ddof=1)).ravel())
-    measured = relative[: int(0.999 * relative.size)].mean() * 16 / samples
+    measured = relative[: int(0.999 * relative.size)].mean()
     assert 0.5 < predicted / measured < 2
 
 
