@@ -28,6 +28,7 @@ from experiments import (  # noqa: E402
     overview,
     radius,
     resampling,
+    sampling,
     scaling,
     stability,
     throughput,
@@ -279,6 +280,24 @@ def _parser() -> argparse.ArgumentParser:
     )
     command.add_argument(
         "--scale", type=_positive, default=1, help="film size, scene's own = 1 (default: 1)"
+    )
+
+    command = _measuring(commands, "sampling", sampling)
+    _chooses(command, ("bdpm:bdd=0",), "each under both samplers")
+    command.set_defaults(scenes=sampling.default_scenes())
+    command.add_argument(
+        "--size", type=int, default=96, metavar="PIXELS", help="edge of the film (default: 96)"
+    )
+    command.add_argument(
+        "--iterations", type=int, default=256, help="of each render (default: 256)"
+    )
+    command.add_argument("--seeds", type=int, default=8, help="renders of each (default: 8)")
+    command.add_argument(
+        "--radius-share",
+        type=_positive,
+        default=0.01,
+        metavar="SHARE",
+        help="merge radius over the scene's diagonal (default: 0.01)",
     )
 
     command = _measuring(commands, "constants", constants)

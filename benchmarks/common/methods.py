@@ -18,11 +18,17 @@ from common.scene_files import OpenScene
 PASS_SECONDS = 0.2
 """What one pass of one of Mitsuba's own integrators should take: short, but long beside its
 start."""
+STRATIFYING = ("multijitter", "stratified", "ldsampler", "orthogonal")
+"""Mitsuba's samplers that do the better the more samples a pass has: one pass should take all the
+time that there is."""
+MOST_SAMPLES = 1 << 25
+"""Samples of a pass at most (bounds memory)."""
 
 # All defaults: what this package does not register is left out, so a plugin may be named here
 # before it exists.
 COMPARED = (
     "path",
+    "path:sampler=multijitter",
     "ptracer",
     "bdpm:bdd=0",
     "bdpm:bdd=1",
@@ -61,8 +67,21 @@ class Method:
     plugin: str
     parameters: dict[str, loading.Value] = field(default_factory=dict, hash=False)
 
+    @property
+    def sampler(self) -> str | None:
+        """For one of Mitsuba's own integrators, the parameter ``sampler``: the sensor's sampler
+        (``None``: the scene's own)."""
+        return str(self.parameters["sampler"]) if self._samples_by_sensor else None
+
+    @property
+    def _samples_by_sensor(self) -> bool:
+        return self.plugin in MITSUBAS and "sampler" in self.parameters
+
     def integrator(self, opened: OpenScene) -> mi.Integrator:
-        return mi.load_dict({"type": self.plugin, **opened.inherited, **self.parameters})
+        own = dict(self.parameters)
+        if self._samples_by_sensor:
+            del own["sampler"]
+        return mi.load_dict({"type": self.plugin, **opened.inherited, **own})
 
 
 def parse_method(text: str) -> Method:
@@ -111,6 +130,7 @@ class SessionMaker:
         tells ``iteration_seconds``."""
         self.method, self.opened, self.seconds = method, opened, seconds
         self._integrator = method.integrator(opened)
+        self._sensor = opened.sensor_with(method.sampler)
         self._spp = 0
         if not hasattr(self._integrator, "session"):
             self._spp = self._samples_per_pass()
@@ -130,7 +150,7 @@ class SessionMaker:
         """A session that renders until it is stopped."""
         if self._spp:
             return MitsubaSession(
-                self._integrator, self.opened.scene, self.opened.sensor, seed, self._spp
+                self._integrator, self.opened.scene, self._sensor, seed, self._spp, at_once=True
             )
         session = self._integrator.session(self.opened.scene, self.opened.sensor, seed=seed, spp=0)
         if hasattr(session, "plan_time") and self.seconds:
@@ -138,16 +158,22 @@ class SessionMaker:
         return session
 
     def _samples_per_pass(self) -> int:
-        """Samples per pixel that one of Mitsuba's own integrators takes in about
-        ``PASS_SECONDS``."""
-        spp = 4
-        session = MitsubaSession(self._integrator, self.opened.scene, self.opened.sensor, 0, spp)
-        session.iterate()
-        start = time.perf_counter()
-        session.iterate()
-        seconds = time.perf_counter() - start
+        """Samples per pixel that one of Mitsuba's own integrators takes in about ``PASS_SECONDS``;
+        under a stratifying sampler, in all of the time."""
+        spp, seconds = 4, self._seconds_of_pass(4)
         while spp > 1 and seconds > 1.5 * PASS_SECONDS:
             spp, seconds = spp // 2, seconds / 2
         while seconds < PASS_SECONDS / 1.5 and spp * self.opened.pixels < 1 << 20:
             spp, seconds = spp * 2, seconds * 2
+        if self.method.sampler in STRATIFYING and self.seconds:
+            wanted = round(spp * self.seconds / self._seconds_of_pass(spp))
+            return max(1, min(wanted, MOST_SAMPLES // self.opened.pixels))
         return spp
+
+    def _seconds_of_pass(self, spp: int) -> float:
+        """Seconds that the second of two passes takes."""
+        session = MitsubaSession(self._integrator, self.opened.scene, self._sensor, 0, spp)
+        session.iterate()
+        start = time.perf_counter()
+        session.iterate()
+        return time.perf_counter() - start

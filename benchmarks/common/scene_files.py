@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -27,6 +27,8 @@ class OpenScene:
     """What a scene without a file was made from: it tells it from all others."""
     title: str = ""
     """Its name."""
+    of_samplers: dict[str, mi.Sensor] = field(default_factory=dict)
+    """Its sensor with another sampler, once it was asked for (`sensor_with`)."""
 
     @property
     def name(self) -> str:
@@ -38,6 +40,16 @@ class OpenScene:
     @property
     def sensor(self) -> mi.Sensor:
         return self.scene.sensors()[0]
+
+    def sensor_with(self, sampler: str | None) -> mi.Sensor:
+        """Its sensor with another of Mitsuba's samplers; ``None``: with its own."""
+        if sampler is None or self.path is None:
+            return self.sensor
+        if sampler not in self.of_samplers:
+            other = loading.load(self.path, {}, "path", {}, sampler).scene.sensors()[0]
+            _resize(other, self.size)
+            self.of_samplers[sampler] = other
+        return self.of_samplers[sampler]
 
     @property
     def size(self) -> tuple[int, int]:
@@ -59,13 +71,17 @@ def open_scene(path: Path, size: tuple[int, int] | None = None) -> OpenScene:
     """Load a scene, its film resized to ``size`` if given (the sensor keeps its field of view)."""
     loaded = loading.load(path, {}, "path", {})
     if size:
-        film = mi.traverse(loaded.scene.sensors()[0])
-        film["film.size"] = mi.ScalarVector2u(*size)
-        film.update()
+        _resize(loaded.scene.sensors()[0], size)
     inherited = {
         name: loaded.parameters[name] for name in loading.INHERITED if name in loaded.parameters
     }
     return OpenScene(path, loaded.scene, inherited)
+
+
+def _resize(sensor: mi.Sensor, size: tuple[int, int]) -> None:
+    film = mi.traverse(sensor)
+    film["film.size"] = mi.ScalarVector2u(*size)
+    film.update()
 
 
 def scaled_size(path: Path, scale: float) -> tuple[int, int] | None:

@@ -27,11 +27,17 @@ COLUMNS = (
     "relMSE ratio",
     "trimmed ratio",
     "MSE ratio",
+    "relMSE / best path",
+    "MSE / best path",
     "FLIP",
     "bias share",
     "cost ratio",
     "settings",
 )
+
+
+TO_BETTER_PATH = {"relMSE": "relMSE / best path", "MSE": "MSE / best path"}
+"""Columns of ratios to the least error of `path` under any of its samplers, by the error's."""
 
 
 def run(options: argparse.Namespace) -> None:
@@ -100,10 +106,18 @@ def compare(measurement: Measurement) -> list[Row]:
         measured.method.label: _figures(measured, measurement) for measured in measurement.methods
     }
     base = every[measurement.base.method.label]
-    return [
+    rows = [
         _row(measured, every[measured.method.label], base, measurement)
         for measured in measurement.methods
     ]
+    paths = [
+        row for row, measured in zip(rows, measurement.methods) if measured.method.plugin == "path"
+    ]
+    for name, column in TO_BETTER_PATH.items():
+        better = min((row[name] for row in paths), default=float("nan"))
+        for row in rows:
+            row[column] = row[name] / better if better else float("nan")
+    return rows
 
 
 def _figures(measured: Measured, measurement: Measurement) -> dict[str, list[float]]:

@@ -82,7 +82,7 @@ def measured(opened, plugins) -> list[dict]:
     for plugin, parameters in METHODS:
         if plugin not in (*plugins, "path"):
             continue
-        given = {**opened.inherited, **parameters}
+        given = {**opened.inherited, "direct_paths": 1, **parameters}
         if plugin == "path":
             session = PathSession(first, scene, sensor, 0, None)
             sessions.append((plugin, plugin, session, costs.events(session, segments, None, 0.0)))

@@ -26,9 +26,9 @@ from common.turns import Contender, take_turns
 from experiments.compare import chosen
 
 STEP = 2**0.5
-ONE_PATH = {"variance": True, "camera_paths": 1}
+ONE_PATH = {"variance": True, "camera_paths": 1, "sampler": "independent"}
 """What all renderings have in common: the automatic one must owe nothing to another number of
-camera paths."""
+camera paths, and the noise of low-discrepancy numbers follows another law."""
 FEWEST_ITERATIONS = 12
 TRIMMED = " trimmed"
 COLUMNS = (

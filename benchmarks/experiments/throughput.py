@@ -98,10 +98,11 @@ class Parts:
 
     def observe(self, kernels: list[dict], seconds: float) -> None:
         """Sort one iteration's kernels: those of the light pass and of the maps are set aside when
-        these are done; of the rest, those up to the first one as wide as the film are the camera
-        pass, the others gather."""
+        these are done; of the rest, those up to the first one as wide as all camera paths are the
+        camera pass, the others gather."""
         compiled = [i for i, kernel in enumerate(kernels) if kernel["type"] == dr.KernelType.JIT]
-        camera = next(i for i in compiled if kernels[i]["size"] == self._session.chunk) + 1
+        lanes = self._session.chunk * self._session.direct_paths
+        camera = next(i for i in compiled if kernels[i]["size"] == lanes) + 1
         parts = {**self._kernels, "camera": kernels[:camera], "gather": kernels[camera:]}
         row = {
             part: sum(kernel["execution_time"] for kernel in mine) for part, mine in parts.items()
@@ -202,7 +203,10 @@ def radius_for(session, photons_a_gather: float) -> tuple[float, int, int, float
     spectral = session._spectral(0)
     photons = session._photons(0, spectral)
     camera_pass = session.describe_camera_pass(
-        session.sensor, session._seed(0, 1), mi.UInt32(0), spectral
+        session.sensor,
+        session._sequence(0, 1, session.camera_paths),
+        mi.UInt32(0),
+        spectral,
     )
     *_, vertices, _ = session._trace_camera(camera_pass, session.vertex_capacity, spectral)
     vertices = read_queries(vertices)

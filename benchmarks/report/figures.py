@@ -25,6 +25,11 @@ def draw_by_share(path: Path, curves: Mapping[str, list[tuple[float, float]]]) -
     charts.save(charts.by_share(curves), path)
 
 
+def draw_convergence_of_samplers(path: Path, rows: Sequence[Mapping]) -> None:
+    """Variances of images against iterations: rows as of `experiments.sampling`."""
+    charts.save(charts.convergence_of_samplers(rows), path)
+
+
 def draw_densities(path: Path) -> None:
     """Figure 3 of the paper: densities of interactions shifted from a segment on [0, 9] to one on
     [0, 3], next to the target's own: tentative, null and real."""

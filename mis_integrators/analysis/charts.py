@@ -286,6 +286,38 @@ def ratios(
     return figure
 
 
+def convergence_of_samplers(rows: Sequence[Mapping[str, Any]]) -> Figure:
+    """Variance of images (full lines) and relative variance (dashed) against iterations, a panel
+    for each scene and method, a colour for each sampler.
+
+    `rows`: mappings with ``scene``, ``method``, ``sampler``, ``iterations``, ``variance``,
+    ``relative variance trimmed``."""
+    panels = list(dict.fromkeys((row["scene"], row["method"]) for row in rows))
+    with rc_context(SETTINGS):
+        figure = Figure(figsize=(3.3 * len(panels), 3.4), layout="constrained")
+        for axis, (scene, method) in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels):
+            for sampler, colour in zip(("sobol", "independent"), ("#1f77d0", "#222222")):
+                mine = [
+                    row
+                    for row in rows
+                    if (row["scene"], row["method"], row["sampler"]) == (scene, method, sampler)
+                ]
+                for name, dashes in (("variance", "-"), ("relative variance trimmed", "--")):
+                    axis.plot(
+                        [row["iterations"] for row in mine],
+                        [row[name] for row in mine],
+                        dashes,
+                        color=colour,
+                        marker="o",
+                        markersize=3,
+                        label=f"{sampler}, {name.removesuffix(' trimmed')}",
+                    )
+            axis.set_title(f"{scene}, {method}")
+            _logarithmic(axis, "iterations", "variance of the image")
+        figure.axes[-1].legend(fontsize=7)
+    return figure
+
+
 def variance_maps(
     labels: Sequence[str],
     images: Sequence[np.ndarray],

@@ -43,13 +43,18 @@ class LoadedScene:
 
 
 def load(
-    path: Path, variables: Mapping[str, str], plugin: str | None, parameters: Mapping[str, Value]
+    path: Path,
+    variables: Mapping[str, str],
+    plugin: str | None,
+    parameters: Mapping[str, Value],
+    sampler: str | None = None,
 ) -> LoadedScene:
     """Load the scene of an XML file under the active variant.
 
     ``variables`` are the values of the scene's ``$variables``. ``plugin`` replaces its integrator,
     which hands on the parameters ``INHERITED``; ``parameters`` are then set on the integrator,
-    replaced or not. Raises one of ``SCENE_ERRORS`` (see ``one_line``).
+    replaced or not; ``sampler`` replaces the sensors' samplers, but not their numbers of samples.
+    Raises one of ``SCENE_ERRORS`` (see ``one_line``).
     """
     config = mi.parser.ParserConfig(mi.variant())
     state = mi.parser.parse_file(config, str(path), **variables)
@@ -73,6 +78,8 @@ def load(
         node.props[name] = value
     name, given = node.props.plugin_name(), _plain(node.props)
 
+    if sampler:
+        _replace_samplers(state, sampler)
     scene = mi.parser.instantiate(config, state)
     for sensor in scene.sensors():
         check_film(sensor, name)
@@ -184,6 +191,29 @@ def _add_integrator(state: Any) -> Any:
     state.nodes.append(node)
     state.root.props["_integrator"] = mi.Properties.ResolvedReference(len(state.nodes) - 1)
     return state.nodes[-1]
+
+
+def _replace_samplers(state: Any, plugin: str) -> None:
+    """Make all samplers such plugins, also where Mitsuba would choose one."""
+    for sensor in [node for node in state.nodes if node.type == mi.ObjectType.Sensor]:
+        own = [index for index in _children(sensor) if _is_sampler(state.nodes[index])]
+        counts = [
+            {"sample_count": state.nodes[index].props["sample_count"]}
+            for index in own
+            if "sample_count" in state.nodes[index].props
+        ]
+        if not own:
+            node = mi.parser.SceneNode()
+            node.type = mi.ObjectType.Sampler
+            state.nodes.append(node)
+            own = [len(state.nodes) - 1]
+            sensor.props["_sampler"] = mi.Properties.ResolvedReference(own[0])
+        for index in own:
+            state.nodes[index].props = _properties(plugin, counts[0] if counts else {})
+
+
+def _is_sampler(node: Any) -> bool:
+    return node.type == mi.ObjectType.Sampler
 
 
 def _nested_integrators(state: Any, node: Any) -> list[Any]:

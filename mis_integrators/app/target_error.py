@@ -51,7 +51,8 @@ def _mean_without_largest(values: np.ndarray) -> float:
 
 class TargetError:
     """Whether a session has reached a relative error. Estimated seldom: whenever it may be reached,
-    or the render has grown by a quarter."""
+    if the error falls like that of independent iterations, or the render has grown by a quarter
+    (that of low-discrepancy sequences falls faster)."""
 
     def __init__(self, target: float):
         self.target = target

@@ -7,7 +7,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from . import segments
 from .packing import from_numpy
+from .stratified_variance import variance_ratio
 from .sums import Sums
 
 
@@ -123,6 +125,11 @@ def spread(sums, mean):
     return sums["square"] - 2 * mean * sums["cross"] + mean * mean * sums["weight_square"]
 
 
+def grey_of(colour):
+    """The mean of three channels (height, width, 3), as (height, width, 1)."""
+    return (colour[:, :, :1] + colour[:, :, 1:2] + colour[:, :, 2:]) / 3
+
+
 def unfinite_pixels(block):
     """One for each pixel of a block tensor that has a value which is not finite, else zero: shape
     (height, width, 1)."""
@@ -144,13 +151,18 @@ class Accumulator:
     The sums are `total`; `left_out`, how many iterations had a value at the pixel that is not
     finite and are left out there, weight and all; with the variance `square` (colour squared),
     `cross` (colour times weight), `weight_square`; `techniques` if there are such images.
+
+    Where iterations are `stratified` together (low-discrepancy numbers), the variance needs
+    `grey_square` and the segments (see `segments`) of grey and weight, too; grey is the mean of the
+    colours.
     """
 
-    def __init__(self, film, with_variance, technique_channels=0):
-        self.film, self.with_variance, self.technique_channels = (
+    def __init__(self, film, with_variance, technique_channels=0, stratified=False):
+        self.film, self.with_variance, self.technique_channels, self.stratified = (
             film,
             with_variance,
             technique_channels,
+            stratified,
         )
         self.sums = Sums(mi.TensorXd)
 
@@ -170,6 +182,8 @@ class Accumulator:
         }
         if self.with_variance:
             channels |= {"square": 3, "cross": 3, "weight_square": 1}
+            if self.stratified:
+                channels |= {"grey_square": 1, **dict.fromkeys(segments.NAMES, 2)}
         if self.technique_channels:
             channels["techniques"] = self.technique_channels
         return {name: (*size, count) for name, count in channels.items()}
@@ -185,6 +199,12 @@ class Accumulator:
         self.sums.add("left_out", left_out)
         if self.with_variance:
             add_squares(self.sums, block[:, :, :3], block[:, :, -1:])
+            if self.stratified:
+                grey = grey_of(mi.TensorXd(block[:, :, :3]))
+                self.sums.add("grey_square", grey * grey)
+                self.sums.add_to_segment(
+                    iteration, dr.concat([grey, mi.TensorXd(block[:, :, -1:])], axis=2)
+                )
         self.sums.done.add(iteration)
         dr.schedule(self.sums.tensors)
 
@@ -199,10 +219,33 @@ class Accumulator:
     def variance_of_mean(self):
         """Estimated variance of each pixel's mean (height, width, 3) from the iterations, by the
         ratio estimator's delta method: sum (A_i - m W_i)^2 / (n (n - 1) mean(W)^2), A_i and W_i the
-        weighted colour and weight of iteration i."""
+        weighted colour and weight of iteration i; times the `_variance_ratio` of those that are
+        stratified."""
         n = self.iterations
         mean, weight = self.mean()
-        return dr.maximum(spread(self.sums, mean), 0) * (n / ((n - 1) * weight * weight))
+        variance = dr.maximum(spread(self.sums, mean), 0) * (n / ((n - 1) * weight * weight))
+        return variance * mi.TensorXd(self._variance_ratio()) if self.stratified else variance
+
+    def _variance_ratio(self):
+        """Variance over that of as many independent iterations, of grey (height, width, 1); one in
+        the block's border."""
+        n, done = self.iterations, self.sums.done
+        mean, weight = (self._inside(tensor) for tensor in self.mean())
+        mean = grey_of(mean)
+        grey = {
+            "square": self._inside(self.sums["grey_square"]),
+            "cross": grey_of(self._inside(self.sums["cross"])),
+            "weight_square": self._inside(self.sums["weight_square"]),
+        }
+        naive = np.maximum(spread(grey, mean), 0) * (n / ((n - 1) * weight * weight))
+        length, complete = segments.complete(done.below, done.beyond, done.end)
+        sums = np.array([self._inside(self.sums[name]) for name in segments.NAMES])
+        deviations = (sums[..., :1] - mean * sums[..., 1:]) * (n / (weight * length))
+        ratio = variance_ratio(
+            deviations[..., 0], complete, length, naive[..., 0], done.below, done.beyond
+        )
+        border = self.film.rfilter().border_size()
+        return np.pad(ratio, border, constant_values=1.0)[..., None]
 
     def estimate(self):
         """Mean colour and its estimated variance, float64 (height, width, 3) each, without the

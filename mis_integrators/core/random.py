@@ -1,6 +1,8 @@
-"""Independent streams of random numbers: one generator a path, one seed an iteration and pass."""
+"""Random numbers: seeds, independent streams, and draws from streams and sequences alike."""
 
 import mitsuba as mi
+
+from .sequences import VertexNumbers
 
 
 def mix(*words):
@@ -16,6 +18,11 @@ def mix(*words):
     return state & 0xFFFFFFFF
 
 
+def reversed_bits(number):
+    """The lowest 32 bits of an integer in reverse order: over 2^32, the van der Corput sequence."""
+    return int(f"{number % 2**32:032b}"[::-1], 2)
+
+
 def streams(index, seed):
     """A PCG32 generator for every path `index` (uint32 array) under `seed` (uint32, opaque to keep
     kernels cached)."""
@@ -29,6 +36,20 @@ def vertex_streams(path, number, seed):
     return streams(path, seed + number * mi.UInt32(0x9E3779B9))
 
 
+def next_floats(rng, dimensions, active=True):
+    """So many uniform numbers in [0, 1); of a `VertexNumbers`, stratified together."""
+    if isinstance(rng, VertexNumbers):
+        return rng.next_floats(dimensions)
+    return [rng.next_float32(active) for _ in range(dimensions)]
+
+
+def next_1d_and_2d(rng, active=True):
+    """A uniform number and a point, stratified together: for a choice, and a point or direction of
+    what is chosen."""
+    choice, x, y = next_floats(rng, 3, active)
+    return choice, mi.Point2f(x, y)
+
+
 def next_2d(rng, active=True):
     """Two uniform numbers in [0, 1) as a point; advances `rng`."""
-    return mi.Point2f(rng.next_float32(active), rng.next_float32(active))
+    return mi.Point2f(*next_floats(rng, 2, active))

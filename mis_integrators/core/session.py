@@ -27,7 +27,7 @@ Setting = str | int | float
 
 
 class Session(Protocol):
-    """One render in progress: ``iterate`` adds an independent iteration, ``image`` is the mean of
+    """One render in progress: ``iterate`` adds an iteration, ``image`` is the mean of
     those done.
 
     A session may have a method ``plan_time(seconds: float) -> None``. It is called once, before the
@@ -122,7 +122,7 @@ class MitsubaSession:
 
     All passes have the same number of samples, so the total is ``spp`` rounded up to a multiple of
     it. If ``fine``, there are ``FEWEST_PASSES`` passes at least (samples allowing), and without a
-    planned end they have 16 samples at most.
+    planned end they have 16 samples at most. If ``at_once``, there is one pass.
     """
 
     def __init__(
@@ -133,6 +133,7 @@ class MitsubaSession:
         seed: int,
         spp: int,
         fine: bool = False,
+        at_once: bool = False,
     ):
         self._integrator, self._scene, self._sensor, self._seed, self._spp = (
             integrator,
@@ -143,6 +144,8 @@ class MitsubaSession:
         )
         width, height = sensor.film().crop_size()
         largest = self._largest = max(1, PATHS_PER_PASS // (width * height))
+        if at_once:
+            largest = self._largest = max(spp, 1)
         if fine:
             largest = min(largest, max(1, spp // FEWEST_PASSES) if spp else 16)
         passes = math.ceil(spp / largest)

@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from . import segments
+
 
 class Iterations:
     """A set of iteration numbers that is nearly 0, 1, ..., n - 1: those below a number, and some
@@ -36,6 +38,11 @@ class Iterations:
     def first_missing(self) -> int:
         """The least number that is not in the set."""
         return self.below
+
+    @property
+    def end(self) -> int:
+        """The least number that all in the set are below."""
+        return max(self.beyond, default=self.below - 1) + 1
 
     def even(self) -> int:
         """How many of the numbers are even."""
@@ -88,6 +95,21 @@ class Sums:
         value = self._tensor(value)
         self.tensors[name] = self.tensors[name] + value if name in self.tensors else value
 
+    def add_to_segment(self, iteration: int, value: Any) -> None:
+        """Add to the sum of the segment that an iteration is in, before it is among those
+        ``done``."""
+        end = max(self.done.end, iteration + 1)
+        self._make_room(end)
+        value = self._tensor(value)
+        if segments.NAMES[0] not in self.tensors:
+            self.tensors |= {name: segments.zeros_like(value) for name in segments.NAMES}
+        self.add(segments.NAMES[iteration >> segments.level(end)], value)
+
+    def _make_room(self, end: int) -> None:
+        """Make segments long enough for iterations below a number."""
+        levels = segments.level(end) - segments.level(self.done.end)
+        self.tensors = segments.coarser(self.tensors, levels)
+
     @contextlib.contextmanager
     def all_or_nothing(self) -> Iterator[None]:
         """Where the block ends with an error, the sums are what they were before it."""
@@ -109,8 +131,13 @@ class Sums:
         mine = {name: tuple(tensor.shape) for name, tensor in self.tensors.items()}
         if self.tensors and shapes != mine:
             raise ValueError(f"sums do not match: {shapes} and {mine}")
-        self.done.update(done)
-        for name, array in arrays.items():
+        end = max(self.done.end, done.end)
+        both = self.done.copy()
+        both.update(done)
+        self._make_room(end)
+        self.done = both
+        levels = segments.level(end) - segments.level(done.end)
+        for name, array in segments.coarser(arrays, levels).items():
             self.add(name, array)
 
     def take(self) -> tuple[dict[str, np.ndarray], Iterations]:

@@ -29,6 +29,9 @@ from .schedule import read_radius
 
 SPARE_PHOTONS = 1 << 20
 """Unused room beyond half of a photon buffer that is worth the time to record the passes anew."""
+USUAL_DIRECT_PATHS = 4
+"""Tuned: camera paths that see direct light, for each that gathers photons."""
+MOST_DIRECT_PATHS = 1024
 CAMERA_CHUNK = 1 << 21
 """Camera paths traced at once at most; larger films are traced in parts (bounds memory)."""
 
@@ -70,10 +73,15 @@ class BDPM(IterativeIntegrator):
        - |float|
        - Radius reduction of progressive photon mapping, in (0, 1]: iteration i uses R_i^2 = R_0^2
          (i + 1)^(alpha - 1). 1 keeps the radius. (Default: 1)
+     * - direct_paths
+       - |int|
+       - Camera paths that see emission and direct light at their first smooth vertex, for each one
+         that gathers photons. (Default: 4)
      * - camera_paths
        - |int|
-       - Camera paths per pixel and iteration. 0 stands for one; in a render of a given time whose
-         radius is automatic, for as many of 1, 2, 4 and 8 as make the least error. (Default: 0)
+       - Camera paths per pixel and iteration that gather photons. 0 stands for one; in a render of
+         a given time whose radius is automatic, for as many of 1, 2, 4 and 8 as make the least
+         error. (Default: 0)
      * - variance
        - |bool|
        - Adds the channels ``var.R``, ``var.G``, ``var.B`` (mono: ``var.Y``): the estimated variance
@@ -89,6 +97,11 @@ class BDPM(IterativeIntegrator):
      * - hide_emitters
        - |bool|
        - Hide directly visible emitters. (Default: no, i.e. |false|)
+     * - sampler
+       - |string|
+       - Random numbers of sub-paths: ``sobol``, scrambled Sobol' sequences, one a pixel over all
+         iterations; or ``independent``. The scene's ``<sampler>`` is not used but for its sample
+         count. (Default: ``sobol``)
 
     Each iteration traces light sub-paths, stores them as photons in a grid, traces camera paths,
     and estimates the light that photons bring to the camera paths' vertices from their density.
@@ -129,6 +142,9 @@ class BDPM(IterativeIntegrator):
             "photon_count", 0, 0, "at least 0 (0: as many as pixels)", high=MOST_LIGHT_PATHS
         )
         self.initial_radius, self.alpha = read_radius(parameters)
+        self.direct_paths = parameters.integer(
+            "direct_paths", USUAL_DIRECT_PATHS, 1, "at least 1", high=MOST_DIRECT_PATHS
+        )
 
     def settings(self):
         return {
@@ -136,6 +152,7 @@ class BDPM(IterativeIntegrator):
             "photon_count": self.photon_count,
             "initial_radius": self.initial_radius,
             "alpha": self.alpha,
+            "direct_paths": self.direct_paths,
             "bdd": self.bdd,
         }
 
@@ -152,7 +169,6 @@ class BDPMSession(PilotedSession):
             SceneTraits(scene), Lights.seen_by(scene, sensor, integrator.plugin)
         )
         self.world = World(scene, self.lights, self.traits)
-        self.split_paths(CAMERA_CHUNK)
         self.light_path_count = integrator.photon_count or min(
             film_sample_count(sensor), MOST_LIGHT_PATHS
         )
@@ -166,6 +182,9 @@ class BDPMSession(PilotedSession):
         self.one_vertex = not self.traits.has_mixed and (
             integrator.bdd == 0 or not self.has_caustics
         )
+        # Where nothing is gathered, more paths are more samples, no cheaper than those.
+        self.direct_paths = integrator.direct_paths if self.kinds() else 1
+        self.split_paths(CAMERA_CHUNK // self.direct_paths)
         self.photon_capacity = rounded_up(3 * self.light_path_count)
         self.vertex_capacity = self._vertex_room(self.chunk)
         if integrator.initial_radius:
@@ -194,7 +213,7 @@ class BDPMSession(PilotedSession):
 
     def set_camera_paths(self, camera_paths):
         super().set_camera_paths(camera_paths)
-        self.split_paths(CAMERA_CHUNK)
+        self.split_paths(CAMERA_CHUNK // self.direct_paths)
         self.vertex_capacity = self._vertex_room(self.chunk)
         self._record_camera_pass()
 
@@ -234,11 +253,11 @@ class BDPMSession(PilotedSession):
         self._map_pass = self.recorded(self._build_maps)
         self._record_camera_pass()
 
-    def _trace_light(self, scene, sensor, tables, seed, spectral):
+    def _trace_light(self, scene, sensor, tables, sequence, spectral):
         return trace_light_paths(
             self.world,
             self.limits,
-            self.describe_light_pass(sensor, seed, self.light_path_count, spectral),
+            self.describe_light_pass(sensor, sequence, self.light_path_count, spectral),
             self.photon_capacity,
             light_state=self._light_state(spectral),
         )
@@ -254,7 +273,13 @@ class BDPMSession(PilotedSession):
     def _trace_camera(self, camera_pass, capacity, spectral):
         """Traces the paths of a `CameraPass`, with room for so many vertices."""
         queries = Queries(
-            self.last_vertex, capacity, self.has_caustics, self.has_indirect, self.one_vertex
+            self.last_vertex,
+            capacity,
+            self.has_caustics,
+            self.has_indirect,
+            self.one_vertex,
+            camera_pass.count,
+            1 + camera_pass.extra,
         )
         return trace_camera_paths(
             self.world, self.limits, camera_pass, queries, self._merge_state(spectral)
@@ -322,11 +347,10 @@ class BDPMSession(PilotedSession):
     def _build_maps(self, photons, radii):
         return {kind: self._map(photons, kind, radius).arrays() for kind, radius in radii.items()}
 
-    def _render_chunk(self, scene, sensor, tables, maps, seed, first, spectral, radii):
+    def _render_chunk(self, scene, sensor, tables, maps, sequences, first, spectral, radii):
+        camera_pass = self._describe_camera_paths(sensor, sequences, first, spectral)
         radiance, alpha, position, vertices, count = self._trace_camera(
-            self.describe_camera_pass(sensor, seed, first, spectral),
-            self.vertex_capacity,
-            spectral,
+            camera_pass, self.vertex_capacity, spectral
         )
         if radii:
             dr.eval(radiance, alpha, position, vertices, count)
@@ -336,17 +360,52 @@ class BDPMSession(PilotedSession):
             )
             (gathered,) = self._gather(photon_map, vertices, kind, [radius], spectral)
             if self.corrected[kind]:
-                gathered *= dr.rcp(self._covered(scene, tables, vertices, radius, seed))
-            radiance += self._per_path(gathered, vertices, self.chunk)
+                gathered *= dr.rcp(
+                    self._covered(scene, tables, vertices, radius, camera_pass.sequence.own_seed())
+                )
+            gathered = self._per_path(gathered, vertices, self.chunk) * (1 + camera_pass.extra)
+            radiance += _widened(gathered, camera_pass)
         if self.integrator.hide_emitters:
             radiance = dr.select(
                 alpha > 0, radiance, 0
             )  # as `path` does: what is behind nothing but null surfaces is hidden
         return splat_samples(
-            sensor.film(), position, radiance, alpha, spectral["matrix"], self.in_chunk(first)
+            sensor.film(),
+            position,
+            radiance,
+            alpha,
+            spectral["matrix"],
+            self._there_are(camera_pass),
         ), count
 
+    def _describe_camera_paths(self, sensor, sequences, first, spectral):
+        """The `CameraPass` of a part. `sequences`: as of `_camera_sequences`."""
+        sequence, of_extra_paths = sequences
+        return replace(
+            self.describe_camera_pass(sensor, sequence, first, spectral),
+            extra=self.direct_paths - 1,
+            extra_sequence=of_extra_paths,
+        )
+
+    def _there_are(self, camera_pass):
+        """Which paths of a part there are: the last part may have fewer."""
+        if not camera_pass.extra:
+            return self.in_chunk(camera_pass.first)
+        path = dr.arange(mi.UInt32, camera_pass.lanes)
+        others = (path - camera_pass.count) // camera_pass.extra
+        number = dr.select(path < camera_pass.count, path, others) + camera_pass.first
+        return number < self.path_count
+
     # ------------------------------------------------------------------ iterations
+
+    def _camera_sequences(self, iteration, camera_paths):
+        """The random numbers of the camera paths that gather, so many a pixel, and of those that do
+        not."""
+        extra = max(self.direct_paths - 1, 1)
+        return (
+            self._sequence(iteration, CAMERA, camera_paths),
+            self._sequence(iteration, EXTRA, camera_paths * extra),
+        )
 
     def _photons(self, iteration, spectral):
         """An iteration's photons. Where they overflow the buffers, these grow and the pass runs
@@ -354,7 +413,11 @@ class BDPMSession(PilotedSession):
         with some room."""
         while True:
             photons = self._light_pass(
-                self.scene, self.sensor, self._tables, self._seed(iteration, LIGHT), spectral
+                self.scene,
+                self.sensor,
+                self._tables,
+                self._sequence(iteration, LIGHT, self.light_path_count),
+                spectral,
             )
             dr.eval(photons)
             found = self.photons_found = int(photons[2][0])
@@ -381,7 +444,7 @@ class BDPMSession(PilotedSession):
                     self.sensor,
                     self._tables,
                     maps,
-                    self._seed(iteration, CAMERA),
+                    self._camera_sequences(iteration, self.camera_paths),
                     first,
                     spectral,
                     radii,
@@ -394,6 +457,15 @@ class BDPMSession(PilotedSession):
 
         (block,) = self.sum_of_chunks(render)
         return block
+
+
+def _widened(values, camera_pass):
+    """Values of the camera paths that gather, for all those of a pass: zero for the others."""
+    if not camera_pass.extra:
+        return values
+    path = dr.arange(mi.UInt32, camera_pass.lanes)
+    dr.eval(values)  # else each channel would be gathered in a kernel of its own
+    return dr.gather(type(values), values, path, path < camera_pass.count)
 
 
 class SubsetPasses:
@@ -412,10 +484,10 @@ class SubsetPasses:
             1 - pixels.count * stride
         ) % 2**32  # from a path of the last pixel to the next one of the first
         self._camera = session.recorded(
-            lambda scene, sensor, tables, seed, spectral: session._trace_camera(
+            lambda scene, sensor, tables, sequences, spectral: session._trace_camera(
                 replace(
-                    session.describe_camera_pass(
-                        sensor, seed, lanes(pixels.paths) // pixels.count * back, spectral
+                    session._describe_camera_paths(
+                        sensor, sequences, lanes(pixels.paths) // pixels.count * back, spectral
                     ),
                     count=pixels.paths,
                     camera_paths=pixels.camera_paths,
@@ -449,17 +521,17 @@ class SubsetPasses:
         photons = session._photons(number, spectral)
         if self.photon_capacity != session.photon_capacity:
             self._record_gather()
-        seed = session._seed(number, CAMERA)
-        radiance, vertices = self._trace_camera(seed, spectral)
-        return SubsetIteration(self, photons, vertices, radiance, seed, spectral)
+        sequences = session._camera_sequences(number, self.pixels.camera_paths)
+        radiance, vertices = self._trace_camera(sequences, spectral)
+        return SubsetIteration(self, photons, vertices, radiance, sequences[0].own_seed(), spectral)
 
-    def _trace_camera(self, seed, spectral):
+    def _trace_camera(self, sequences, spectral):
         """Radiance and vertices of the camera paths. Where the vertices overflow their buffer, it
         grows and the pass runs again."""
         session = self.session
         while True:
             radiance, _, _, vertices, count = self._camera(
-                session.scene, session.sensor, session._tables, seed, spectral
+                session.scene, session.sensor, session._tables, sequences, spectral
             )
             found = 0 if session.one_vertex else int(dr.max(count)[0])
             if found <= self.capacity:
@@ -526,8 +598,12 @@ class SubsetIteration(NamedTuple):
         return self.passes.gather(self.photons, self.vertices, radii, self.seed, self.spectral)
 
     def direct(self):
-        return self.passes.by_pixel(channel_mean(self.radiance))
+        passes = self.passes
+        paths, of_each = passes.pixels.paths, passes.session.direct_paths
+        values = np.broadcast_to(np.array(channel_mean(self.radiance)), paths * of_each)
+        others = values[paths:].reshape(paths, of_each - 1).sum(axis=1)
+        return passes.by_pixel((values[:paths] + others) / of_each)
 
 
-LIGHT, CAMERA = range(2)
+LIGHT, CAMERA, EXTRA = 0, 1, 3
 """Purposes of an iteration's random seeds, besides `IterativeSession.WAVELENGTH`."""

@@ -22,7 +22,7 @@ class BDPMAuto(IterativeIntegrator):
 
     .. pluginparameters::
 
-     * - camera_paths, variance, max_depth, rr_depth, hide_emitters
+     * - camera_paths, variance, max_depth, rr_depth, hide_emitters, sampler
        -
        - As of :monosp:`bdpm`.
 
@@ -95,12 +95,9 @@ class AutoSession(IterativeSession):
 
     @property
     def remarks(self):
-        """Why what renders was chosen, line by line."""
-        return (
-            [f"{self.integrator.plugin}: {reason}" for reason in self.decision.reasons]
-            if self.decision
-            else []
-        )
+        """Why what renders was chosen, and what else the user should know, line by line."""
+        reasons = self.decision.reasons if self.decision else []
+        return [*(f"{self.integrator.plugin}: {reason}" for reason in reasons), *super().remarks]
 
     def start(self):
         if self.decision is None:

@@ -54,8 +54,8 @@ class BDPMOpt(WeightedBDPM):
        - Light sub-paths of the pass from which the weights learn where light is; they do not
          contribute to the image. 0 stands for
          131072. (Default: 0)
-     * - photon_count, initial_radius, alpha, camera_paths, variance, max_depth, rr_depth,
-         hide_emitters
+     * - photon_count, initial_radius, alpha, direct_paths, camera_paths, variance, max_depth,
+         rr_depth, hide_emitters, sampler
        -
        - As of :monosp:`bdpm`.
 
@@ -168,7 +168,7 @@ class BDPMOptSession(WeightedSession):
         while found > capacity:
             capacity = found
             light_pass = self.describe_light_pass(
-                self.sensor, self._seed(0, FROZEN), paths, spectral
+                self.sensor, self._sequence(0, FROZEN, paths), paths, spectral
             )
             photons = trace_light_paths(
                 self.world, self.limits, light_pass, capacity, keep_direct=True

@@ -75,6 +75,11 @@ class BDPT(IterativeIntegrator):
      * - hide_emitters
        - |bool|
        - Hide directly visible emitters. (Default: no, i.e. |false|)
+     * - sampler
+       - |string|
+       - Random numbers of sub-paths: ``sobol``, scrambled Sobol' sequences, one a pixel over all
+         iterations; or ``independent``. The scene's ``<sampler>`` is not used but for its sample
+         count. (Default: ``sobol``)
 
     Each camera path is traced with a light sub-path. Light comes from emitters that the camera path
     meets, from next-event estimation, from joining each of its vertices with each of the light
@@ -187,19 +192,19 @@ class BDPTSession(IterativeSession):
 
     # ------------------------------------------------------------------ passes
 
-    def _trace_light(self, scene, sensor, tables, seed, spectral):
-        light_pass = self.describe_light_pass(sensor, seed, self.light_chunk, spectral)
+    def _trace_light(self, scene, sensor, tables, sequence, first, spectral):
+        light_pass = self.describe_light_pass(sensor, sequence, self.light_chunk, spectral, first)
         return trace_light_subpaths(
             self.world, self.limits, light_pass, self.weights(spectral), self.capacity["light"]
         )
 
-    def _trace_camera(self, scene, sensor, tables, seed, first, skip, spectral):
+    def _trace_camera(self, scene, sensor, tables, sequence, first, skip, spectral):
         ledger = self._ledger() if self.integrator.techniques else None
         first = with_gaps(first, skip, self.chunk, self.camera_paths)
         radiance, alpha, position, vertices, count = trace_camera_subpaths(
             self.world,
             self.limits,
-            self.describe_camera_pass(sensor, seed, first, spectral),
+            self.describe_camera_pass(sensor, sequence, first, spectral),
             self.weights(spectral),
             self.capacity["camera"],
             ledger,
@@ -284,7 +289,12 @@ class BDPTSession(IterativeSession):
         light = lit = None
         while self.bidirectional:
             light = self._light_pass(
-                self.scene, self.sensor, self._tables, self._seed(iteration, LIGHT, chunk), spectral
+                self.scene,
+                self.sensor,
+                self._tables,
+                self._sequence(iteration, LIGHT, 1),
+                dr.opaque(mi.UInt32, chunk * self.light_chunk),
+                spectral,
             )
             if not self._grown("light", light[1]):
                 break
@@ -293,7 +303,7 @@ class BDPTSession(IterativeSession):
                 self.scene,
                 self.sensor,
                 self._tables,
-                self._seed(iteration, CAMERA),
+                self._sequence(iteration, CAMERA, self.camera_paths),
                 first,
                 dr.opaque(mi.UInt32, 0),
                 spectral,

@@ -15,7 +15,7 @@ class PCBPT(ResampledIntegrator):
     .. pluginparameters::
 
      * - light_paths, resamples, cache_neighbors, target, light_tracing, camera_paths, variance,
-         max_depth, rr_depth, hide_emitters
+         max_depth, rr_depth, hide_emitters, sampler
        -
        - As of :monosp:`bdpt_ris`.
 
@@ -87,6 +87,11 @@ class BDPTRIS(ResampledIntegrator):
      * - hide_emitters
        - |bool|
        - Hide directly visible emitters. (Default: no, i.e. |false|)
+     * - sampler
+       - |string|
+       - Random numbers of sub-paths: ``sobol``, scrambled Sobol' sequences, one a pixel over all
+         iterations; or ``independent``. The scene's ``<sampler>`` is not used but for its sample
+         count. (Default: ``sobol``)
 
     Each iteration traces light sub-paths and, at cache points strewn over what the camera sees,
     makes the pmf of the light vertices of M of them, with shadow rays. A camera vertex draws the

@@ -18,9 +18,10 @@ import numpy as np
 
 from ..core.recording import lanes
 from ..core.spectra import channel_mean
+from ..core.stratified_variance import contrasts, extrapolated
 from ..paths.path_length_statistics import mean_segments
 from ..pilot.noise import relative_weights, trimmed_mean
-from ..pilot.run import FEWEST_ITERATIONS, PILOT_INDEX
+from ..pilot.run import FEWEST_ITERATIONS
 from ..pilot.setting import UNPLANNED_ITERATIONS
 from . import costs
 from .bdpm import Survey
@@ -48,8 +49,10 @@ was in vain."""
 LIKE_THE_FIRST = 2.5
 """Tuned: what trying another photon mapper takes, in the seconds that the first one took (optimal
 weights have to learn first): 1.6 to 3."""
-PATH_TRIALS = 12
-"""Tuned: samples of `path` on each of the pilot's pixels."""
+PATH_TRIALS = 16
+"""Tuned: samples of `path` on each of the pilot's pixels; a power of two."""
+TRIAL_INDEX = 1 << 28
+"""Iteration number of these samples: consecutive in the pixels' sequences."""
 UNSEEN = 1e-3
 """Tuned: share of the light, brought by caustics, from which on a `path` that cannot see them is
 out of the question."""
@@ -100,7 +103,14 @@ def handed_on(integrator):
     """The parameters that every integrator of this package shares."""
     return {
         name: getattr(integrator, name)
-        for name in ("max_depth", "rr_depth", "hide_emitters", "camera_paths", "variance")
+        for name in (
+            "max_depth",
+            "rr_depth",
+            "hide_emitters",
+            "camera_paths",
+            "variance",
+            "sampler",
+        )
     }
 
 
@@ -144,7 +154,7 @@ def choose(integrator, scene, sensor, seed, iterations, seconds):
     if blind:
         reasons.append(blind)
     else:
-        trials.insert(0, _try_path(path, segments, pixels, prediction.mean))
+        trials.insert(0, _try_path(path, segments, pixels, prediction.mean, budget))
     weighting = (
         not blind and 1 < trials[0].error(budget) / max(trials[1].error(budget), 1e-30) < KEEPS_UP
     )
@@ -263,7 +273,8 @@ def _trial(plugin, parameters, session, segments):
         session,
         prediction.squared_bias,
         prediction.variance,
-        costs.cost(plugin, counted) * prediction.cost_of_paths,
+        (costs.cost(plugin, counted) + costs.of_direct_paths(session, segments))
+        * prediction.cost_of_paths,
     )
 
 
@@ -274,8 +285,8 @@ def _pilot_cost(session, segments):
     return session.prediction.pilot_iterations * costs.cost(plugin, (0.0, light, 0.0, 1.0))
 
 
-def _try_path(path, segments, pixels, mean):
-    """`path` on the pilot's pixels."""
+def _try_path(path, segments, pixels, mean, budget):
+    """`path` on the pilot's pixels, for a render of this `budget`."""
     passes = (
         PATH_TRIALS if mi.is_spectral else 1
     )  # wavelengths are shared by all that is traced at once
@@ -284,25 +295,32 @@ def _try_path(path, segments, pixels, mean):
     trial = lanes(at_once * count) // count
     values = []
     first = trial * (-count * stride % 2**32)  # back to the first pixel
-    for number in range(PILOT_INDEX, PILOT_INDEX + passes):
+    for number in range(passes):
+        spectral = path._spectral(TRIAL_INDEX + number)
         radiance, *_ = path.trace(
-            number, 0, first, stride, at_once * count, path._spectral(number), trial
+            TRIAL_INDEX, first, stride, at_once * count, spectral, trial + number
         )
         values += list(
             np.broadcast_to(np.array(channel_mean(radiance)), at_once * count).reshape(
                 at_once, count
             )
         )
-    path.sampler.seed(0, 1)
-    variance = trimmed_mean(relative_weights(mean) * np.var(values, axis=0, ddof=1))
-    return Trial(
-        "path",
-        {},
-        path,
-        0.0,
-        variance / path.camera_paths,
-        costs.cost("path", costs.events(path, segments, None, 0.0)) * path.camera_paths,
-    )
+    cost = costs.cost("path", costs.events(path, segments, None, 0.0))
+    samples = max(round(budget / cost), 1)
+    values, weights = np.array(values), relative_weights(mean)
+    if path.integrator.sampler == "independent":
+        variance = trimmed_mean(weights * np.var(values, axis=0, ddof=1))
+    else:  # `Trial.error` divides by the samples
+        variance = samples * _variance_of_samples(values, weights, samples)
+    return Trial("path", {}, path, 0.0, variance / path.camera_paths, cost * path.camera_paths)
+
+
+def _variance_of_samples(values, weights, samples):
+    """Relative variance of the mean of so many samples a pixel: what `values` (trials, pixels) of
+    samples that are consecutive in the pixels' sequences extrapolate to."""
+    lengths, found, counts = contrasts(values, np.ones(len(values), bool), 1)
+    pooled = [[trimmed_mean(weights * contrast)] for contrast in found]
+    return float(extrapolated(lengths, np.array(pooled), counts, samples)[0])
 
 
 def _worse(trials, budget):

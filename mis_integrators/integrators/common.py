@@ -11,15 +11,22 @@ import numpy as np
 
 from ..core.film import Accumulator, shared_wavelengths, variance_channels
 from ..core.packing import rounded_up
-from ..core.random import mix
+from ..core.random import mix, reversed_bits
 from ..core.recording import settle
 from ..core.render_lock import RENDER_LOCK, under_render_lock
+from ..core.sequences import SampleSequence
 from ..core.traits import UnsupportedScene, check_film, check_scene, check_variant, unfinite_data
 from ..core.untrusted import Fields
 from ..paths.camera import film_sample_count, with_gaps
 from ..paths.setting import CameraPass, LightPass, Limits
+from ..pilot.run import PILOT_INDEX
 from .parameters import Parameters
 
+SAMPLERS = "sobol", "independent"
+"""Values of the parameter `sampler`; the first is the default."""
+
+RENDER = 1 << 40
+"""In the place of an iteration's number: seeds that all iterations of a render share."""
 MOST_PATHS = 2**32 - 1
 """Camera paths of an iteration at most: their numbers have 32 bits."""
 MOST_LIGHT_PATHS = 2**28
@@ -27,7 +34,7 @@ MOST_LIGHT_PATHS = 2**28
 
 
 class IterativeIntegrator(mi.AdjointIntegrator):
-    """Base of integrators that render by independent iterations and average them.
+    """Base of integrators that render by iterations and average them.
 
     A subclass reads its own parameters in `read_parameters` and makes the object that runs
     iterations in `new_session`.
@@ -45,6 +52,8 @@ class IterativeIntegrator(mi.AdjointIntegrator):
         self.hide_emitters = parameters.boolean("hide_emitters", False)
         self.camera_paths = parameters.integer("camera_paths", *self.CAMERA_PATHS)
         self.variance = parameters.boolean("variance", False)
+        self.sampler = parameters.choice("sampler", SAMPLERS[0], SAMPLERS)
+        self.warned_of_sampler = False
         self.read_parameters(parameters)
         parameters.finish()
         super().__init__(props)
@@ -82,6 +91,7 @@ class IterativeIntegrator(mi.AdjointIntegrator):
             "hide_emitters": self.hide_emitters,
             "camera_paths": self.camera_paths,
             "variance": self.variance,
+            "sampler": self.sampler,
         }
 
     def session(self, scene, sensor=0, seed=0, spp=0):
@@ -133,6 +143,23 @@ class IterativeIntegrator(mi.AdjointIntegrator):
                 f"camera_paths = {camera_paths}",
             )
 
+    def about_samplers(self, sensors):
+        """Lines that say which kinds of samplers of these sensors are not used. (`independent`,
+        Mitsuba's default, asks for nothing.)"""
+        kinds = {sensor.sampler().class_name() for sensor in sensors} - {"IndependentSampler"}
+        return [
+            f"{self.plugin}: of the sensor's {kind}, nothing but the sample count is used; random "
+            f'numbers are those of the parameter "sampler" = {self.sampler}'
+            for kind in sorted(kinds)
+        ]
+
+    def say_sampler(self, sensors):
+        """Warns, once, where samplers of these sensors are not used."""
+        lines = self.about_samplers(sensors)
+        if lines and not self.warned_of_sampler:
+            self.warned_of_sampler = True
+            mi.Log(mi.LogLevel.Warn, "; ".join(lines))
+
     def say_unfinite(self, session):
         """Warns where values of a session that are not finite were left out, and names the data of
         the scene that may be to blame."""
@@ -162,6 +189,7 @@ class IterativeIntegrator(mi.AdjointIntegrator):
             spp = spp or sensor.sampler().sample_count()
             session = self.session(scene, sensor, seed, spp)
             self.say_rounded(session, spp)
+            self.say_sampler([sensor])
             for _ in range(session.iterations_planned):
                 session.iterate()
             with RENDER_LOCK:
@@ -185,8 +213,9 @@ class IterativeSession:
     """Runs iterations and accumulates them; a subclass implements `_iteration(index) -> block
     tensor`.
 
-    `seed` is an integer; iteration `i` draws all its random numbers from (seed, i), so iterations
-    are independent and any subset of them can be rendered anywhere.
+    `seed` is an integer; iteration `i` draws all its random numbers from (seed, i), so any subset
+    of the iterations can be rendered anywhere. They are independent, or parts of sequences
+    (`sampler`).
     """
 
     def __init__(self, integrator, scene, sensor, seed, iterations):
@@ -194,7 +223,9 @@ class IterativeSession:
         self.limits = Limits(integrator.max_depth, integrator.rr_depth, integrator.hide_emitters)
         self.iterations_planned = iterations
         self.camera_paths = integrator.initial_camera_paths
-        self.accumulator = Accumulator(sensor.film(), integrator.variance)
+        self.accumulator = Accumulator(
+            sensor.film(), integrator.variance, stratified=integrator.sampler == "sobol"
+        )
         self.variant = mi.variant()
         settle(scene)
 
@@ -260,6 +291,11 @@ class IterativeSession:
         self.camera_paths = camera_paths
 
     @property
+    def remarks(self):
+        """What the user should know, line by line."""
+        return self.integrator.about_samplers([self.sensor])
+
+    @property
     def settings(self):
         """Names and values that reproduce the image, together with the scene."""
         return {
@@ -304,17 +340,18 @@ class IterativeSession:
         self.chunk = -(-self.path_count // (self.chunks * self.camera_paths)) * self.camera_paths
 
     @staticmethod
-    def describe_light_pass(sensor, seed, count, spectral):
-        """`count` light sub-paths under the wavelengths of an iteration."""
+    def describe_light_pass(sensor, sequence, count, spectral, first=0):
+        """`count` light sub-paths, from number `first` on, under the wavelengths of an
+        iteration."""
         shutter = sensor.shutter_open(), sensor.shutter_open_time()
-        return LightPass(seed, count, spectral["wavelengths"], *shutter)
+        return LightPass(sequence, count, spectral["wavelengths"], *shutter, first)
 
-    def describe_camera_pass(self, sensor, seed, first, spectral):
+    def describe_camera_pass(self, sensor, sequence, first, spectral):
         """The camera paths of a part, from number `first` on."""
         return CameraPass(
             sensor,
             self.integrator,
-            seed,
+            sequence,
             first,
             self.chunk,
             self.camera_paths,
@@ -358,10 +395,32 @@ class IterativeSession:
     def _spectral(self, iteration):
         """The wavelengths that all sub-paths of an iteration share, the sample that makes them, and
         their conversion to colour."""
-        return shared_wavelengths(self.sensor, mix(self.seed, iteration, self.WAVELENGTH))
+        if self._low_discrepancy(iteration):
+            number = reversed_bits(iteration) ^ mix(self.seed, RENDER, self.WAVELENGTH)
+        else:
+            number = mix(self.seed, iteration, self.WAVELENGTH)
+        return shared_wavelengths(self.sensor, number)
+
+    def _low_discrepancy(self, iteration):
+        return self.integrator.sampler == "sobol" and iteration < PILOT_INDEX
 
     def _seed(self, iteration, *purpose):
         return dr.opaque(mi.UInt32, mix(self.seed, iteration, *purpose))
+
+    def _sequence(self, iteration, purpose, group_size):
+        """The random numbers of a pass whose groups have `group_size` paths an iteration each: all
+        paths of a group, over the iterations, share a low-discrepancy sequence. Pilots draw
+        independent numbers: their laws are about these."""
+        low_discrepancy = self._low_discrepancy(iteration)
+        first = iteration * group_size
+        return SampleSequence(
+            self._seed(RENDER, purpose, first >> 32)
+            if low_discrepancy
+            else self._seed(iteration, purpose),
+            dr.opaque(mi.UInt32, first % 2**32),
+            group_size,
+            low_discrepancy,
+        )
 
     def _grown(self, name, count):
         """Whether the `count` (an array of width one) found more than there is room for in the

@@ -30,6 +30,12 @@ def events(session, segments, last_vertex, gathered):
     return camera, light, gathered, 1.0
 
 
+def of_direct_paths(session, segments):
+    """Cost of the camera paths that see direct light only, beside the first: they are as far as the
+    first smooth vertex what `path` is, whose segments are the unit."""
+    return (getattr(session, "direct_paths", 1) - 1) * float(segments[0])
+
+
 def cost(plugin, counted, prices=PRICES):
     """Cost of an iteration of `plugin` with these events a pixel, in segments of `path`."""
     return sum(prices[plugin][name] * count for name, count in zip(EVENTS, counted))

@@ -189,28 +189,28 @@ class ResampledSession(IterativeSession):
 
     # ------------------------------------------------------------------ passes
 
-    def _trace_light(self, scene, sensor, tables, seed, spectral):
-        light_pass = self.describe_light_pass(sensor, seed, self.light_chunk, spectral)
+    def _trace_light(self, scene, sensor, tables, sequence, first, spectral):
+        light_pass = self.describe_light_pass(sensor, sequence, self.light_chunk, spectral, first)
         return trace_light_subpaths(
             self.world, self.limits, light_pass, self.weights(), self.capacity["light"]
         )
 
-    def _trace_camera(self, scene, sensor, tables, seed, first, skip, spectral):
+    def _trace_camera(self, scene, sensor, tables, sequence, first, skip, spectral):
         first = with_gaps(first, skip, self.chunk, self.camera_paths)
         return trace_camera_vertices(
             self.world,
             self.limits,
-            self.describe_camera_pass(sensor, seed, first, spectral),
+            self.describe_camera_pass(sensor, sequence, first, spectral),
             self.weights(),
             self.ratio,
             self.capacity["camera"],
             self.capacity["hits"],
         )
 
-    def _starts(self, sensor, seed, spectral):
+    def _starts(self, sensor, sequence, spectral):
         return sample_light_starts(
             self.lights,
-            seed,
+            sequence,
             self.integrator.resampled_light_paths,
             spectral["wavelengths"],
             mi.Float(sensor.shutter_open()),
@@ -223,7 +223,7 @@ class ResampledSession(IterativeSession):
             self.traits, self.lights, starts, M, light, places, kept + M, self.reach
         )
 
-    def _targets(self, scene, sensor, tables, seed, subpaths, first, cache, spectral, target):
+    def _targets(self, scene, sensor, tables, sequence, subpaths, first, cache, spectral, target):
         """q*/p of every light vertex of M sub-paths (from the number `first` on) at every cache
         point if nothing stood between, row by row; whether nothing does; what makes their
         `LightVertices`; how many vertices they have; `guessed_weight`. `subpaths`: as of
@@ -233,7 +233,7 @@ class ResampledSession(IterativeSession):
         places, found = list_light_vertices(
             light, count, lengths, first, M, self.capacity["light"], room
         )
-        starts = self._starts(sensor, seed, spectral)
+        starts = self._starts(sensor, sequence, spectral)
         ends = self._ends(starts, light, places, found)
         index = lanes(dr.width(cache["depth"]) * (M + room))
         width = dr.opaque(mi.UInt32, M + room)
@@ -268,7 +268,7 @@ class ResampledSession(IterativeSession):
             guessed_weight(z, sent),
         )
 
-    def _own_targets(self, scene, sensor, tables, seed, subpaths, cache, spectral):
+    def _own_targets(self, scene, sensor, tables, sequence, subpaths, cache, spectral):
         """What pmfs are made of: q*/p of the first M sub-paths for the target at hand, times the
         guessed weight; then as of `_targets`."""
         target = self.integrator.target
@@ -276,7 +276,7 @@ class ResampledSession(IterativeSession):
             scene,
             sensor,
             tables,
-            seed,
+            sequence,
             subpaths,
             mi.UInt32(0),
             cache,
@@ -285,12 +285,12 @@ class ResampledSession(IterativeSession):
         )
         return dr.select(r > 0, r * guess, 0), *others
 
-    def _pilot_targets(self, scene, sensor, tables, seed, subpaths, first, cache, spectral):
+    def _pilot_targets(self, scene, sensor, tables, sequence, subpaths, first, cache, spectral):
         return self._targets(
             scene,
             sensor,
             tables,
-            seed,
+            sequence,
             subpaths,
             first,
             cache,
@@ -314,7 +314,8 @@ class ResampledSession(IterativeSession):
         camera,
         count,
         proposals,
-        seed,
+        sequence,
+        first,
         spectral,
     ):
         """Radiance of camera paths with that of connections of their `count` vertices to drawn
@@ -332,9 +333,8 @@ class ResampledSession(IterativeSession):
         slot = index // integrator.resamples
         active = slot < dr.gather(mi.UInt32, count, 0)
         z = read_vertices(camera, slot, active, states=STEP)
-        rng = vertex_streams(
-            z["path"] * integrator.resamples + index % integrator.resamples, z["number"], seed
-        )
+        number = (first + z["path"]) * integrator.resamples + index % integrator.resamples
+        rng = sequence.of_paths(number).at(z["number"])
         row = self.grid.row(z["p"], seen_normal(z))
         drawn = pmf.draw(row, rng, active)
         active &= drawn < dr.gather(mi.UInt32, ends.count, 0)
@@ -508,7 +508,7 @@ class ResampledSession(IterativeSession):
                     self.scene,
                     self.sensor,
                     self._tables,
-                    self._seed(PILOT, START, k),
+                    self._sequence(PILOT + k, START, M),
                     light,
                     dr.opaque(mi.UInt32, k * M),
                     cache,
@@ -531,7 +531,12 @@ class ResampledSession(IterativeSession):
         """What `trace_light_subpaths` returns."""
         while True:
             light = self._light_pass(
-                self.scene, self.sensor, self._tables, self._seed(iteration, LIGHT, chunk), spectral
+                self.scene,
+                self.sensor,
+                self._tables,
+                self._sequence(iteration, LIGHT, self.integrator.resampled_light_paths),
+                dr.opaque(mi.UInt32, chunk * self.light_chunk),
+                spectral,
             )
             if not self._grown("light", light[1]):
                 return light
@@ -543,7 +548,7 @@ class ResampledSession(IterativeSession):
                 self.scene,
                 self.sensor,
                 self._tables,
-                self._seed(iteration, CAMERA),
+                self._sequence(iteration, CAMERA, self.camera_paths),
                 *self.all_over_the_film(chunk),
                 spectral,
             )
@@ -569,7 +574,7 @@ class ResampledSession(IterativeSession):
                 self.scene,
                 self.sensor,
                 self._tables,
-                self._seed(iteration, START),
+                self._sequence(iteration, START, self.integrator.resampled_light_paths),
                 light,
                 self.cache,
                 spectral,
@@ -589,7 +594,8 @@ class ResampledSession(IterativeSession):
             camera,
             count,
             proposals,
-            self._seed(iteration, DRAW, chunk),
+            self._sequence(iteration, DRAW, self.integrator.resamples),
+            dr.opaque(mi.UInt32, chunk * self.chunk),
             spectral,
         )
         radiance = self._hit_pass(self._tables, radiance, camera, hits, hit_count)

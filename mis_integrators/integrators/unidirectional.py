@@ -17,8 +17,29 @@ BUSY = 1 << 19
 slower."""
 CHUNK = 1 << 21
 """Camera paths traced at once at most (bounds memory)."""
-PATHS, SAMPLER = 0, 2
-"""Purposes of an iteration's random seeds, besides `PathSession.WAVELENGTH`."""
+PATHS = 0
+"""Purpose of an iteration's random seeds, besides `PathSession.WAVELENGTH`."""
+
+
+class PathSampler(mi.Sampler):
+    """Hands the numbers of paths to Mitsuba's own integrators. Every draw stands for a vertex of
+    its own, counted from `first_draw`: Dr.Jit's loops carry the count along."""
+
+    def __init__(self, numbers, first_draw=1):
+        super().__init__(mi.Properties())
+        self.numbers = numbers
+        self.draw = mi.UInt32(first_draw)
+
+    def _next(self, dimensions):
+        found = self.numbers.at(self.draw).next_floats(dimensions)
+        self.draw += 1
+        return found
+
+    def next_1d(self, active=True):
+        return self._next(1)[0]
+
+    def next_2d(self, active=True):
+        return mi.Point2f(*self._next(2))
 
 
 class PathSession(IterativeSession):
@@ -37,7 +58,6 @@ class PathSession(IterativeSession):
                 "hide_emitters": integrator.hide_emitters,
             }
         )
-        self.sampler = mi.load_dict({"type": "independent"})
         if not integrator.camera_paths and iterations is None:
             self.camera_paths = max(1, BUSY // film_sample_count(sensor))
         self.split_paths(CHUNK)
@@ -56,19 +76,19 @@ class PathSession(IterativeSession):
         fields.finish()
         self.split_paths(CHUNK)
 
-    def trace(self, iteration, chunk, first, stride, paths, spectral, variation=0):
+    def trace(self, iteration, first, stride, paths, spectral, variation=0):
         """Radiance and alpha of camera paths `first`, `first + stride`, ..., and their positions on
-        the film. Where `first` and `variation` are arrays, each lane has its own, and the paths of
-        one number differ with the variation."""
-        seed = self._seed(iteration, PATHS) + variation
+        the film. Where `first` and `variation` are arrays, each lane has its own; the variations of
+        a pixel's first path are parts of one sequence."""
+        sequence = self._sequence(iteration, PATHS, self.camera_paths)
+        sequence.first += variation
         camera_pass = CameraPass(
-            self.sensor, None, seed, first, paths, self.camera_paths, spectral["sample"], stride
+            self.sensor, None, sequence, first, paths, self.camera_paths, spectral["sample"], stride
         )
-        _, active, _, ray, weight, position, _ = start_camera_paths(camera_pass)
+        _, active, numbers, ray, weight, position, _ = start_camera_paths(camera_pass)
         differential = mi.RayDifferential3f(ray)
-        self.sampler.seed(self._seed(iteration, SAMPLER, chunk), paths)
         radiance, valid, _ = self.path_integrator.sample(
-            self.scene, self.sampler, differential, None, active
+            self.scene, PathSampler(numbers), differential, None, active
         )
         return (
             dr.select(active, weight * radiance, 0),
@@ -82,7 +102,7 @@ class PathSession(IterativeSession):
 
         def render(chunk, first):
             radiance, alpha, position, active = self.trace(
-                iteration, chunk, first, 1, self.chunk, spectral
+                iteration, first, 1, self.chunk, spectral
             )
             return (
                 splat_samples(
@@ -91,7 +111,4 @@ class PathSession(IterativeSession):
             )
 
         (block,) = self.sum_of_chunks(render)
-        # Else the sampler's unused final state would be computed with the next iteration, by
-        # tracing these paths again.
-        self.sampler.seed(0, 1)
         return block

@@ -15,7 +15,7 @@ from ..photons.gather import KeptVertices, gather_photons
 from ..photons.grid import smallest_cell
 from ..photons.vertex_map import state_of, vertex_map
 from ..pilot.run import PILOT_INDEX
-from .bdpt import BDPT, BDPTSession
+from .bdpt import BDPT, CAMERA, BDPTSession
 from .common import MOST_LIGHT_PATHS
 from .schedule import LARGEST_RADIUS, SMALLEST_RADIUS, read_radius, shrunk
 
@@ -47,7 +47,7 @@ class VCM(BDPT):
        - |float|
        - Radius reduction of progressive photon mapping, in (0, 1]: iteration i uses R_i^2 = R_0^2
          (i + 1)^(alpha - 1). 1 keeps the radius. (Default: 1)
-     * - camera_paths, variance, max_depth, rr_depth, hide_emitters
+     * - camera_paths, variance, max_depth, rr_depth, hide_emitters, sampler
        -
        - As of :monosp:`bdpt`.
 
@@ -147,7 +147,7 @@ class VCMSession(BDPTSession):
                 self.scene,
                 self.sensor,
                 self._tables,
-                self._seed(PILOT_INDEX, 0),
+                self._sequence(PILOT_INDEX, CAMERA, self.camera_paths),
                 *self.all_over_the_film(),
                 spectral,
             )

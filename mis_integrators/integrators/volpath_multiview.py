@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.film import colour_channels, colour_matrix
-from ..core.random import mix, streams
+from ..core.random import mix
 from ..core.recording import recorder
 from ..core.render_lock import under_render_lock
 from ..core.traits import UnsupportedScene, check_film, check_variant
@@ -33,7 +33,7 @@ FEWEST = 1 << 12
 """Camera paths that a part has at least."""
 LAUNCH = 1 << 16
 """Camera paths that are worth a launch: of fewer, the longest keep the others waiting."""
-PATHS, WAVELENGTH = range(2)
+PATHS, WAVELENGTH, EVEN, ODD = range(4)
 """Purposes of an iteration's random seeds."""
 
 
@@ -82,6 +82,11 @@ class VolpathMultiview(IterativeIntegrator):
      * - hide_emitters
        - |bool|
        - Hide directly visible emitters. (Default: no, i.e. |false|)
+     * - sampler
+       - |string|
+       - Random numbers of sub-paths: ``sobol``, scrambled Sobol' sequences, one a pixel over all
+         iterations; or ``independent``. The scene's ``<sampler>`` is not used but for its sample
+         count. (Default: ``sobol``)
 
     The views are the children of a ``batch`` sensor, side by side on its film, or one sensor, or
     any list of sensors through ``mis_integrators.render_views``. Each view's camera paths are
@@ -183,6 +188,10 @@ class MultiViewSession(IterativeSession):
     def settings(self):
         return {**super().settings, "views": self.views.count}
 
+    @property
+    def remarks(self):
+        return self.integrator.about_samplers(self.views.groups)
+
     def _freeze(self):
         """Records the passes anew."""
         self._tables = [
@@ -211,16 +220,16 @@ class MultiViewSession(IterativeSession):
 
     # ------------------------------------------------------------------ passes
 
-    def _trace_first(self, scene, tables, number, seed, spectral):
+    def _trace_first(self, scene, tables, number, seed, sequence, spectral):
         integrator = self.integrator
         active = (number < self.views.paths) & (integrator.max_depth != 0)
-        pivot, radiance, _ = trace_first_segments(
+        pivot, radiance = trace_first_segments(
             scene,
             self.views,
             self.traits,
             number,
             seed,
-            streams(number, seed),
+            sequence.of_paths(number),
             spectral["wavelengths"],
             spectral["weight"],
             integrator.hide_emitters,
@@ -298,7 +307,7 @@ class MultiViewSession(IterativeSession):
             number < self.views.paths,
         )
 
-    def _continue(self, scene, tables, pivot, connections, number, seed):
+    def _continue(self, scene, tables, pivot, connections, number, seed, sequence):
         integrator = self.integrator
         return continue_paths(
             scene,
@@ -309,6 +318,7 @@ class MultiViewSession(IterativeSession):
             connections,
             number,
             seed,
+            sequence.of_paths(number),
             self.views.count,
             integrator.max_depth,
             integrator.rr_depth,
@@ -364,8 +374,12 @@ class MultiViewSession(IterativeSession):
 
     def _run(self, iteration):
         seed, spectral = self._seed(iteration, PATHS), self._spectral(iteration)
+        # Even and odd iterations are independent: what each learns serves the others (`films`).
+        half, parity = divmod(iteration, 2)
+        sequence = self._sequence(half, (EVEN, ODD)[parity], self.camera_paths)
         layers = [
-            self._part(first, seed, spectral) for first in range(0, self.views.paths, self.paths)
+            self._part(first, seed, sequence, spectral)
+            for first in range(0, self.views.paths, self.paths)
         ]
         self.accumulator.add(*(sum(layer[1:], layer[0]) for layer in zip(*layers)), iteration)
 
@@ -373,13 +387,13 @@ class MultiViewSession(IterativeSession):
         """As of other sessions, with all pixels of all views in one row: (1, pixels, 3)."""
         return self.accumulator.estimate()
 
-    def _part(self, first, seed, spectral):
+    def _part(self, first, seed, sequence, spectral):
         """One part of an iteration: its layers."""
         numbers = dr.arange(mi.UInt32, self.paths) + dr.opaque(mi.UInt32, first)
         dr.eval(numbers)
         while True:
             pivots, radiance, lines, found = self._first_pass(
-                self.scene, self._tables, numbers, seed, spectral
+                self.scene, self._tables, numbers, seed, sequence, spectral
             )
             connections, more = None, mi.UInt32(0)
             if self.views.count > 1:
@@ -398,7 +412,7 @@ class MultiViewSession(IterativeSession):
                 )
                 dr.eval(connections)
             suffixes, value = self._suffix_pass(
-                self.scene, self._tables, pivots, connections, numbers, seed
+                self.scene, self._tables, pivots, connections, numbers, seed, sequence
             )
             dr.eval(suffixes, value)
             layers = self._splat_pass(
@@ -497,6 +511,7 @@ def render_views(scene, integrator=None, spp=0, seed=0):
         spp = spp or max((sensor.sampler().sample_count() for sensor in scene.sensors()), default=1)
         session = integrator.views_session(scene, seed, spp)
         integrator.say_rounded(session, spp)
+        integrator.say_sampler(session.views.groups)
         for _ in range(session.iterations_planned):
             session.iterate()
         integrator.say_unfinite(session)

@@ -15,7 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.packing import from_numpy
-from ..core.random import next_2d, streams
+from ..core.random import next_1d_and_2d, next_2d, next_floats, streams
 from ..core.spectra import channel_mean
 from ..core.traits import UnsupportedScene, lookup, registry_table
 from .environment_guide import AIMED_SHARE, EnvironmentGuide, direction_cell, infinite_emitters
@@ -288,11 +288,12 @@ class Lights:
         nothing can be sampled), and the density per solid angle with the emitter's choice included;
         `ds.delta` marks emitters that no ray can meet.
         """
-        index, probability = self.choice.sample(
-            rng.next_float32(active) if self.choice.count > 1 else mi.Float(0)
-        )
+        if self.choice.count > 1:
+            choice, sample = next_1d_and_2d(rng, active)
+        else:
+            choice, sample = mi.Float(0), next_2d(rng, active)
+        index, probability = self.choice.sample(choice)
         emitter = self.pointer(index)
-        sample = next_2d(rng, active)
         textured = active & self._textured_mask(emitter) if self.has_textured else mi.Bool(False)
         if self._aims:
             aims = (
@@ -440,7 +441,8 @@ class Lights:
             rng.next_float32() if self.choice.count > 1 else mi.Float(0)
         )
         emitter = self.pointer(index)
-        sample_a, sample_b = next_2d(rng), next_2d(rng)
+        a, b, c, d = next_floats(rng, 4)
+        sample_a, sample_b = mi.Point2f(a, b), mi.Point2f(c, d)
         extra = rng.next_float32() if self.guide is not None else mi.Float(0)
         kind = (
             mi.UInt32(_KINDS.index(self.kinds[0]))

@@ -8,7 +8,7 @@ from typing import Any, Protocol
 import drjit as dr
 import mitsuba as mi
 
-from ..core.random import next_2d, streams
+from ..core.random import next_1d_and_2d, next_2d
 from .camera_rays import sample_camera_ray
 from .roulette import russian_roulette
 from .setting import CameraPass, Limits, World
@@ -16,16 +16,14 @@ from .setting import CameraPass, Limits, World
 Array = Any
 
 
-def film_samples(sensor, index, camera_paths: int, rng):
-    """Film positions of camera paths `index` (in pixels, crop offset included), in the order pixel
-    by pixel, row by row.
+def film_samples(sensor, pixel, rng):
+    """Film positions in pixels, which are numbered row by row (crop offset included).
 
     Returns `(position in [0, 1]^2 of the crop window, position for splatting)`; with a film that
     samples its border the grid covers the border too, as in Mitsuba's own integrators.
     """
     film = sensor.film()
     width, _ = film_size(sensor)
-    pixel = index // camera_paths
     corner = (
         mi.Vector2i(mi.Int32(pixel % width), mi.Int32(pixel // width))
         - border_size(film)
@@ -68,16 +66,16 @@ def within_crop(film, splat):
 def start_camera_paths(camera_pass: CameraPass):
     """Camera rays of a pass.
 
-    Returns `(path, active, rng, ray, weight, splat, aperture)`: the index of each, whether there is
-    a path of that number, its random numbers, the ray and its weight, the position for splatting,
-    and the sample that chose the point of the lens.
+    Returns `(path, active, numbers, ray, weight, splat, aperture)`: the index of each, whether
+    there is a path of that number, its random numbers (`PathNumbers`), the ray and its weight, the
+    position for splatting, and the sample that chose the point of the lens.
     """
-    sensor, camera_paths = camera_pass.sensor, camera_pass.camera_paths
-    path = dr.arange(mi.UInt32, camera_pass.count)
-    number = path * camera_pass.stride + camera_pass.first
-    active = number < film_sample_count(sensor) * camera_paths
-    rng = streams(number, camera_pass.seed)
-    unit, splat = film_samples(sensor, number, camera_paths, rng)
+    sensor = camera_pass.sensor
+    path = dr.arange(mi.UInt32, camera_pass.lanes)
+    pixel, numbers = _pixels_and_numbers(camera_pass, path)
+    active = pixel < film_sample_count(sensor)
+    rng = numbers.at(0)
+    unit, splat = film_samples(sensor, pixel, rng)
     aperture = next_2d(rng) if sensor.needs_aperture_sample() else mi.Point2f(0.5)
     time = mi.Float(sensor.shutter_open())
     if sensor.shutter_open_time() > 0:
@@ -85,7 +83,24 @@ def start_camera_paths(camera_pass: CameraPass):
     ray, weight = sample_camera_ray(
         sensor, time, camera_pass.wavelength_sample, unit, aperture, active
     )
-    return path, active, rng, mi.Ray3f(ray), weight, splat, aperture
+    return path, active, numbers, mi.Ray3f(ray), weight, splat, aperture
+
+
+def _pixels_and_numbers(camera_pass: CameraPass, path):
+    """The pixel of each path, and its random numbers (`PathNumbers`)."""
+    first, extra = camera_pass.first, camera_pass.extra
+    usual = path < camera_pass.count
+    if extra:
+        other = dr.select(usual, 0, path - camera_pass.count)
+        path = dr.select(usual, path, other // extra)
+        if dr.width(first) > 1:
+            first = dr.gather(mi.UInt32, first, path)
+    number = path * camera_pass.stride + first
+    numbers = camera_pass.sequence.of_paths(number)
+    if extra:
+        own = camera_pass.extra_sequence.of_paths(number * extra + other % extra)
+        numbers = numbers.where(usual, own)
+    return number // camera_pass.camera_paths, numbers
 
 
 def with_gaps(first, skip, n_paths: int, camera_paths: int):
@@ -168,13 +183,13 @@ def trace_camera(world: World, limits: Limits, camera_pass: CameraPass, visitor:
     scene, traits = world.scene, world.traits
     max_depth, rr_depth = limits.max_depth, limits.rr_depth
     hide_emitters = limits.hide_emitters
-    path, active, rng, ray, sensor_weight, splat, aperture = start_camera_paths(camera_pass)
+    path, active, numbers, ray, sensor_weight, splat, aperture = start_camera_paths(camera_pass)
     throughput = mi.Spectrum(sensor_weight)
     radiance = mi.Spectrum(0)
     depth = mi.UInt32(0)
     eta = mi.Float(1)
     context = mi.BSDFContext()
-    state = visitor.begin(camera_pass.count, splat, aperture)
+    state = visitor.begin(camera_pass.lanes, splat, aperture)
     visible = mi.Bool((scene.environment() is not None) and not hide_emitters)
     if dr.hint(max_depth == 0, mode="scalar"):
         active &= False
@@ -186,6 +201,7 @@ def trace_camera(world: World, limits: Limits, camera_pass: CameraPass, visitor:
     while dr.hint(active, label="camera sub-paths"):
         si = hit.compute_surface_interaction(ray, mi.RayFlags.All, active=active)
         depth += 1
+        rng = numbers.at(depth)
         at = CameraArrival(si, hit, ray, -ray.d, throughput, path, depth, visible, si.bsdf(ray))
 
         # ---- Emission met by the path
@@ -201,7 +217,7 @@ def trace_camera(world: World, limits: Limits, camera_pass: CameraPass, visitor:
         radiance += direct
 
         # ---- Go on
-        bs, weight = at.bsdf.sample(context, si, rng.next_float32(met), next_2d(rng, met), met)
+        bs, weight = at.bsdf.sample(context, si, *next_1d_and_2d(rng, met), met)
         delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         visible |= met & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
         state, weight, active = visitor.leave(state, at, rng, bs, weight, delta, active)

@@ -8,7 +8,7 @@ from typing import Any, Protocol
 import drjit as dr
 import mitsuba as mi
 
-from ..core.random import next_2d, streams
+from ..core.random import next_1d_and_2d, next_2d
 from ..core.traits import lookup
 from .roulette import russian_roulette
 from .setting import LightPass, Limits, World
@@ -79,8 +79,7 @@ def scatter_light(traits, si, bsdf, rng, active):
     bs, weight = bsdf.sample(
         mi.BSDFContext(mi.TransportMode.Importance),
         si,
-        rng.next_float32(active),
-        next_2d(rng, active),
+        *next_1d_and_2d(rng, active),
         active,
     )
     delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
@@ -155,7 +154,7 @@ def trace_light(world: World, limits: Limits, light_pass: LightPass, visitor: Li
     shutter_open, shutter_time = light_pass.shutter_open, light_pass.shutter_time
     lanes = lane_count(light_pass.count)
     lane = dr.arange(mi.UInt32, lanes)
-    rng = streams(lane, light_pass.seed)
+    sequence, first = light_pass.sequence, mi.UInt32(light_pass.first)
     count, stride = dr.opaque(mi.UInt32, light_pass.count), dr.opaque(mi.UInt32, lanes)
     next_path = mi.UInt32(lane)
     path = mi.UInt32(lane)
@@ -174,6 +173,7 @@ def trace_light(world: World, limits: Limits, light_pass: LightPass, visitor: Li
         begin = ~active & (next_path < count)
         source = dr.zeros(mi.DirectionSample3f)
         if begin:
+            rng = sequence.of_paths(first + next_path).at(0)
             time = mi.Float(shutter_open)
             if dr.hint(shutter_time > 0, mode="scalar"):
                 time += rng.next_float32() * shutter_time
@@ -192,6 +192,7 @@ def trace_light(world: World, limits: Limits, light_pass: LightPass, visitor: Li
         active &= hit.is_valid()
         si = hit.compute_surface_interaction(ray, mi.RayFlags.All, active=active)
         depth += 1
+        rng = sequence.of_paths(first + path).at(depth)
         at = LightArrival(
             si, hit, si.bsdf(ray), -ray.d, flux, path, depth, begin, source, had_delta, scattered
         )

@@ -6,13 +6,11 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from ..core.random import streams
 
-
-def sample_light_starts(lights, seed, count: int, wavelengths, time):
-    """`count` starts of light sub-paths: a dictionary of arrays `emitter`, `p` (of environments,
-    the unit vector towards it), `n`, `uv`, as `Lights.emitted` takes them."""
-    rng = streams(dr.arange(mi.UInt32, count), seed)
+def sample_light_starts(lights, sequence, count: int, wavelengths, time):
+    """`count` starts of light sub-paths, from a `SampleSequence`: a dictionary of arrays `emitter`,
+    `p` (of environments, the unit vector towards it), `n`, `uv`, as `Lights.emitted` takes them."""
+    rng = sequence.of_paths(dr.arange(mi.UInt32, count)).at(0)
     ray, _, _, source = lights.sample_emission(rng, time, wavelengths)
     p = source.p + dr.zeros(mi.Point3f, count)
     if "environment" in lights.kinds:

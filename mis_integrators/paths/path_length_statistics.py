@@ -9,6 +9,7 @@ import numpy as np
 
 from ..core.packing import Store
 from ..core.random import next_2d
+from ..core.sequences import SampleSequence
 from .camera import start_camera_paths
 from .roulette import russian_roulette
 from .setting import CameraPass
@@ -22,8 +23,17 @@ def count_segments(scene, sensor, seed, stride: int, paths: int, max_depth: int,
     """Segments of BSDF-sampled camera paths that end as those of Mitsuba's `path` do: an array
     (`SMOOTH_VERTICES` + 1,), mean over `paths` paths, numbers 0, `stride`, ...; entry k counts the
     segments that follow k smooth vertices (the last entry: or more)."""
-    camera_pass = CameraPass(sensor, None, seed, mi.UInt32(0), paths, 1, mi.Float(0.5), stride)
-    _, active, rng, ray, weight, _, _ = start_camera_paths(camera_pass)
+    camera_pass = CameraPass(
+        sensor,
+        None,
+        SampleSequence(seed, mi.UInt32(0), 1, False),
+        mi.UInt32(0),
+        paths,
+        1,
+        mi.Float(0.5),
+        stride,
+    )
+    _, active, numbers, ray, weight, _, _ = start_camera_paths(camera_pass)
     throughput = mi.Spectrum(weight)
     eta = mi.Float(1)
     depth, vertex = mi.UInt32(0), mi.UInt32(0)
@@ -35,6 +45,7 @@ def count_segments(scene, sensor, seed, stride: int, paths: int, max_depth: int,
         si = scene.ray_intersect(ray, active)
         dr.scatter_inc(store.counts, dr.minimum(vertex, SMOOTH_VERTICES), active)
         depth += 1
+        rng = numbers.at(depth)
         active &= si.is_valid()
         if dr.hint(max_depth > 0, mode="scalar"):
             active &= depth < max_depth

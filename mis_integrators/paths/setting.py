@@ -38,17 +38,19 @@ class Limits:
 
 @dataclass(frozen=True)
 class LightPass:
-    """`count` light sub-paths.
+    """`count` light sub-paths, numbers `first`, `first` + 1, ... of an iteration.
 
-    `seed`: uint32 of width one; `wavelengths` that they share (empty in rgb and mono variants);
-    `shutter_open`, `shutter_time`: when the shutter opens, and for how long.
+    `sequence`: their random numbers (a `SampleSequence`); `wavelengths` that they share (empty in
+    rgb and mono variants); `shutter_open`, `shutter_time`: when the shutter opens, and for how
+    long; `first`: uint32 of width one.
     """
 
-    seed: Array
+    sequence: Any
     count: int
     wavelengths: Array
     shutter_open: float = 0.0
     shutter_time: float = 0.0
+    first: Array = 0
 
 
 @dataclass(frozen=True)
@@ -56,16 +58,26 @@ class CameraPass:
     """`count` camera paths through a `sensor`: numbers `first`, `first + stride`, ... of
     `camera.film_samples`, where each pixel has `camera_paths`.
 
-    `integrator`: what moves rays on behind emitters that are hidden (None: none are); `seed`,
-    `first`: uint32 of width one, or one a path (see `camera.with_gaps`); `wavelength_sample`: in
-    [0, 1), makes the wavelengths that all paths share.
+    `integrator`: what moves rays on behind emitters that are hidden (None: none are);
+    `sequence`: their random numbers (a `SampleSequence`); `first`: uint32
+    of width one, or one a path (see `camera.with_gaps`); `wavelength_sample`: in
+    [0, 1), makes the wavelengths that all paths share; `extra`: further paths of the same pixel for
+    each of these, with random numbers of their own (`extra_sequence`); they follow after all of
+    these, those of a path side by side. What they are for is the visitor's affair.
     """
 
     sensor: Any
     integrator: Any
-    seed: Array
+    sequence: Any
     first: Array
     count: int
     camera_paths: int
     wavelength_sample: Array
     stride: int = 1
+    extra: int = 0
+    extra_sequence: Any = None
+
+    @property
+    def lanes(self) -> int:
+        """Camera paths in all."""
+        return self.count * (1 + self.extra)

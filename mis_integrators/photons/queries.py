@@ -71,6 +71,10 @@ class Queries:
     `bdd`: the last smooth camera vertex, counted from 0; `capacity`: vertices that there is room
     for (under weights, in each section); `has_caustics`, `has_indirect`: kinds of photons that
     there are; `one_vertex`: no path asks twice, and each owns the place of its number.
+
+    The first `paths` camera paths ask for photons (None: all). Others that follow see emission and
+    direct light at the first smooth vertex only, and all but this counts `boost` times with those
+    that ask.
     """
 
     bdd: int
@@ -78,14 +82,17 @@ class Queries:
     has_caustics: bool
     has_indirect: bool
     one_vertex: bool
+    paths: int | None = None
+    boost: int = 1
 
 
 class QueryVisitor:
     """Direct light, and vertices that wait for photons (a `CameraVisitor`).
 
-    Its state: smooth vertices left behind; whether the last vertex scattered by a delta function;
-    the density of the last smooth scattering; the last smooth vertex; the weight of direct light
-    there; and the state of `weights`.
+    Its state: smooth vertices left behind (the last one counts as the `bdd`-th); whether the last
+    vertex scattered by a delta function; the density of the last smooth scattering; the last smooth
+    vertex; the weight of direct light there; how many times light counts that is found there; and
+    the state of `weights`.
     """
 
     def __init__(self, world, limits, queries, weights):
@@ -102,10 +109,11 @@ class QueryVisitor:
     def begin(self, n_paths, splat, aperture):
         sums = [] if self.weights is None else self.weights.init(n_paths)
         origin = dr.zeros(mi.Interaction3f)
-        return [mi.UInt32(0), mi.Bool(False), mi.Float(1), origin, mi.Spectrum(1), sums]
+        one = mi.Float(1)
+        return [mi.UInt32(0), mi.Bool(False), one, origin, mi.Spectrum(1), mi.Float(one), sums]
 
     def emission(self, state, at, active):
-        vertex, behind_delta, scatter_pdf, origin, share_here, sums = state
+        vertex, behind_delta, scatter_pdf, origin, share_here, times, sums = state
         ds = mi.DirectionSample3f(self.scene, at.si, origin)
         shown = active & ((vertex == 0) | ~behind_delta)
         if self.hide_emitters:
@@ -117,30 +125,34 @@ class QueryVisitor:
         share = dr.select(
             vertex == 0, mi.Spectrum(1), mis_power(scatter_pdf, light_pdf) * share_here
         )
-        return dr.select(shown, at.throughput * share * ds.emitter.eval(at.si, shown), 0)
+        light = at.throughput * share * ds.emitter.eval(at.si, shown)
+        return dr.select(shown, light * times, 0)
 
     def unfinished(self, state):
         return state[0] <= self.bdd
 
     def arrive(self, state, at, rng, active):
-        vertex, behind_delta, scatter_pdf, origin, share_here, sums = state
+        vertex, behind_delta, scatter_pdf, origin, share_here, times, sums = state
         weights, bsdf = self.weights, at.bsdf
         smooth = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
         at.ends = vertex >= self.bdd  # the path's last smooth vertex
+        if self.queries.boost > 1:
+            at.ends |= ~self._asks(at)
+            times = dr.select(smooth & (vertex > 0), self.queries.boost, times)
         if weights is not None:
             sums, share = weights.propagate(sums, at.si, bsdf, vertex, smooth)
             share_here = dr.select(smooth, share, share_here)
             at.ends |= weights.ends(bsdf, vertex, smooth)
-        state = [vertex, behind_delta, scatter_pdf, origin, share_here, sums]
+        state = [vertex, behind_delta, scatter_pdf, origin, share_here, times, sums]
         direct = mi.Spectrum(0)
         if not self.lights.dark:
-            direct = self._direct(state, at, rng, smooth)
+            direct = self._direct(state, at, rng, smooth) * times
         self._ask_for_photons(state, at, smooth)
         return state, direct
 
     def _direct(self, state, at, rng, smooth):
         """Radiance of direct light at smooth vertices, by next-event estimation."""
-        vertex, _, _, _, share_here, sums = state
+        vertex, _, _, _, share_here, _, sums = state
         si, weights = at.si, self.weights
         ds, light, light_pdf = self.lights.sample_direct(si, rng, smooth)
         wo = si.to_local(ds.d)
@@ -152,12 +164,16 @@ class QueryVisitor:
         share = dr.select(ds.delta, 1, mis_power(light_pdf, response_pdf)) * share_here
         return dr.select(smooth, at.throughput * share * response * light, 0)
 
+    def _asks(self, at):
+        """Which paths ask for photons."""
+        return True if self.queries.paths is None else at.path < self.queries.paths
+
     def _ask_for_photons(self, state, at, smooth):
         """Stores the vertices at which photons are to be gathered."""
-        vertex, _, _, _, share_here, sums = state
+        vertex, _, _, _, share_here, _, sums = state
         weights, store, queries = self.weights, self.store, self.queries
         last = (vertex == self.bdd) | (weights is not None)
-        wants = smooth & (dr.max(at.throughput) > 0)
+        wants = smooth & (dr.max(at.throughput) > 0) & self._asks(at)
         if not queries.has_caustics:
             wants &= last & queries.has_indirect
         slot = mi.UInt32(at.path)
@@ -184,7 +200,7 @@ class QueryVisitor:
             weight_layout().write(store.vertices["weights"], state, slot, wants)
 
     def leave(self, state, at, rng, bs, weight, delta, active):
-        vertex, _, scatter_pdf, origin, share_here, sums = state
+        vertex, _, scatter_pdf, origin, share_here, times, sums = state
         if not self.traits.has_light_surfaces:
             active &= delta | ~at.ends
         scattered = active & ~delta
@@ -197,6 +213,7 @@ class QueryVisitor:
             dr.select(scattered, bs.pdf, scatter_pdf),
             dr.select(scattered, mi.Interaction3f(at.si), origin),
             share_here,
+            times,
             sums,
         ]
         return state, weight, active

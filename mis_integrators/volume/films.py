@@ -175,7 +175,7 @@ class ViewAccumulator:
     def variance(self):
         """Estimated variance of each pixel's mean (height, width, 3) from the iterations: that of Y
         - m D over W, or over the mean of D (delta method). The noise of emitters seen directly, if
-        any, is not in it."""
+        any, is not in it. Too large where iterations share low-discrepancy sequences."""
         n, total = dr.maximum(sum(self._counts()), 2), self.sums["shared0"] + self.sums["shared1"]
         mean = self._mean(total)
         rest = total[:, :, :3] - mean * total[:, :, 3:]

@@ -243,7 +243,10 @@ def follow_nulls(shift, pivot, own, line, common, number, seed, slots: int, acti
     while dr.hint(shifting, label="shifts"):
         sampled = shifting & (left > 0)
         adds = shifting & ~sampled
-        tau += dr.select(sampled, next_gap(gaps, sampled), 0)
+        gap = dr.select(
+            left == pivot["nulls"], pivot["gap"], next_gap(gaps, sampled & (left < pivot["nulls"]))
+        )
+        tau += dr.select(sampled, gap, 0)
         added += dr.select(adds, next_gap(additions, adds), 0)
         shifting &= sampled | (added < extra)
         place = dr.select(sampled, tau, added * dr.rcp(dr.maximum(extra_rate, 1e-30)))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from ..core.random import next_2d
+from ..core.random import next_1d_and_2d
 from ..lights.lights import mis_power
 from ..paths.roulette import russian_roulette
 from .media import collision, section, transmittance
@@ -20,12 +20,13 @@ def scattering_interaction(medium, p, wi, time, wavelengths):
 
 
 @dr.syntax
-def direct_light(scene, lights, traits, it, medium, transition, surface, rng, active):
+def direct_light(scene, lights, traits, it, medium, transition, surface, draws, rng, active):
     """Next-event estimation at interaction `it`, in `medium` or where `transition` between the
-    media of `surface`: `(ds, light, pdf, rng)`, the light's radiance over its density, attenuated
-    on the way, and the advanced generator."""
+    media of `surface`, with the random numbers `draws` and, on the way, those of `rng`: `(ds,
+    light, pdf, rng)`, the light's radiance over its density, attenuated on the way, and the
+    advanced generator."""
     rng = mi.PCG32(rng)
-    ds, light, pdf = lights.propose_direct(it, rng, active)
+    ds, light, pdf = lights.propose_direct(it, draws, active)
     lit = active & (dr.max(light) > 0)
     medium = mi.MediumPtr(medium)
     medium[lit & transition] = surface.target_medium(ds.d)
@@ -48,6 +49,8 @@ def incident_radiance(
     throughput,
     strength,
     depth,
+    numbers,
+    first_event,
     rng,
     max_depth: int,
     rr_depth: int,
@@ -59,6 +62,10 @@ def incident_radiance(
     `origin` is the interaction that the ray leaves, `scatter_pdf` the density of its direction
     (unless `specular`), `depth` the number of scattering vertices so far with that one, `strength`
     a factor by which roulette takes the throughput for larger than it is.
+
+    What is met, a scattering or a surface, is an event; the first has the number `first_event`.
+    An event, and the flight towards it up to the first tentative collision, draw the path's
+    `numbers` (`PathNumbers`), all other collisions those of `rng`.
     """
     ray = mi.Ray3f(ray)
     rng = mi.PCG32(rng)
@@ -68,6 +75,7 @@ def incident_radiance(
     specular = mi.Bool(specular)
     throughput = mi.Spectrum(throughput)
     depth = mi.UInt32(depth)
+    event = mi.UInt32(first_event)
     active = mi.Bool(active)
     radiance = mi.Spectrum(0)
     eta = mi.Float(1)
@@ -80,19 +88,23 @@ def incident_radiance(
         look = active & fresh
         surface[look] = scene.ray_intersect(ray, mi.RayFlags.All, False, look)
         fresh = mi.Bool(False)
+        draws = numbers.at(event)
 
         # ---- Free flight
         inside = active & (medium != None)  # noqa: E711 (array comparison)
         stretch = mi.Ray3f(ray)
         stretch.maxt = dr.minimum(ray.maxt, surface.t)
         near, far, majorant = section(medium, stretch, inside)
-        t = near - dr.log(1 - rng.next_float32(inside)) * dr.rcp(dr.maximum(majorant, 1e-30))
+        later = inside & ~look
+        flight = dr.select(look, draws.next_float32(), rng.next_float32(later))
+        t = near - dr.log(1 - flight) * dr.rcp(dr.maximum(majorant, 1e-30))
         collided = inside & (majorant > 0) & (t < far)
         p = ray(t)
         null, real, probability = collision(
             medium, p, majorant, ray.time, ray.wavelengths, collided
         )
-        passes = collided & (rng.next_float32(collided) < probability)
+        chance = dr.select(look, draws.next_float32(), rng.next_float32(collided & ~look))
+        passes = collided & (chance < probability)
         scatters = collided & ~passes
         throughput = dr.select(
             passes, throughput * null, dr.select(scatters, throughput * real, throughput)
@@ -119,7 +131,7 @@ def incident_radiance(
         reference = dr.zeros(mi.Interaction3f)
         reference[active] = here
         if dr.hint(not lights.dark, mode="scalar"):
-            ds, light, pdf = lights.propose_direct(reference, rng, lit)
+            ds, light, pdf = lights.propose_direct(reference, draws, lit)
             on_surface, in_medium = lit & met, lit & ~met
             response, response_pdf = bsdf.eval_pdf(
                 context, surface, surface.to_local(ds.d), on_surface
@@ -138,13 +150,12 @@ def incident_radiance(
             radiance[lit] += gain * kept
 
         # ---- Scattering in a medium
-        wo, phase_weight, phase_pdf = phase.sample(
-            phase_context, mei, rng.next_float32(scatters), next_2d(rng, scatters), scatters
-        )
+        choice, point = next_1d_and_2d(draws)
+        wo, phase_weight, phase_pdf = phase.sample(phase_context, mei, choice, point, scatters)
         scatters &= phase_pdf > 0
 
         # ---- Scattering at a surface
-        bs, weight = bsdf.sample(context, surface, rng.next_float32(met), next_2d(rng, met), met)
+        bs, weight = bsdf.sample(context, surface, choice, point, met)
         met &= dr.max(weight) > 0
         crosses = met & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
         bounces = met & ~crosses
@@ -167,12 +178,13 @@ def incident_radiance(
         scatter_pdf[vertex] = dr.select(scatters, phase_pdf, bs.pdf)
         specular[vertex] = delta
         depth[vertex] += 1
+        event[vertex | crosses] += 1
         medium[met & surface.is_medium_transition()] = surface.target_medium(ray.d)
         active &= passes | vertex | crosses
         if dr.hint(max_depth > 0, mode="scalar"):
             active &= depth < max_depth
         begun = vertex & (depth >= rr_depth)
         throughput, active = russian_roulette(
-            rng, throughput, dr.max(throughput) * strength, eta, begun, active
+            draws, throughput, dr.max(throughput) * strength, eta, begun, active
         )
     return radiance

@@ -15,14 +15,17 @@ NOWHERE, IN_MEDIUM, ON_SURFACE = range(3)
 SHARED, OWN = 0, 1
 """Whether other views may join at the pivot, or the path goes on by a delta function and is its own
 view's alone."""
+CAMERA, FIRST_SEGMENT, PIVOT, LATER = range(4)
+"""Where a path's numbers are drawn (`PathNumbers.at`); what is met after the pivot is counted from
+`LATER`."""
 
 NULL_SALT, ADDED_SALT = 0x6E756C6C, 0x61646465
 
 
 def null_stream(number, seed):
-    """The random numbers that place a path's null interactions: optical depths between tentative
-    collisions on the first segment. They can be drawn again wherever the interactions are needed,
-    so none is stored."""
+    """The random numbers that place a path's null interactions: optical depths from one tentative
+    collision to the next on the first segment. They can be drawn again wherever the interactions
+    are needed, so none is stored, except for the `gap` before the first one."""
     return streams(number, seed ^ NULL_SALT)
 
 
@@ -47,12 +50,22 @@ def passing(bsdf, surface, active):
 
 @dr.syntax
 def trace_first_segments(
-    scene, views, traits, number, seed, rng, wavelengths, sensor_weight, hide_emitters: bool, active
+    scene,
+    views,
+    traits,
+    number,
+    seed,
+    numbers,
+    wavelengths,
+    sensor_weight,
+    hide_emitters: bool,
+    active,
 ):
-    """Traces camera paths to their pivots.
+    """Traces camera paths to their pivots. What has a fixed place in a path draws its `numbers`
+    (`PathNumbers`), all else those of a stream (`number`, `seed`).
 
     Media scatter by delta tracking against their majorants, null surfaces let paths pass with the
-    mean of their transmission, and what stops is a pivot. Returns `(pivot, radiance, rng)`, a
+    mean of their transmission, and what stops is a pivot. Returns `(pivot, radiance)`, a
     dictionary and the emission seen on the way:
 
     - `kind`, `branch`: see the constants; `p`, `medium` (before the pivot), `wi` (to the camera),
@@ -62,14 +75,22 @@ def trace_first_segments(
     - `weight`, `tint`: spectra whose product is what the path carries when it scatters, measured
       value over density; the former belongs to the pivot and is every view's, the latter to the
       path's own first segment;
-    - `nulls`: how many null interactions it passed;
+    - `nulls`: how many null interactions it passed; `gap`: optical depth to the first tentative
+      collision;
     - `visible`: what the alpha channel shows.
     """
-    view, ray, position, aperture, in_window = views.sample(number, wavelengths, rng, active)
+    view, ray, position, aperture, in_window = views.sample(
+        number, wavelengths, numbers.at(CAMERA), active
+    )
     ray = mi.Ray3f(ray)
     medium = views.medium(view, active)
+    rng = streams(number, seed)
     gaps = null_stream(number, seed)
-    gap = next_gap(gaps, active)
+    first = numbers.at(FIRST_SEGMENT)
+    first_gap = next_gap(first)
+    first_chance = first.next_float32()
+    branch_chance = first.next_float32()
+    gap = mi.Float(first_gap)
     tint = mi.Spectrum(1)
     weight = mi.Spectrum(1)
     nulls = mi.UInt32(0)
@@ -99,7 +120,8 @@ def trace_first_segments(
         null, real, probability = collision(
             medium, ray(t), majorant, ray.time, ray.wavelengths, collided
         )
-        passes = collided & (rng.next_float32(collided) < probability)
+        chance = dr.select(nulls == 0, first_chance, rng.next_float32(collided))
+        passes = collided & (chance < probability)
         scatters = collided & ~passes
         gap = dr.select(inside & ~collided, dr.maximum(gap - majorant * (far - near), 0), gap)
         gap[passes] = next_gap(gaps, passes)
@@ -138,9 +160,7 @@ def trace_first_segments(
         if dr.hint(traits.has_mixed, mode="scalar"):
             mixed = stops & smooth & delta
             weight[mixed] = 2 * weight
-            branch[mixed] = dr.select(
-                rng.next_float32(mixed) < 0.5, mi.UInt32(SHARED), mi.UInt32(OWN)
-            )
+            branch[mixed] = dr.select(branch_chance < 0.5, mi.UInt32(SHARED), mi.UInt32(OWN))
         branch[stops & ~smooth] = OWN
         kind[stops] = ON_SURFACE
         p[stops] = surface.p
@@ -177,9 +197,10 @@ def trace_first_segments(
         "tint": tint,
         "weight": weight * sensor_weight,
         "nulls": nulls,
+        "gap": first_gap,
         "visible": dr.select(active & visible, mi.Float(1), mi.Float(0)),
     }
-    return pivot, dr.select(active, radiance * sensor_weight, 0), rng
+    return pivot, dr.select(active, radiance * sensor_weight, 0)
 
 
 def pivot_surface(pivot, active):

@@ -5,10 +5,10 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from ..core.random import next_2d, streams
+from ..core.random import next_1d_and_2d, streams
 from ..lights.lights import mis_power
 from .paths import direct_light, incident_radiance, scattering_interaction
-from .pivots import IN_MEDIUM, NOWHERE, ON_SURFACE, OWN, pivot_surface
+from .pivots import IN_MEDIUM, LATER, NOWHERE, ON_SURFACE, OWN, PIVOT, pivot_surface
 
 SUFFIX_SALT = 0x73756666
 
@@ -29,7 +29,7 @@ def scattering(pivot, surface, d, wo, active):
     return dr.select(on_surface, value, phase_value), dr.select(on_surface, pdf, phase_pdf)
 
 
-def sample_scattering(pivot, surface, d, traits, rng, active):
+def sample_scattering(pivot, surface, d, traits, draws, active):
     """A direction for the path to go on, by the smooth scattering towards `d`, or on a path's `OWN`
     branch by the delta functions there.
 
@@ -43,7 +43,7 @@ def sample_scattering(pivot, surface, d, traits, rng, active):
     own = on_surface & (pivot["branch"] == OWN)
     seen = mi.SurfaceInteraction3f(surface)
     seen.wi = surface.to_local(d)
-    choice, point = rng.next_float32(active), next_2d(rng, active)
+    choice, point = next_1d_and_2d(draws)
     bs, weight = surface.bsdf().sample(mi.BSDFContext(), seen, choice, point, on_surface)
     if traits.has_delta and not traits.has_masks:
         context = mi.BSDFContext()
@@ -73,13 +73,15 @@ def continue_paths(
     connections,
     number,
     seed,
+    numbers,
     views: int,
     max_depth: int,
     rr_depth: int,
     active,
 ):
-    """Traces suffixes from pivots. `connections` holds, for each view k and path p at k * paths +
-    p, what `lines.connect` gave (None for a single view).
+    """Traces suffixes from pivots, with the paths' `numbers` (`PathNumbers`) where a draw has a
+    fixed place in the path, else with those of a stream (`number`, `seed`). `connections` holds,
+    for each view k and path p at k * paths + p, what `lines.connect` gave (None for a single view).
 
     A direction is drawn from the mixture of all views' scattering at the pivot, each by its share
     of the densities, r_k / sum r: the best single sample under the balance heuristic, and never a
@@ -94,6 +96,7 @@ def continue_paths(
     if dr.hint(max_depth > 0, mode="scalar"):
         active &= max_depth > 1
     rng = streams(number, seed ^ SUFFIX_SALT)
+    draws = numbers.at(PIVOT)
     paths = dr.width(number)
     path = dr.arange(mi.UInt32, paths)
     shared = active & (pivot["branch"] != OWN)
@@ -122,7 +125,7 @@ def continue_paths(
         medium, pivot["p"], pivot["wi"], pivot["time"], pivot["wavelengths"]
     )
     it = dr.select(pivot["kind"] == ON_SURFACE, mi.Interaction3f(surface), mi.Interaction3f(mei))
-    next_d, delta_weight, taken = sample_scattering(pivot, surface, chosen, traits, rng, active)
+    next_d, delta_weight, taken = sample_scattering(pivot, surface, chosen, traits, draws, active)
     light_d = mi.Vector3f(0, 0, 1)
     light = mi.Spectrum(0)
     light_pdf = mi.Float(0)
@@ -131,7 +134,7 @@ def continue_paths(
     if dr.hint(not lights.dark, mode="scalar"):
         beyond = mi.MediumPtr(medium)
         ds, value, pdf, rng = direct_light(
-            scene, lights, traits, it, beyond, transition, surface, rng, shared
+            scene, lights, traits, it, beyond, transition, surface, draws, rng, shared
         )
         light_d, light, light_pdf, on_delta_light = (
             mi.Vector3f(ds.d),
@@ -189,6 +192,8 @@ def continue_paths(
         pivot["weight"] * carried,
         strength,
         mi.UInt32(1),
+        numbers,
+        LATER,
         rng,
         max_depth,
         rr_depth,

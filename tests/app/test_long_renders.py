@@ -300,6 +300,7 @@ def test_samples_asked_for_are_made_whatever_was_learned(
     )
     if price:
         set_price_of_path(monkeypatch, price)
+        monkeypatch.setattr("mis_integrators.integrators.choice.RARE", 1.0)  # caustics or not
     out = ["-i", plugin, "-o", tmp_path / "a.exr"]
     assert render(scene, *out, "--time", 0.01, "--checkpoint", 100) == 0
     header, _ = read(tmp_path / "a.exr")
@@ -617,14 +618,23 @@ def test_estimated_error_is_the_error(scene, plugin, parameters):
 
 def test_target_error_stops_the_render(scene, tmp_path, capsys):
     """Reached without another bound; not reached within one, which is said."""
-    errors = {}
-    for target in (0.1, 0.05):
-        assert render(scene, "-i", "bdpt", "-o", tmp_path / "a.exr", "--target-error", target) == 0
-        header, _ = read(tmp_path / "a.exr")
-        assert 0.8 * target < header["relativeError"] <= target
-        errors[target] = header["iterations"]
-        assert "relative error 0.0" in capsys.readouterr().err
-    assert 3 < errors[0.05] / errors[0.1] < 5.3  # four times as many, but for steps
+    needed = {}
+    for sampler in ("independent", "sobol"):
+        iterations = []
+        for target in (0.1, 0.05):
+            options = ["-i", "bdpt", "-P", f"sampler={sampler}", "--target-error", target]
+            options += ["-P", "max_depth=2"]  # direct light, where sequences are at their best
+            assert render(scene, *options, "-o", tmp_path / "a.exr") == 0
+            header, _ = read(tmp_path / "a.exr")
+            assert 0.75 * target < header["relativeError"] <= target
+            iterations.append(header["iterations"])
+            assert "relative error 0.0" in capsys.readouterr().err
+        needed[sampler] = iterations
+    few, many = needed["independent"]
+    assert 3 < many / few < 5.3  # four times as many, but for steps
+    few, many = needed["sobol"]
+    assert 1.7 < many / few < 5.3  # between twice (error proportional to 1 / n) and four times
+    assert many < 0.9 * needed["independent"][1]  # what the estimate has to know
     assert (
         render(scene, "-i", "bdpt", "-o", tmp_path / "a.exr", "--target-error", 0.001, "--spp", 10)
         == 0

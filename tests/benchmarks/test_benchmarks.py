@@ -271,6 +271,45 @@ TINY = """<scene version="3.0.0">
     <emitter type="point"><point name="position" x="1" y="2" z="4"/></emitter></scene>"""
 
 
+def test_path_under_another_sampler(module, tmp_path):
+    """One pass takes the whole time, with the scene's film; the scene's own sampler stays."""
+    file = tmp_path / "tiny.xml"
+    file.write_text(TINY)
+    methods = module("common.methods")
+    opened = module("common.scene_files").open_scene(file, (24, 20))
+    plain, other = (
+        methods.SessionMaker(methods.parse_method(label), opened, 0.5, warm_up=False).make(1)
+        for label in ("path", "path:sampler=multijitter")
+    )
+    assert other.iterations_planned == 1 and other.camera_paths > 4
+    assert "Multijitter" in str(opened.sensor_with("multijitter").sampler())
+    assert "Independent" in str(opened.sensor.sampler())
+    assert opened.sensor_with(None) is opened.sensor
+    for session in (plain, other):
+        session.iterate()
+    assert plain.image().shape == other.image().shape == (20, 24, plain.image().shape[2])
+    assert other.image().mean() == pytest.approx(plain.image().mean(), rel=0.1)
+    with pytest.raises(Exception, match="nonsense"):
+        methods.SessionMaker(methods.parse_method("path:sampler=nonsense"), opened, 0.5)
+
+
+def test_convergence_of_samplers(module, tmp_path):
+    """A row for each sampler and power of two; the chart has a panel for each scene."""
+    pytest.importorskip("matplotlib")
+    file = tmp_path / "tiny.xml"
+    file.write_text(TINY)
+    module("run").main(
+        ["sampling", "--scenes", str(file), "--size", "16", "--iterations", "4", "--seeds", "3"]
+        + ["--out", str(tmp_path)]
+    )
+    rows = json.loads((tmp_path / "sampling.json").read_text())["rows"]
+    assert [(row["sampler"], row["iterations"]) for row in rows] == [
+        (sampler, n) for sampler in ("sobol", "independent") for n in (1, 2, 4)
+    ]
+    assert all(row["variance"] > 0 for row in rows)
+    assert (tmp_path / "sampling.png").stat().st_size > 1000
+
+
 def test_page_of_one_small_scene(module, tmp_path):
     """The whole way, small: every part of the page is there, everything it shows is embedded, and
     it names what cannot be rendered."""

@@ -271,7 +271,7 @@ def test_irradiance_of_area_light(rgb, shape):
             "lamp": lamp,
             "sensor": {
                 "type": "perspective",
-                "fov": 2,
+                "fov": 0.2,
                 "to_world": look((2, 0, 1), (0, 0, 0), (0, 0, 1)),
                 "film": film(16),
             },

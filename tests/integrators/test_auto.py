@@ -10,10 +10,11 @@ import json
 from mis_integrators.integrators import costs
 from mis_integrators.paths.path_length_statistics import mean_segments
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from comparing import agree, pictures
+from comparing import Estimate, PathBatches, agree, assert_same, block_means, collect_until
 from foggy import even, view, volpath
 from foggy import grid as smoke
 from foggy import world as foggy_world
@@ -73,24 +74,88 @@ def test_path_as_iterations(variant_name, kind, rfilter):
     )
 
 
-def test_path_in_parts(rgb, monkeypatch):
-    """Large films are traced in parts: all pixels are, and no two parts share random numbers."""
+class Renders:
+    """Region means of renders by `PathSession`s of different seeds, which are independent; the
+    iterations of one are not."""
+
+    def __init__(self, scene, iterations, **parameters):
+        self.scene, self.iterations, self.parameters = scene, iterations, parameters
+        self.batches = []
+
+    def add(self, count):
+        for seed in range(len(self.batches), len(self.batches) + count):
+            session = Unidirectional(**self.parameters).session(self.scene, 0, seed, 0)
+            for _ in range(self.iterations):
+                session.iterate()
+            self.batches.append(block_means(session.image()[:, :, :3], 3))
+
+    def estimate(self):
+        return Estimate.of(self.batches)
+
+
+@pytest.mark.parametrize("sampler", ("sobol", "independent"))
+def test_mean_of_whole_renders(rgb, sampler):
+    """A few iterations together, with whatever their random numbers share, have the mean of `path`
+    (false-alarm rate 1e-6; an error of 1 % of the whole image or of 8 % of a block is seen)."""
     scene = tray("smooth1", "rectangle")
-    whole = Unidirectional().session(scene, 0, 1, 0)
+    ours, theirs = Renders(scene, 4, camera_paths=8, sampler=sampler), PathBatches(path(), scene, 3)
+    with dr.suspend_grad():
+        assert_same(*collect_until(ours, theirs, block=0.08), block=0.08)
+
+
+def test_sequences_lower_the_variance_of_path(rgb):
+    """The variance of 32 paths a pixel, over 24 seeds, is much less than that of independent
+    numbers: a fifth, by the median over pixels. Were they equal, a pixel's ratio would follow
+    F(23, 23), below 0.7 with probability 0.2; of 500 independent pixels half would be so with a
+    probability below 1e-40."""
+    scene = tray("lambertian", "rectangle", rfilter="box")
+
+    def variance(sampler):
+        images = []
+        for seed in range(24):
+            session = Unidirectional(camera_paths=8, sampler=sampler).session(scene, 0, seed, 0)
+            for _ in range(4):
+                session.iterate()
+            images.append(session.image()[:, :, :3].mean(axis=-1))
+        return np.var(images, axis=0, ddof=1)
+
+    sobol, independent = variance("sobol"), variance("independent")
+    lit = (sobol > 0) & (independent > 0)
+    assert lit.sum() > 500 and np.median(sobol[lit] / independent[lit]) < 0.7
+
+
+@pytest.mark.parametrize("sampler", ("sobol", "independent"))
+def test_path_in_parts(rgb, monkeypatch, sampler):
+    """Large films are traced in parts, and iterations in any order: it makes no difference. (What
+    atomic additions on the film round differs.)"""
+    scene = tray("smooth1", "rectangle")
+    whole = Unidirectional(camera_paths=2, sampler=sampler).session(scene, 0, 1, 0)
     monkeypatch.setattr("mis_integrators.integrators.unidirectional.CHUNK", 1000)
-    parts = Unidirectional().session(scene, 0, 1, 0)
-    assert parts.chunks == 3 and parts.chunk == 48 * 16
-    for _ in range(24):
-        whole.iterate()
-    noise = np.array([picture.mean(axis=-1) for picture in pictures(parts, 24)])
-    a, b = whole.image(), parts.image()
-    assert abs(a.mean() / b.mean() - 1) < 0.03
-    assert np.corrcoef(a[0::2].ravel(), b[0::2].ravel())[0, 1] > 0.9
-    noise -= noise.mean(axis=0)
-    noise = (noise / np.maximum(noise.std(axis=0), 1e-6)).reshape(24, 3, -1)  # a part is 16 rows
-    for one, other in ((0, 1), (1, 2), (0, 2)):
-        # 1e-7
-        assert abs(np.mean(noise[:, one] * noise[:, other])) < 5.3 / np.sqrt(noise[:, 0].size)
+    parts = Unidirectional(camera_paths=2, sampler=sampler).session(scene, 0, 1, 0)
+    assert parts.chunks > 2 and whole.chunks == 1
+    for iteration in range(3):
+        whole.iterate(iteration)
+        parts.iterate(2 - iteration)
+    assert np.allclose(whole.image(), parts.image(), rtol=1e-4, atol=1e-5)
+
+
+def test_pilot_of_path_draws_independent_numbers(rgb):
+    """The laws of pilots are about independent paths: the trial of `path` draws the same, whatever
+    the `sampler`."""
+    from mis_integrators.pilot.run import PILOT_INDEX
+
+    def radiance(sampler, variation):
+        session = Unidirectional(sampler=sampler).session(scene, 0, 1, 0)
+        spectral = session._spectral(PILOT_INDEX)
+        first = dr.opaque(mi.UInt32, 0)
+        return np.array(
+            session.trace(PILOT_INDEX, first, 1, 500, spectral, mi.UInt32(variation))[0]
+        )
+
+    scene = tray("lambertian", "rectangle")
+    for variation in (0, 1):
+        assert np.array_equal(radiance("sobol", variation), radiance("independent", variation))
+    assert not np.array_equal(radiance("sobol", 0), radiance("sobol", 1))
 
 
 def test_census(rgb):
@@ -325,24 +390,27 @@ def test_camera_paths_of_the_chosen_are_its_own(rgb, monkeypatch):
     assert other.camera_paths == 3
 
 
-def test_prediction_is_checked(rgb):
-    """The error that is predicted for `path` is what independent renders have: within a factor of
-    two, the pilot's pixels being few."""
+@pytest.mark.parametrize("sampler", ["independent", "sobol"])
+def test_prediction_is_checked(rgb, sampler):
+    """The error that is predicted for `path` is what twelve renders have: within a factor of two,
+    the pilot's pixels being few."""
     scene = tray("lambertian", "rectangle")
-    session = auto().session(scene, spp=64)
+    session = auto(sampler=sampler).session(scene, spp=64)
     session.iterate()
     predicted = session.settings["choice.relmse.path"]
     trial = next(t for t in session.decision.trials if t.name == "path")
     # as many as cost the same as 64 iterations of bdpm
-    samples = 64 * session.decision.usual_cost / trial.cost
-    images = [
-        np.array(mi.render(scene, integrator=path(), spp=16, seed=seed)).mean(axis=-1)
-        for seed in range(12)
-    ]
+    samples = round(64 * session.decision.usual_cost / trial.cost)
+    images = []
+    for seed in range(12):
+        one = Unidirectional(sampler=sampler).session(scene, 0, seed, 0)
+        for _ in range(samples):
+            one.iterate()
+        images.append(one.image().mean(axis=-1))
     mean = np.mean(images, axis=0)
     weights = 1 / (mean**2 + 0.1 * np.mean(np.minimum(mean, np.quantile(mean, 0.95))) ** 2)
     relative = np.sort((weights * np.var(images, axis=0, ddof=1)).ravel())
-    measured = relative[: int(0.999 * relative.size)].mean() * 16 / samples
+    measured = relative[: int(0.999 * relative.size)].mean()
     assert 0.5 < predicted / measured < 2
 
 

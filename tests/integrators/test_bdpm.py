@@ -1,5 +1,6 @@
 """Behaviour of the plugin `bdpm`: strategies, seeds, films, limits, and errors."""
 
+import contextlib
 import dataclasses
 import gc
 import sys
@@ -163,7 +164,9 @@ def test_bias_falls_with_the_square_of_the_radius(rgb):
         for r in radii
     ]
     for estimate, expected in zip(estimates, disk):  # the mean over the disk in closed form
-        assert not differences(estimate, Estimate.exact(np.full_like(estimate.mean, expected)))
+        # The pane lifts rays by Mitsuba's 1e-4 or so: for the floor, the lamp is that much lower.
+        exactly = Estimate.exact(np.full_like(estimate.mean, expected))
+        assert not differences(estimate, exactly, slack=6e-4)
     bias = [1 - e.mean[0, 0] / exact for e in estimates]
     slope = np.polyfit(np.log(radii), np.log(bias), 1)[0]
     assert 1.6 < slope < 2.3, (slope, bias)
@@ -238,10 +241,10 @@ def test_seeds_and_iterations_are_uncorrelated(rgb):
     """Correlation of the pixels' noise over pairs of renders, of different seeds and iterations:
     below 0.2, four to five standard deviations of chance (0.04 to 0.06: neighbouring pixels share
     photons). With random numbers in common it is far above."""
-    scene = glossy_box(size=32)
+    scene, sampler = glossy_box(size=32), "independent"
     mean = render(scene, 1000, 256).mean(axis=2)
-    session = bdpm(camera_paths=1, photon_count=3000).session(scene, 0, 3, 0)
-    images = [render(scene, seed, 1).mean(axis=2) for seed in (0, 1, 2, 3)]
+    session = bdpm(camera_paths=1, photon_count=3000, sampler=sampler).session(scene, 0, 3, 0)
+    images = [render(scene, seed, 1, sampler=sampler).mean(axis=2) for seed in (0, 1, 2, 3)]
     images += [picture.mean(axis=2) for picture in pictures(session, 3)]
     noise = [(i - mean).ravel() for i in images[:3]] + [(i - mean).ravel() for i in images[4:]]
     # a caustic's fireflies would be all that counts
@@ -529,12 +532,14 @@ def test_numbers_of_paths_leave_the_mean(rgb, camera_paths, photon_count):
     )
 
 
-def test_rounding_up_is_said_once(rgb):
-    said = []
+@contextlib.contextmanager
+def said():
+    """The lines that Mitsuba's log gets meanwhile."""
+    lines = []
 
     class Listener(mi.Appender):
         def append(self, level, text):
-            said.append(text)
+            lines.append(text)
 
         def log_progress(self, *args):
             pass
@@ -543,14 +548,48 @@ def test_rounding_up_is_said_once(rgb):
     logger = mi.Thread.thread().logger() if hasattr(mi, "Thread") else mi.logger()
     logger.add_appender(listener)
     try:
-        mi.render(box_scene(8), integrator=bdpm(camera_paths=4), spp=10)
-        rounded = [text for text in said if "rounded up" in text]
-        assert len(rounded) == 1 and "10 samples" in rounded[0] and "3 iterations" in rounded[0]
-        said.clear()
-        mi.render(box_scene(8), integrator=bdpm(camera_paths=4), spp=8)
-        assert not [text for text in said if "rounded up" in text]
+        yield lines
     finally:
         logger.remove_appender(listener)
+
+
+def test_rounding_up_is_said_once(rgb):
+    with said() as lines:
+        mi.render(box_scene(8), integrator=bdpm(camera_paths=4), spp=10)
+        rounded = [text for text in lines if "rounded up" in text]
+        assert len(rounded) == 1 and "10 samples" in rounded[0] and "3 iterations" in rounded[0]
+        lines.clear()
+        mi.render(box_scene(8), integrator=bdpm(camera_paths=4), spp=8)
+        assert not [text for text in lines if "rounded up" in text]
+
+
+@pytest.mark.parametrize("plugin", ("bdpm", "bdpt", "bdpm_auto", "volpath_multiview"))
+@pytest.mark.parametrize("sampler", ("independent", "multijitter"))
+def test_samplers_that_are_not_used_are_named_once(rgb, plugin, sampler):
+    """By `mi.render`, and for `mis-render` in the remarks of the session."""
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "lamp": {"type": "constant"},
+            "ball": {"type": "sphere", "bsdf": {"type": "diffuse"}},
+            "sensor": {
+                "type": "perspective",
+                "to_world": look((0, 0, 5), (0, 0, 0), (0, 1, 0)),
+                "film": film(4),
+                "sampler": {"type": sampler, "sample_count": 4},
+            },
+        }
+    )
+    integrator = mi.load_dict({"type": plugin, "max_depth": 2, "sampler": "independent"})
+    with said() as lines:
+        for seed in range(2):
+            mi.render(scene, integrator=integrator, seed=seed)
+    session = integrator.session(scene, spp=4)
+    session.iterate()
+    for texts in (lines, session.remarks):
+        found = [text for text in texts if "Sampler" in text]
+        assert len(found) == (sampler != "independent")
+        assert all("Multijitter" in t and '"sampler" = independent' in t for t in found)
 
 
 # --- Buffers ------------------------------------------------------------------
@@ -958,13 +997,15 @@ def test_camera_paths_average_their_own_noise_only(rgb, shared):
 )
 def test_noise_of_several_camera_paths_is_foreseen(rgb, plugin, given, camera_paths):
     """The pilot's two camera paths a pixel say what an iteration of more, or fewer, of them will
-    have: within a factor 1.3 of twelve renders."""
+    have: within a factor 1.3 of twelve renders. (Its law is that of independent numbers.)"""
     session = mi.load_dict(
         {
             "type": plugin,
             "max_depth": 4,
             "photon_count": 20000,
             "camera_paths": camera_paths,
+            "sampler": "independent",
+            "direct_paths": 1,
             **given,
         }
     ).session(glossy_box(size=48), spp=16 * camera_paths)

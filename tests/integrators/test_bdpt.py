@@ -8,6 +8,7 @@ Comparisons of renders as in `test_against_path`: false-alarm rate 1e-6 each, an
 from itertools import pairwise
 
 from mis_integrators.core.random import next_2d, streams
+from mis_integrators.core.sequences import SampleSequence
 from mis_integrators.core.traits import SceneTraits
 from mis_integrators.integrators.pyramid import technique_names
 from mis_integrators.lights.environment_guide import EnvironmentGuide
@@ -366,15 +367,16 @@ def test_states_of_traced_subpaths(rgb, kind):
     traits, lights, sensor = SceneTraits(scene), Lights(scene), scene.sensors()[0]
     weights, count, capacity = ConnectionWeights(lights, beta, 1.3), 300, 4000
     world = World(scene, lights, traits)
+    sequence = SampleSequence(mi.UInt32(3), mi.UInt32(0), 1, False)
     if kind == "light":
         vertices, found, _ = trace_light_subpaths(
-            world, Limits(6, 50), LightPass(mi.UInt32(3), count, []), weights, capacity
+            world, Limits(6, 50), LightPass(sequence, count, []), weights, capacity
         )
     else:
         *_, vertices, found = trace_camera_subpaths(
             world,
             Limits(6, 50),
-            CameraPass(sensor, None, mi.UInt32(3), mi.UInt32(0), 64, 1, 0.5),
+            CameraPass(sensor, None, sequence, mi.UInt32(0), 64, 1, 0.5),
             weights,
             capacity,
         )

@@ -729,13 +729,13 @@ def test_kernels_know_neither_seed_nor_room(rgb, name):
     other sizes, one of which grows: no path kernel is compiled anew. (Merging knows the size of its
     table, which goes with the light buffer's.)"""
     scene, compiled, grids = glossy_box(size=16), [], set()
-    for seed in range(3):
+    for number, seed in enumerate((0, 1, 3)):
         session = mi.load_dict({"type": name, "max_depth": 4, "camera_paths": 1}).session(
             scene, 0, seed, 0
         )
         session.capacity.update(
-            camera=2048 >> seed,
-            light=session.capacity["light"] if name == "vcm" else (1024, 64, 2048)[seed],
+            camera=2048 >> number,
+            light=session.capacity["light"] if name == "vcm" else (1024, 64, 2048)[number],
         )
         compiled.append(kernels_of(session.iterate, 500))
         grids.add(tuple(session.grid.resolution) if name == "bdpt_ris" else seed)

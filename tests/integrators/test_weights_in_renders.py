@@ -368,10 +368,12 @@ def test_noise_law(rgb):
                 "camera_paths": n_b,
                 "variance": True,
                 "max_depth": 8,
+                "sampler": "independent",
+                "direct_paths": 1,
             }
         )
         session = integrator.session(scene, seed=n_b + n_f)
-        for _ in range(48):
+        for _ in range(96):
             session.iterate()
         return session.image()[..., -3:].mean() * session.iterations
 
@@ -440,6 +442,7 @@ def measured_in_sphere(iterations):
             "initial_radius": SPHERE["radius"],
             "photon_count": SPHERE["light_paths"],
             "variance": True,
+            "sampler": "independent",
         }
     )
     session = integrator.session(scene, seed=1)

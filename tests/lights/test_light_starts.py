@@ -2,6 +2,7 @@
 and the light that comes from a start."""
 
 from mis_integrators.core.random import streams
+from mis_integrators.core.sequences import SampleSequence
 from mis_integrators.lights.lights import Lights
 from mis_integrators.paths.light_starts import read_starts, sample_light_starts
 
@@ -75,7 +76,9 @@ def test_starts_light_the_scene(rgb, emitter):
     probability of 0.95)."""
     scene, lights = lights_of(emitter)
     count = 1 << 20
-    starts = sample_light_starts(lights, mi.UInt32(3), count, [], mi.Float(0))
+    starts = sample_light_starts(
+        lights, SampleSequence(mi.UInt32(3), mi.UInt32(0), count, True), count, [], mi.Float(0)
+    )
     starts = read_starts(starts, dr.arange(mi.UInt32, count), mi.Bool(True))
     si = dr.zeros(mi.SurfaceInteraction3f, count)
     si.p, si.n = mi.Point3f(0.3, -0.2, 0.4), mi.Normal3f(0, 0, 1)

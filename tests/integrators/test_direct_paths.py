@@ -1,0 +1,91 @@
+"""Camera paths that see direct light alone: means stay, and the noise of direct light falls."""
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from comparing import SessionBatches, assert_same, collect_until
+from worlds import tray
+
+RADIUS = 0.3
+POWER = {"whole": 0.02, "block": 0.05}
+"""Relative errors that tests would see, of the whole image and of a quarter."""
+
+
+def integrator(plugin="bdpm", **parameters):
+    return mi.load_dict({"type": plugin, "initial_radius": RADIUS, "max_depth": 4, **parameters})
+
+
+@pytest.mark.parametrize(
+    "material, parameters",
+    [
+        ("lambertian", {"bdd": 0}),
+        ("lambertian", {"bdd": 1}),
+        ("lambertian", {"bdd": 0, "camera_paths": 2}),
+        ("rough", {"bdd": 1}),
+        ("rough", {"plugin": "bdpm_opt2"}),
+    ],
+)
+def test_same_means(rgb, material, parameters):
+    """With one path and with five: `assert_same` with its false-alarm rate."""
+    scene = tray(material, "rectangle")
+    sides = [
+        SessionBatches(integrator(direct_paths=count, **parameters), scene, 2, seed)
+        for seed, count in enumerate((1, 5))
+    ]
+    assert_same(*collect_until(*sides, **POWER), **POWER)
+
+
+def test_light_behind_mirrors_and_holes(rgb):
+    """Paths that pass delta surfaces first see direct light at their first smooth vertex, too."""
+    scene = tray("delta", "rectangle")
+    sides = [
+        SessionBatches(integrator(direct_paths=count, bdd=1), scene, 2, seed)
+        for seed, count in enumerate((1, 4))
+    ]
+    assert_same(*collect_until(*sides, **POWER), **POWER)
+
+
+def test_noise_of_direct_light_falls(rgb):
+    """Where nearly all noise is that of direct light, four independent paths have a quarter of the
+    variance of one: ratio of two variances of 4000 values each, within 0.2 to 0.3 (false alarms
+    below 1e-6)."""
+    scene = tray("lambertian", "rectangle")
+    variance = []
+    for count in (1, 4):
+        session = integrator(
+            direct_paths=count,
+            bdd=0,
+            max_depth=3,
+            initial_radius=1.0,
+            sampler="independent",
+            variance=True,
+        ).session(scene, 0, 1, 0)
+        for _ in range(64):
+            session.iterate()
+        variance.append(session.estimate()[1].mean())
+    assert 0.2 < variance[1] / variance[0] < 0.3
+
+
+def test_parts_make_the_same_image(rgb, monkeypatch):
+    """Camera paths in several parts, the last one not full, are the paths of one part."""
+    from mis_integrators.integrators import bdpm
+
+    scene = tray("lambertian", "rectangle")
+    images = []
+    for chunk in (1 << 21, 700):
+        monkeypatch.setattr(bdpm, "CAMERA_CHUNK", chunk)
+        session = integrator(direct_paths=3).session(scene, 0, 1, 0)
+        session.iterate()
+        images.append(session.image())
+    np.testing.assert_allclose(images[0], images[1], rtol=1e-3, atol=1e-5)
+
+
+def test_only_where_photons_are_gathered(rgb):
+    scene = tray("lambertian", "rectangle")
+    assert integrator(max_depth=2).session(scene).direct_paths == 1
+    assert integrator(bdd=0, max_depth=3).session(scene).direct_paths == 4
+
+
+def test_range(rgb):
+    with pytest.raises(Exception, match='parameter "direct_paths" = 0'):
+        integrator(direct_paths=0)
