@@ -605,5 +605,6 @@ class SubsetIteration(NamedTuple):
         return passes.by_pixel((values[:paths] + others) / of_each)
 
 
-LIGHT, CAMERA, EXTRA = 0, 1, 3
-"""Purposes of an iteration's random seeds, besides `IterativeSession.WAVELENGTH`."""
+LIGHT, CAMERA, EXTRA = 0, 1, 4
+"""Purposes of an iteration's random seeds, besides `IterativeSession.WAVELENGTH` and
+`bdpm_opt.FROZEN`."""

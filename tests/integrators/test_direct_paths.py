@@ -86,6 +86,15 @@ def test_only_where_photons_are_gathered(rgb):
     assert integrator(bdd=0, max_depth=3).session(scene).direct_paths == 4
 
 
+def test_purposes_differ(rgb):
+    """What paths that gather draw, and others, and light, and what only weights learn from."""
+    from mis_integrators.integrators import bdpm, bdpm_opt
+    from mis_integrators.integrators.common import IterativeSession
+
+    purposes = [bdpm.LIGHT, bdpm.CAMERA, bdpm.EXTRA, bdpm_opt.FROZEN, IterativeSession.WAVELENGTH]
+    assert len(set(purposes)) == len(purposes)
+
+
 def test_range(rgb):
     with pytest.raises(Exception, match='parameter "direct_paths" = 0'):
         integrator(direct_paths=0)
