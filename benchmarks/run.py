@@ -288,17 +288,8 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument(
         "--size", type=int, default=96, metavar="PIXELS", help="edge of the film (default: 96)"
     )
-    command.add_argument(
-        "--iterations", type=int, default=256, help="of each render (default: 256)"
-    )
     command.add_argument("--seeds", type=int, default=8, help="renders of each (default: 8)")
-    command.add_argument(
-        "--radius-share",
-        type=_positive,
-        default=0.01,
-        metavar="SHARE",
-        help="merge radius over the scene's diagonal (default: 0.01)",
-    )
+    _variance(command, 256, 0.01)
 
     command = _measuring(commands, "constants", constants)
     command.set_defaults(scenes=[])
@@ -454,7 +445,7 @@ def _chooses(command: argparse.ArgumentParser, labels: tuple[str, ...], what: st
     )
 
 
-def _variance(command: argparse.ArgumentParser, iterations: int) -> None:
+def _variance(command: argparse.ArgumentParser, iterations: int, share: float = 0.005) -> None:
     """How variance is measured."""
     command.add_argument(
         "--iterations", type=int, default=iterations, help=f"for variances (default: {iterations})"
@@ -463,10 +454,14 @@ def _variance(command: argparse.ArgumentParser, iterations: int) -> None:
         "--radius",
         type=_positive,
         metavar="R",
-        help="merge radius of variance maps (default: a share of the scene's diagonal)",
+        help="merge radius (default: a share of the scene's diagonal)",
     )
     command.add_argument(
-        "--radius-share", type=_positive, default=0.005, metavar="SHARE", help="(default: 0.005)"
+        "--radius-share",
+        type=_positive,
+        default=share,
+        metavar="SHARE",
+        help=f"(default: {share})",
     )
 
 

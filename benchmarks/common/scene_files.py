@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import argparse
 import hashlib
 from dataclasses import dataclass, field
 from pathlib import Path
 from xml.etree import ElementTree
 
 from mis_integrators.app import loading
+from mis_integrators.core.traits import scene_bounds
 
 import mitsuba as mi
+import numpy as np
 
 BUNDLED = Path(__file__).resolve().parents[2] / "scenes"
 
@@ -82,6 +85,12 @@ def _resize(sensor: mi.Sensor, size: tuple[int, int]) -> None:
     film = mi.traverse(sensor)
     film["film.size"] = mi.ScalarVector2u(*size)
     film.update()
+
+
+def merge_radius(opened: OpenScene, options: argparse.Namespace) -> float:
+    """The radius that the options ``radius`` or ``radius_share`` ask for."""
+    diagonal = float(np.linalg.norm(np.array(scene_bounds(opened.scene).extents())))
+    return options.radius or options.radius_share * diagonal
 
 
 def scaled_size(path: Path, scale: float) -> tuple[int, int] | None:

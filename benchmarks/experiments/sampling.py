@@ -7,7 +7,7 @@ import argparse
 
 from mis_integrators.analysis.confidence import log_slope
 from mis_integrators.analysis.metrics import trimmed_mean
-from mis_integrators.core.traits import scene_bounds
+from mis_integrators.analysis.variance_maps import relative_variance
 from mis_integrators.integrators.common import SAMPLERS
 
 import numpy as np
@@ -15,13 +15,11 @@ import numpy as np
 from common.methods import Method
 from common.references import colours
 from common.rows import Row, save, show, tell
-from common.scene_files import OpenScene, bundled, open_scene
+from common.scene_files import OpenScene, bundled, merge_radius, open_scene
 from report.figures import draw_convergence_of_samplers
 
 CHOSEN = ("caustics", "cornell_area", "cornell_glossy", "corridor")
 """Bundled scenes: light that only photons bring, and rooms of more and more glossy surfaces."""
-DARK = 0.05
-"""Share of the mean brightness below which errors are no longer relative to the pixel's own."""
 COLUMNS = (
     "scene",
     "method",
@@ -45,9 +43,7 @@ def run(options: argparse.Namespace) -> None:
     for path in options.scenes:
         opened = open_scene(path, (options.size, options.size))
         for method in options.integrators:
-            found = converge(
-                opened, method, options.iterations, options.seeds, options.radius_share
-            )
+            found = converge(opened, method, options)
             rows += found
             slopes += fit(found)
         show(f"{opened.name}: variance of images", rows, COLUMNS)
@@ -57,12 +53,11 @@ def run(options: argparse.Namespace) -> None:
     draw_convergence_of_samplers(options.out / "sampling.png", rows)
 
 
-def converge(
-    opened: OpenScene, method: Method, iterations: int, seeds: int, radius_share: float
-) -> list[Row]:
-    """A row for each sampler and power of two of iterations, up to so many."""
-    diagonal = float(np.linalg.norm(np.array(scene_bounds(opened.scene).extents())))
-    given = {"initial_radius": radius_share * diagonal} if method.plugin.startswith("bdpm") else {}
+def converge(opened: OpenScene, method: Method, options: argparse.Namespace) -> list[Row]:
+    """A row for each sampler and power of two of iterations, up to those of the options."""
+    seeds, given = options.seeds, {}
+    if method.plugin.startswith("bdpm"):
+        given["initial_radius"] = merge_radius(opened, options)
     rows: list[Row] = []
     for sampler in SAMPLERS:
         used = Method(
@@ -72,7 +67,7 @@ def converge(
         for seed in range(seeds):
             tell(f"{opened.name}: {method.label}, {sampler}, seed {seed + 1} of {seeds}")
             session = used.integrator(opened).session(opened.scene, opened.sensor, seed=seed)
-            for done in range(1, iterations + 1):
+            for done in range(1, options.iterations + 1):
                 session.iterate()
                 if done & (done - 1) == 0:
                     images.setdefault(done, []).append(colours(session))
@@ -91,8 +86,7 @@ def converge(
 
 
 def _figures(variance: np.ndarray, mean: np.ndarray) -> dict[str, float]:
-    level = DARK * float(mean.mean())
-    relative = variance / (np.square(mean) + level**2)
+    relative = relative_variance(variance, mean)
     return {
         "variance": float(variance.mean()),
         "relative variance": float(relative.mean()),

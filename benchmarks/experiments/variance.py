@@ -1,5 +1,5 @@
-"""Variance of one iteration at equal radius: numbers against the best single strategy, and maps
-side by side."""
+"""Variance of an image times its iterations, at equal radius: numbers against the best single
+strategy, and maps side by side."""
 
 from __future__ import annotations
 
@@ -10,13 +10,12 @@ from pathlib import Path
 from mis_integrators.analysis.metrics import trimmed_mean
 from mis_integrators.analysis.variance_maps import best_single, relative_variance, share_worse
 from mis_integrators.app import loading
-from mis_integrators.core.traits import scene_bounds
 
 import numpy as np
 
 from common.methods import Method
 from common.rows import Row, console, save, show, tell
-from common.scene_files import OpenScene, open_scene, scaled_size
+from common.scene_files import OpenScene, merge_radius, open_scene, scaled_size
 from report import sections
 from report.figures import draw_variance_maps
 from report.page import Page
@@ -65,8 +64,7 @@ def compare(opened: OpenScene, camera_paths: int, options: argparse.Namespace) -
     Methods whose plugin has no merge radius or no channel of variances, and those that cannot
     render the scene, are left out.
     """
-    diagonal = float(np.linalg.norm(np.array(scene_bounds(opened.scene).extents())))
-    radius = options.radius or options.radius_share * diagonal
+    radius = merge_radius(opened, options)
     common = {"initial_radius": radius, "camera_paths": camera_paths, "variance": True}
     methods, images, variances, seconds = [], [], [], []
     for method in options.integrators:

@@ -293,10 +293,11 @@ def convergence_of_samplers(rows: Sequence[Mapping[str, Any]]) -> Figure:
     `rows`: mappings with ``scene``, ``method``, ``sampler``, ``iterations``, ``variance``,
     ``relative variance trimmed``."""
     panels = list(dict.fromkeys((row["scene"], row["method"]) for row in rows))
+    samplers = list(dict.fromkeys(row["sampler"] for row in rows))
     with rc_context(SETTINGS):
         figure = Figure(figsize=(3.3 * len(panels), 3.4), layout="constrained")
         for axis, (scene, method) in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels):
-            for sampler, colour in zip(("sobol", "independent"), ("#1f77d0", "#222222")):
+            for sampler, colour in zip(samplers, ("#1f77d0", "#222222")):
                 mine = [
                     row
                     for row in rows

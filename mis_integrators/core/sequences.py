@@ -23,7 +23,6 @@ Array = Any
 PRIMITIVE = {2: (2, 1, (1, 3)), 3: (3, 1, (1, 3, 1))}
 """By dimension, counted from 0: degree and inner coefficients of its primitive polynomial, and the
 first odd direction numbers (Joe and Kuo 2008)."""
-MOST_DIMENSIONS = 4
 BLOCK_BITS = 16
 """Points of more than two dimensions are nets of 2^16 points each, which are scrambled apart: with
 more, coordinates from the third on are no longer stratified with those before. (Half the
@@ -33,20 +32,16 @@ instructions.)"""
 def hash_bits(x):
     """A bijection of 32-bit words in which each bit in decides all bits out (the finaliser of
     MurmurHash3)."""
-    x ^= x >> 16
-    x *= mi.UInt32(0x85EBCA6B)
-    x ^= x >> 13
-    x *= mi.UInt32(0xC2B2AE35)
+    x = (x ^ (x >> 16)) * mi.UInt32(0x85EBCA6B)
+    x = (x ^ (x >> 13)) * mi.UInt32(0xC2B2AE35)
     return x ^ (x >> 16)
 
 
 def _scramble_reversed(x, seed):
     """Nested uniform scrambling of words whose lowest bit counts most: each bit is flipped or not
     by a hash of the bits below it."""
-    x ^= x * mi.UInt32(0x3D20ADEA)
-    x += seed
-    x *= (seed >> 16) | 1
-    x ^= x * mi.UInt32(0x05526C56)
+    x = ((x ^ (x * mi.UInt32(0x3D20ADEA))) + seed) * ((seed >> 16) | 1)
+    x = x ^ (x * mi.UInt32(0x05526C56))
     return x ^ (x * mi.UInt32(0x53A22864))
 
 

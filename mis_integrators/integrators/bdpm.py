@@ -15,7 +15,7 @@ from ..core.recording import lanes, recorder
 from ..core.spectra import channel_mean
 from ..core.traits import SceneTraits, lookup
 from ..lights.lights import Lights
-from ..paths.camera import film_sample_count, film_size
+from ..paths.camera import film_sample_count, film_size, path_of_lane
 from ..paths.setting import World
 from ..photons.coverage import covered_share
 from ..photons.gather import QueryVertices, gather_photons, mean_photon_count
@@ -273,13 +273,7 @@ class BDPMSession(PilotedSession):
     def _trace_camera(self, camera_pass, capacity, spectral):
         """Traces the paths of a `CameraPass`, with room for so many vertices."""
         queries = Queries(
-            self.last_vertex,
-            capacity,
-            self.has_caustics,
-            self.has_indirect,
-            self.one_vertex,
-            camera_pass.count,
-            1 + camera_pass.extra,
+            self.last_vertex, capacity, self.has_caustics, self.has_indirect, self.one_vertex
         )
         return trace_camera_paths(
             self.world, self.limits, camera_pass, queries, self._merge_state(spectral)
@@ -389,23 +383,16 @@ class BDPMSession(PilotedSession):
 
     def _there_are(self, camera_pass):
         """Which paths of a part there are: the last part may have fewer."""
-        if not camera_pass.extra:
-            return self.in_chunk(camera_pass.first)
-        path = dr.arange(mi.UInt32, camera_pass.lanes)
-        others = (path - camera_pass.count) // camera_pass.extra
-        number = dr.select(path < camera_pass.count, path, others) + camera_pass.first
-        return number < self.path_count
+        path = path_of_lane(camera_pass, dr.arange(mi.UInt32, camera_pass.lanes))
+        return path + camera_pass.first < self.path_count
 
     # ------------------------------------------------------------------ iterations
 
     def _camera_sequences(self, iteration, camera_paths):
         """The random numbers of the camera paths that gather, so many a pixel, and of those that do
-        not."""
-        extra = max(self.direct_paths - 1, 1)
-        return (
-            self._sequence(iteration, CAMERA, camera_paths),
-            self._sequence(iteration, EXTRA, camera_paths * extra),
-        )
+        not (None where there are none)."""
+        gathering, extra = self._sequence(iteration, CAMERA, camera_paths), self.direct_paths - 1
+        return gathering, self._sequence(iteration, EXTRA, camera_paths * extra) if extra else None
 
     def _photons(self, iteration, spectral):
         """An iteration's photons. Where they overflow the buffers, these grow and the pass runs

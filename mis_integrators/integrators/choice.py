@@ -308,10 +308,10 @@ def _try_path(path, segments, pixels, mean, budget):
     cost = costs.cost("path", costs.events(path, segments, None, 0.0))
     samples = max(round(budget / cost), 1)
     values, weights = np.array(values), relative_weights(mean)
-    if path.integrator.sampler == "independent":
-        variance = trimmed_mean(weights * np.var(values, axis=0, ddof=1))
-    else:  # `Trial.error` divides by the samples
+    if path.integrator.low_discrepancy:  # `Trial.error` divides by the samples
         variance = samples * _variance_of_samples(values, weights, samples)
+    else:
+        variance = trimmed_mean(weights * np.var(values, axis=0, ddof=1))
     return Trial("path", {}, path, 0.0, variance / path.camera_paths, cost * path.camera_paths)
 
 

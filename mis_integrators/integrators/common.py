@@ -78,6 +78,11 @@ class IterativeIntegrator(mi.AdjointIntegrator):
         return f"{type(self).__name__}[\n{lines}\n]"
 
     @property
+    def low_discrepancy(self):
+        """Whether iterations share sequences."""
+        return self.sampler != "independent"
+
+    @property
     def initial_camera_paths(self):
         """The parameter `camera_paths`; where it is automatic, one: until more turn out to be worth
         while."""
@@ -224,7 +229,7 @@ class IterativeSession:
         self.iterations_planned = iterations
         self.camera_paths = integrator.initial_camera_paths
         self.accumulator = Accumulator(
-            sensor.film(), integrator.variance, stratified=integrator.sampler == "sobol"
+            sensor.film(), integrator.variance, stratified=integrator.low_discrepancy
         )
         self.variant = mi.variant()
         settle(scene)
@@ -402,7 +407,7 @@ class IterativeSession:
         return shared_wavelengths(self.sensor, number)
 
     def _low_discrepancy(self, iteration):
-        return self.integrator.sampler == "sobol" and iteration < PILOT_INDEX
+        return self.integrator.low_discrepancy and iteration < PILOT_INDEX
 
     def _seed(self, iteration, *purpose):
         return dr.opaque(mi.UInt32, mix(self.seed, iteration, *purpose))

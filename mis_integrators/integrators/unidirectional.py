@@ -23,12 +23,12 @@ PATHS = 0
 
 class PathSampler(mi.Sampler):
     """Hands the numbers of paths to Mitsuba's own integrators. Every draw stands for a vertex of
-    its own, counted from `first_draw`: Dr.Jit's loops carry the count along."""
+    its own, counted from 1 on: Dr.Jit's loops carry the count along."""
 
-    def __init__(self, numbers, first_draw=1):
+    def __init__(self, numbers):
         super().__init__(mi.Properties())
         self.numbers = numbers
-        self.draw = mi.UInt32(first_draw)
+        self.draw = mi.UInt32(1)
 
     def _next(self, dimensions):
         found = self.numbers.at(self.draw).next_floats(dimensions)

@@ -86,21 +86,26 @@ def start_camera_paths(camera_pass: CameraPass):
     return path, active, numbers, mi.Ray3f(ray), weight, splat, aperture
 
 
-def _pixels_and_numbers(camera_pass: CameraPass, path):
-    """The pixel of each path, and its random numbers (`PathNumbers`)."""
+def _pixels_and_numbers(camera_pass: CameraPass, lane):
+    """The pixel of each lane's path, and its random numbers (`PathNumbers`)."""
     first, extra = camera_pass.first, camera_pass.extra
-    usual = path < camera_pass.count
-    if extra:
-        other = dr.select(usual, 0, path - camera_pass.count)
-        path = dr.select(usual, path, other // extra)
-        if dr.width(first) > 1:
-            first = dr.gather(mi.UInt32, first, path)
+    path = path_of_lane(camera_pass, lane)
+    if extra and dr.width(first) > 1:
+        first = dr.gather(mi.UInt32, first, path)
     number = path * camera_pass.stride + first
     numbers = camera_pass.sequence.of_paths(number)
     if extra:
-        own = camera_pass.extra_sequence.of_paths(number * extra + other % extra)
-        numbers = numbers.where(usual, own)
+        own = number * extra + (lane - camera_pass.count) % extra
+        numbers = numbers.where(lane < camera_pass.count, camera_pass.extra_sequence.of_paths(own))
     return number // camera_pass.camera_paths, numbers
+
+
+def path_of_lane(camera_pass: CameraPass, lane):
+    """Which of the `count` paths of a pass a lane traces, or is an extra one for."""
+    if not camera_pass.extra:
+        return lane
+    extra = (lane - camera_pass.count) // camera_pass.extra
+    return dr.select(lane < camera_pass.count, lane, extra)
 
 
 def with_gaps(first, skip, n_paths: int, camera_paths: int):

@@ -71,10 +71,6 @@ class Queries:
     `bdd`: the last smooth camera vertex, counted from 0; `capacity`: vertices that there is room
     for (under weights, in each section); `has_caustics`, `has_indirect`: kinds of photons that
     there are; `one_vertex`: no path asks twice, and each owns the place of its number.
-
-    The first `paths` camera paths ask for photons (None: all). Others that follow see emission and
-    direct light at the first smooth vertex only, and all but this counts `boost` times with those
-    that ask.
     """
 
     bdd: int
@@ -82,12 +78,13 @@ class Queries:
     has_caustics: bool
     has_indirect: bool
     one_vertex: bool
-    paths: int | None = None
-    boost: int = 1
 
 
 class QueryVisitor:
     """Direct light, and vertices that wait for photons (a `CameraVisitor`).
+
+    The extra paths of a pass ask for no photons: they see emission and direct light at their first
+    smooth vertex only, and all but this counts `boost` times with those that ask.
 
     Its state: smooth vertices left behind (the last one counts as the `bdd`-th); whether the last
     vertex scattered by a delta function; the density of the last smooth scattering; the last smooth
@@ -95,10 +92,11 @@ class QueryVisitor:
     the state of `weights`.
     """
 
-    def __init__(self, world, limits, queries, weights):
+    def __init__(self, world, limits, camera_pass, queries, weights):
         self.scene, self.lights, self.traits = world.scene, world.lights, world.traits
         self.hide_emitters, self.queries, self.weights = limits.hide_emitters, queries, weights
         self.bdd = queries.bdd
+        self.paths, self.boost = camera_pass.count, 1 + camera_pass.extra
         self.sections = 1 if weights is None else self.bdd + 1
         self.by_light = weights is not None and weights.weighs_points_of_lights
         self.store = Store(
@@ -136,9 +134,9 @@ class QueryVisitor:
         weights, bsdf = self.weights, at.bsdf
         smooth = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
         at.ends = vertex >= self.bdd  # the path's last smooth vertex
-        if self.queries.boost > 1:
+        if self.boost > 1:
             at.ends |= ~self._asks(at)
-            times = dr.select(smooth & (vertex > 0), self.queries.boost, times)
+            times = dr.select(smooth & (vertex > 0), self.boost, times)
         if weights is not None:
             sums, share = weights.propagate(sums, at.si, bsdf, vertex, smooth)
             share_here = dr.select(smooth, share, share_here)
@@ -166,7 +164,7 @@ class QueryVisitor:
 
     def _asks(self, at):
         """Which paths ask for photons."""
-        return True if self.queries.paths is None else at.path < self.queries.paths
+        return at.path < self.paths if self.boost > 1 else True
 
     def _ask_for_photons(self, state, at, smooth):
         """Stores the vertices at which photons are to be gathered."""
@@ -238,6 +236,6 @@ def trace_camera_paths(
     of the path, of `capacity` each (a path's last vertex in the last section), and `count` has one
     entry for each.
     """
-    visitor = QueryVisitor(world, limits, queries, weights)
+    visitor = QueryVisitor(world, limits, camera_pass, queries, weights)
     radiance, alpha, splat = trace_camera(world, limits, camera_pass, visitor)
     return radiance, alpha, splat, visitor.store.vertices, visitor.store.count

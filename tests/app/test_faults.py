@@ -18,6 +18,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from lamplit import ROOT, command, read, render, run, same, write_scene
+from worlds import lit_ball
 
 
 @pytest.fixture
@@ -525,23 +526,7 @@ def test_texel_is_named_from_python(spotted, tmp_path, capfd):
 @pytest.mark.parametrize("plugin", ["bdpm", "bdpt", "volpath_multiview", "path"])
 @pytest.mark.parametrize("size", [(1, 1), (1, 3), (3, 1)])
 def test_films_of_few_pixels(rgb, plugin, size):
-    scene = mi.load_dict(
-        {
-            "type": "scene",
-            "light": {"type": "constant"},
-            "ball": {"type": "sphere", "bsdf": {"type": "diffuse"}},
-            "sensor": {
-                "type": "perspective",
-                "to_world": mi.ScalarTransform4f().translate([0, 0, -4]),
-                "film": {
-                    "type": "hdrfilm",
-                    "width": size[0],
-                    "height": size[1],
-                    "rfilter": {"type": "box"},
-                },
-            },
-        }
-    )
+    scene = lit_ball(*size)
     session = make_session(mi.load_dict({"type": plugin}), scene, scene.sensors()[0], 0, 2)
     session.keep_variance()
     for number in range(2):

@@ -355,6 +355,23 @@ def tray(family, emitter, sensor_kind="perspective", only=None, **film_options):
     return mi.load_dict(scene)
 
 
+def lit_ball(width, height, **sensor_options):
+    """A ball under an even sky, on a film of so many pixels."""
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "light": {"type": "constant"},
+            "ball": {"type": "sphere", "bsdf": {"type": "diffuse"}},
+            "sensor": {
+                "type": "perspective",
+                "to_world": T().translate([0, 0, -4]),
+                "film": film(width, height=height),
+                **sensor_options,
+            },
+        }
+    )
+
+
 def bdpm(**parameters):
     return mi.load_dict(
         {

@@ -30,7 +30,7 @@ from comparing import (
     pictures,
     smallest_visible,
 )
-from worlds import T, bdpm, diffuse, film, grey, look, path, sensor, tray
+from worlds import T, bdpm, diffuse, film, grey, lit_ball, look, path, sensor, tray
 
 
 def box_scene(size=32, rfilter="box", film_options=None, light="area", **entries):
@@ -567,19 +567,7 @@ def test_rounding_up_is_said_once(rgb):
 @pytest.mark.parametrize("sampler", ("independent", "multijitter"))
 def test_samplers_that_are_not_used_are_named_once(rgb, plugin, sampler):
     """By `mi.render`, and for `mis-render` in the remarks of the session."""
-    scene = mi.load_dict(
-        {
-            "type": "scene",
-            "lamp": {"type": "constant"},
-            "ball": {"type": "sphere", "bsdf": {"type": "diffuse"}},
-            "sensor": {
-                "type": "perspective",
-                "to_world": look((0, 0, 5), (0, 0, 0), (0, 1, 0)),
-                "film": film(4),
-                "sampler": {"type": sampler, "sample_count": 4},
-            },
-        }
-    )
+    scene = lit_ball(4, 4, sampler={"type": sampler, "sample_count": 4})
     integrator = mi.load_dict({"type": plugin, "max_depth": 2, "sampler": "independent"})
     with said() as lines:
         for seed in range(2):
