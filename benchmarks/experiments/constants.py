@@ -8,10 +8,13 @@ import ast
 import json
 import time
 from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from mis_integrators.analysis.metrics import References, errors
 from mis_integrators.app import loading
+from mis_integrators.core.session import Session
 
 import drjit as dr
 import numpy as np
@@ -38,6 +41,16 @@ METHODS = {
 }
 """What judges a constant, or those of a module or of a folder; others are judged by `USUAL`."""
 USUAL = "bdpm:bdd=0"
+BY_CLOCK = (
+    "integrators.choice",
+    "integrators.piloted",
+    "pilot.result",
+    "pilot.cost.LEAST_CAMERA_SHARE",
+    "pilot.cost.MOST_CAMERA_SHARE",
+    "pilot.run.FEWEST_TIMED_ITERATIONS",
+    "pilot.run.PILOT_TIME_SHARE",
+)
+"""Constants, or those of modules, that only renders of a given time read."""
 OF_SEVERAL_VIEWS = "volume."
 """Modules that none of these scenes needs."""
 SEEN_BY_ENVIRONMENTS = ("lights.environment_guide", "lights.portals")
@@ -85,40 +98,39 @@ def run(options: argparse.Namespace) -> None:
     for path in options.scenes:
         opened = open_at_width(path, options.width)
         references = find_references(opened, options, console.log)
-        renders: dict[tuple, tuple[float, float]] = {}
-        for key, name, method, values in experiments:
+        for key, method, variants in experiments:
             if not _concerns(key, opened):
                 continue
-            ratios = []
-            for seed in range(options.seeds):
-                plain = (method.label, seed)
-                try:
-                    if plain not in renders:
-                        renders[plain] = judge(opened, method, references, options.time, seed, {})
-                    new = judge(opened, method, references, options.time, seed, values)
-                except loading.SCENE_ERRORS as error:
-                    console.log(f"{opened.name}, {method.label}: {loading.one_line(error)}")
-                    break
-                ratios.append([new[i] / renders[plain][i] for i in range(2)])
-            if ratios:
-                place = found.setdefault(key, {}).setdefault(name, {})
-                place[opened.name] = [float(x) for x in np.exp(np.mean(np.log(ratios), axis=0))]
-                console.log(f"{opened.name}: {key} {name}: {place[opened.name]}")
+            judge = Judge(method, opened, references, options.time, key.startswith(BY_CLOCK))
+            try:
+                ratios = judge.ratios(variants, options.seeds)
+            except loading.SCENE_ERRORS as error:
+                console.log(f"{opened.name}, {method.label}: {loading.one_line(error)}")
+                continue
+            for name, ratio in ratios.items():
+                found.setdefault(key, {}).setdefault(name, {})[opened.name] = ratio
+                console.log(f"{opened.name}: {key} {name}: {ratio}")
             options.file.write_text(json.dumps(found, indent=1, sort_keys=True) + "\n")
 
 
-def wanted(options: argparse.Namespace) -> list[tuple[str, str, Method, dict[str, object]]]:
-    """``(key, name of the variant, method, changed values)`` of each experiment."""
+def wanted(
+    options: argparse.Namespace,
+) -> list[tuple[str, Method, dict[str, dict[str, object]]]]:
+    """``(key, method, changed values by name of the variant)`` of each experiment."""
     if options.change:
         values = dict(_assignment(text) for text in options.change)
         method = options.method or method_of(next(iter(values)))
-        return [(" ".join(options.change), "changed", method, values)]
+        return [(" ".join(options.change), method, {"changed": values})]
     return [
-        (constant.key, name, options.method or method_of(constant.key), {constant.key: value})
+        (
+            constant.key,
+            options.method or method_of(constant.key),
+            {name: {constant.key: value} for name, value in variants(constant).items()},
+        )
         for constant in tuned_constants()
         if not constant.key.startswith(OF_SEVERAL_VIEWS)
         if not options.only or any(part in constant.key for part in options.only)
-        for name, value in variants(constant).items()
+        if variants(constant)
     ]
 
 
@@ -139,27 +151,67 @@ def open_at_width(path: Path, width: int) -> OpenScene:
     return open_scene(path, (width, max(round(width * own[1] / own[0]), 1)))
 
 
-def judge(
-    opened: OpenScene,
-    method: Method,
-    references: References,
-    seconds: float,
-    seed: int,
-    values: Mapping[str, object],
-) -> tuple[float, float]:
-    """Relative squared error of a render of so many seconds with the constants changed: trimmed,
-    and not. What kernels take to compile is not counted."""
-    with changed(values), dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-        maker = SessionMaker(method, opened, seconds, warm_up=False)
-        for _ in range(2):  # the first compiles; the second does what time for that kept it from
-            throw_away = maker.make(seed=2**31)
-            throw_away.iterate()
-            throw_away.iterate()
-        contender = Contender.begin(method.label, maker.make, seed)
-        while contender.wants(seconds):
-            contender.iterate()
-        contender.take_snapshot()
-    # The last iteration seldom ends when the time is over: noise falls with the time.
-    late = contender.rendering / seconds
-    found = errors(contender.snapshots[-1].image, references)
-    return max(found.relmse_trimmed, 1e-12) * late, max(found.relmse, 1e-12) * late
+@dataclass(frozen=True)
+class Judge:
+    """Compares renders with constants changed to renders without."""
+
+    method: Method
+    opened: OpenScene
+    references: References
+    seconds: float
+    """Of a render with the usual values, about."""
+    by_clock: bool
+    """Whether all renders last so long; else all take as many samples as fit then, and what they
+    take counts. Then both have the same random numbers, and what changes nothing shows as that."""
+
+    def ratios(
+        self, variants: Mapping[str, Mapping[str, object]], seeds: int
+    ) -> dict[str, list[float]]:
+        """By variant, relative squared error times time with its values over that without,
+        geometric mean over the seeds: without the worst 0.1 % of the pixels, and with them. What
+        kernels take to compile is not counted."""
+        samples = None if self.by_clock else self._samples()
+        logs: dict[str, list[np.ndarray]] = {name: [] for name in variants}
+        for seed in range(seeds):
+            usual = self._error_times_time(samples, seed, {})
+            for name, values in variants.items():
+                new = self._error_times_time(samples, seed, values)
+                logs[name].append(np.log(new / usual))
+        return {name: np.exp(np.mean(of_seeds, axis=0)).tolist() for name, of_seeds in logs.items()}
+
+    def _samples(self) -> int:
+        place = self.opened.name, self.method.label, self.seconds
+        if place not in _SAMPLES:
+            session = self._render(None, 0, {}).session
+            _SAMPLES[place] = session.iterations * session.camera_paths
+        return _SAMPLES[place]
+
+    def _error_times_time(
+        self, samples: int | None, seed: int, values: Mapping[str, object]
+    ) -> np.ndarray:
+        render = self._render(samples, seed, values)
+        found = errors(render.snapshots[-1].image, self.references)
+        return np.maximum([found.relmse_trimmed, found.relmse], 1e-12) * render.rendering
+
+    def _render(self, samples: int | None, seed: int, values: Mapping[str, object]) -> Contender:
+        """A render of so many samples a pixel, else by the clock; again if much of its time went
+        into compiling."""
+        with changed(values), dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            for _ in range(3):
+                render = Contender.begin(self.method.label, partial(self._session, samples), seed)
+                while render.wants(self.seconds, samples):
+                    render.iterate()
+                if render.compiling < 0.05 * render.rendering:
+                    break
+            render.take_snapshot()
+        return render
+
+    def _session(self, samples: int | None, seed: int) -> Session:
+        if samples is None:
+            return SessionMaker(self.method, self.opened, self.seconds, warm_up=False).make(seed)
+        integrator = self.method.integrator(self.opened)
+        return integrator.session(self.opened.scene, self.opened.sensor, seed=seed, spp=samples)
+
+
+_SAMPLES: dict[tuple, int] = {}
+"""Samples a pixel that a scene and a method have time for in so many seconds."""
