@@ -59,10 +59,11 @@ def add_folder(command: argparse.ArgumentParser) -> None:
 
 def recipe(opened: OpenScene) -> dict:
     """How the references of a scene are made, ``method``, and the methods that must agree,
-    ``opinions``: path, where there are media volpath, unless `references.json` knows better."""
-    return RECIPE.get(
-        opened.name, {"method": "volpath" if has_media(opened.scene) else "path", "opinions": []}
-    )
+    ``opinions``: path, where there are media volpath, unless `references.json` knows better. Under
+    the better sampler: at the edges of bright lamps references by independent numbers would be
+    noisier than what they judge."""
+    plugin = "volpath" if has_media(opened.scene) else "path"
+    return RECIPE.get(opened.name, {"method": f"{plugin}:sampler=multijitter", "opinions": []})
 
 
 def find_references(

@@ -45,13 +45,14 @@ def colour_channels(radiance, matrix):
     return radiance
 
 
-def splat_samples(film, position, radiance, alpha, matrix, active):
+def splat_samples(film, position, radiance, alpha, matrix, active, weight=1):
     """Reconstructs one pass: an image tensor (height, width, channels), border included, that holds
-    sums of filter weight times (R, G, B, [alpha,] 1); `matrix` as for `colour_channels`."""
-    values = list(colour_channels(radiance, matrix))
+    sums of filter weight times (R, G, B, [alpha,] 1); `matrix` as for `colour_channels`. Samples
+    may have a `weight` of their own, in all channels."""
+    values = [value * weight for value in colour_channels(radiance, matrix)]
     if mi.has_flag(film.flags(), mi.FilmFlags.Alpha):
-        values.append(alpha)
-    return splat_channels(film, position, values + [mi.Float(1)], active)
+        values.append(alpha * weight)
+    return splat_channels(film, position, [*values, mi.Float(weight)], active)
 
 
 def splat_channels(film, position, channels, active):

@@ -125,9 +125,12 @@ class SampleSequence:
 
     def of_paths(self, number) -> PathNumbers:
         """Those of the paths `number` of the pass (a uint32 array)."""
-        group, own = number // self.group_size, number % self.group_size
+        return self.of_members(number // self.group_size, number % self.group_size)
+
+    def of_members(self, group, member) -> PathNumbers:
+        """Those of the paths that come `member`-th in their `group` (uint32 arrays)."""
         key = hash_bits(hash_bits(group) + self.seed)
-        return PathNumbers(self.first + own, key, self.low_discrepancy)
+        return PathNumbers(self.first + member, key, self.low_discrepancy)
 
     def own_seed(self):
         """A seed of this pass alone."""
@@ -140,14 +143,6 @@ class PathNumbers:
 
     def __init__(self, index, key, low_discrepancy):
         self.index, self.key, self.low_discrepancy = index, key, low_discrepancy
-
-    def where(self, mask, other) -> PathNumbers:
-        """These where the mask is set, elsewhere those of the `other`, of the same kind."""
-        return PathNumbers(
-            dr.select(mask, self.index, other.index),
-            dr.select(mask, self.key, other.key),
-            self.low_discrepancy,
-        )
 
     def at(self, vertex) -> VertexNumbers:
         """Those of one vertex (an integer, or an array)."""

@@ -15,7 +15,7 @@ from ..core.recording import lanes, recorder
 from ..core.spectra import channel_mean
 from ..core.traits import SceneTraits, lookup
 from ..lights.lights import Lights
-from ..paths.camera import film_sample_count, film_size, path_of_lane
+from ..paths.camera import film_sample_count, film_size
 from ..paths.setting import World
 from ..photons.coverage import covered_share
 from ..photons.gather import QueryVertices, gather_photons, mean_photon_count
@@ -24,14 +24,13 @@ from ..photons.queries import Queries, read_queries, trace_camera_paths
 from ..photons.trace import trace_light_paths
 from ..pilot.setting import PilotSetting
 from .common import MOST_LIGHT_PATHS, IterativeIntegrator
+from .direct_light import DirectLight
 from .piloted import PilotedSession
 from .schedule import read_radius
 
 SPARE_PHOTONS = 1 << 20
 """Unused room beyond half of a photon buffer that is worth the time to record the passes anew."""
-USUAL_DIRECT_PATHS = 4
-"""Tuned: camera paths that see direct light, for each that gathers photons."""
-MOST_DIRECT_PATHS = 1024
+MOST_DIRECT_PATHS = 256
 CAMERA_CHUNK = 1 << 21
 """Camera paths traced at once at most; larger films are traced in parts (bounds memory)."""
 
@@ -75,8 +74,9 @@ class BDPM(IterativeIntegrator):
          (i + 1)^(alpha - 1). 1 keeps the radius. (Default: 1)
      * - direct_paths
        - |int|
-       - Camera paths that see emission and direct light at their first smooth vertex, for each one
-         that gathers photons. (Default: 4)
+       - Camera paths per pixel and iteration that see emission and direct light at their first
+         smooth vertex, those that gather photons among them. 0 sends more of them through pixels
+         where such light is noisy, as a few trials tell. (Default: 0)
      * - camera_paths
        - |int|
        - Camera paths per pixel and iteration that gather photons. 0 stands for one; in a render of
@@ -143,7 +143,7 @@ class BDPM(IterativeIntegrator):
         )
         self.initial_radius, self.alpha = read_radius(parameters)
         self.direct_paths = parameters.integer(
-            "direct_paths", USUAL_DIRECT_PATHS, 1, "at least 1", high=MOST_DIRECT_PATHS
+            "direct_paths", 0, 0, "at least 0 (0: automatic)", high=MOST_DIRECT_PATHS
         )
 
     def settings(self):
@@ -182,9 +182,7 @@ class BDPMSession(PilotedSession):
         self.one_vertex = not self.traits.has_mixed and (
             integrator.bdd == 0 or not self.has_caustics
         )
-        # Where nothing is gathered, more paths are more samples, no cheaper than those.
-        self.direct_paths = integrator.direct_paths if self.kinds() else 1
-        self.split_paths(CAMERA_CHUNK // self.direct_paths)
+        self.split_paths(CAMERA_CHUNK)
         self.photon_capacity = rounded_up(3 * self.light_path_count)
         self.vertex_capacity = self._vertex_room(self.chunk)
         if integrator.initial_radius:
@@ -193,6 +191,7 @@ class BDPMSession(PilotedSession):
         self.photons_found = 0  # by the last light pass
         self._sized = False
         self.recorded = recorder()
+        self.direct_light = DirectLight(self)
         self._freeze()
 
     @property
@@ -213,7 +212,7 @@ class BDPMSession(PilotedSession):
 
     def set_camera_paths(self, camera_paths):
         super().set_camera_paths(camera_paths)
-        self.split_paths(CAMERA_CHUNK // self.direct_paths)
+        self.split_paths(CAMERA_CHUNK)
         self.vertex_capacity = self._vertex_room(self.chunk)
         self._record_camera_pass()
 
@@ -237,6 +236,28 @@ class BDPMSession(PilotedSession):
 
     def pilot_passes(self, setting, pixels):
         return SubsetPasses(self, setting, pixels)
+
+    def start(self):
+        super().start()
+        if self.direct_light.mean_paths is None:
+            self.direct_light.spread(self.camera_paths)
+
+    def _take(self, choice):
+        super()._take(choice)
+        if not self.kept:
+            self.direct_light.spread(self.camera_paths, self.prediction)
+        if self.prediction is not None:
+            self.prediction = self.direct_light.known_by(self.prediction)
+
+    @property
+    def learned(self):
+        learned = super().learned
+        return learned and {**learned, "direct_light": self.direct_light.learned}
+
+    def recall_more(self, fields):
+        of_direct_light = fields.object("direct_light")
+        self.direct_light.recall(of_direct_light)
+        of_direct_light.finish()
 
     def _vertex_room(self, paths):
         if not self.kinds():
@@ -270,13 +291,13 @@ class BDPMSession(PilotedSession):
         """The weights of camera paths (a `mis.state.MergeState`); None where there are none."""
         return None
 
-    def _trace_camera(self, camera_pass, capacity, spectral):
+    def _trace_camera(self, camera_pass, capacity, spectral, beyond=None):
         """Traces the paths of a `CameraPass`, with room for so many vertices."""
         queries = Queries(
             self.last_vertex, capacity, self.has_caustics, self.has_indirect, self.one_vertex
         )
         return trace_camera_paths(
-            self.world, self.limits, camera_pass, queries, self._merge_state(spectral)
+            self.world, self.limits, camera_pass, queries, self._merge_state(spectral), beyond
         )
 
     def _gather(self, photon_map, vertices, kind, radii, spectral, grey=False):
@@ -341,10 +362,14 @@ class BDPMSession(PilotedSession):
     def _build_maps(self, photons, radii):
         return {kind: self._map(photons, kind, radius).arrays() for kind, radius in radii.items()}
 
-    def _render_chunk(self, scene, sensor, tables, maps, sequences, first, spectral, radii):
-        camera_pass = self._describe_camera_paths(sensor, sequences, first, spectral)
+    def _render_chunk(self, scene, sensor, tables, maps, sequence, first, spectral, radii, beyond):
+        camera_pass = self.describe_camera_pass(sensor, sequence, first, spectral)
+        path = dr.arange(mi.UInt32, self.chunk) + first
+        there = path < self.path_count  # the last part may have fewer
+        if beyond is not None:
+            beyond = dr.gather(mi.Float, beyond, path // self.camera_paths, there)
         radiance, alpha, position, vertices, count = self._trace_camera(
-            camera_pass, self.vertex_capacity, spectral
+            camera_pass, self.vertex_capacity, spectral, beyond
         )
         if radii:
             dr.eval(radiance, alpha, position, vertices, count)
@@ -355,10 +380,10 @@ class BDPMSession(PilotedSession):
             (gathered,) = self._gather(photon_map, vertices, kind, [radius], spectral)
             if self.corrected[kind]:
                 gathered *= dr.rcp(
-                    self._covered(scene, tables, vertices, radius, camera_pass.sequence.own_seed())
+                    self._covered(scene, tables, vertices, radius, sequence.own_seed())
                 )
-            gathered = self._per_path(gathered, vertices, self.chunk) * (1 + camera_pass.extra)
-            radiance += _widened(gathered, camera_pass)
+            gathered = self._per_path(gathered, vertices, self.chunk)
+            radiance += gathered if beyond is None else gathered * beyond
         if self.integrator.hide_emitters:
             radiance = dr.select(
                 alpha > 0, radiance, 0
@@ -369,30 +394,11 @@ class BDPMSession(PilotedSession):
             radiance,
             alpha,
             spectral["matrix"],
-            self._there_are(camera_pass),
+            there,
+            1 if beyond is None else dr.rcp(beyond),
         ), count
 
-    def _describe_camera_paths(self, sensor, sequences, first, spectral):
-        """The `CameraPass` of a part. `sequences`: as of `_camera_sequences`."""
-        sequence, of_extra_paths = sequences
-        return replace(
-            self.describe_camera_pass(sensor, sequence, first, spectral),
-            extra=self.direct_paths - 1,
-            extra_sequence=of_extra_paths,
-        )
-
-    def _there_are(self, camera_pass):
-        """Which paths of a part there are: the last part may have fewer."""
-        path = path_of_lane(camera_pass, dr.arange(mi.UInt32, camera_pass.lanes))
-        return path + camera_pass.first < self.path_count
-
     # ------------------------------------------------------------------ iterations
-
-    def _camera_sequences(self, iteration, camera_paths):
-        """The random numbers of the camera paths that gather, so many a pixel, and of those that do
-        not (None where there are none)."""
-        gathering, extra = self._sequence(iteration, CAMERA, camera_paths), self.direct_paths - 1
-        return gathering, self._sequence(iteration, EXTRA, camera_paths * extra) if extra else None
 
     def _photons(self, iteration, spectral):
         """An iteration's photons. Where they overflow the buffers, these grow and the pass runs
@@ -431,10 +437,11 @@ class BDPMSession(PilotedSession):
                     self.sensor,
                     self._tables,
                     maps,
-                    self._camera_sequences(iteration, self.camera_paths),
+                    self._sequence(iteration, CAMERA, self.camera_paths),
                     first,
                     spectral,
                     radii,
+                    self.direct_light.beyond,
                 )
                 wanted = 0 if self.one_vertex else int(dr.max(count)[0])
                 if wanted <= self.vertex_capacity or not radii:
@@ -443,16 +450,7 @@ class BDPMSession(PilotedSession):
                 self._freeze()
 
         (block,) = self.sum_of_chunks(render)
-        return block
-
-
-def _widened(values, camera_pass):
-    """Values of the camera paths that gather, for all those of a pass: zero for the others."""
-    if not camera_pass.extra:
-        return values
-    path = dr.arange(mi.UInt32, camera_pass.lanes)
-    dr.eval(values)  # else each channel would be gathered in a kernel of its own
-    return dr.gather(type(values), values, path, path < camera_pass.count)
+        return self.direct_light.add_to(block, iteration, spectral)
 
 
 class SubsetPasses:
@@ -471,10 +469,10 @@ class SubsetPasses:
             1 - pixels.count * stride
         ) % 2**32  # from a path of the last pixel to the next one of the first
         self._camera = session.recorded(
-            lambda scene, sensor, tables, sequences, spectral: session._trace_camera(
+            lambda scene, sensor, tables, sequence, spectral: session._trace_camera(
                 replace(
-                    session._describe_camera_paths(
-                        sensor, sequences, lanes(pixels.paths) // pixels.count * back, spectral
+                    session.describe_camera_pass(
+                        sensor, sequence, lanes(pixels.paths) // pixels.count * back, spectral
                     ),
                     count=pixels.paths,
                     camera_paths=pixels.camera_paths,
@@ -508,17 +506,17 @@ class SubsetPasses:
         photons = session._photons(number, spectral)
         if self.photon_capacity != session.photon_capacity:
             self._record_gather()
-        sequences = session._camera_sequences(number, self.pixels.camera_paths)
-        radiance, vertices = self._trace_camera(sequences, spectral)
-        return SubsetIteration(self, photons, vertices, radiance, sequences[0].own_seed(), spectral)
+        sequence = session._sequence(number, CAMERA, self.pixels.camera_paths)
+        radiance, vertices = self._trace_camera(sequence, spectral)
+        return SubsetIteration(self, photons, vertices, radiance, sequence.own_seed(), spectral)
 
-    def _trace_camera(self, sequences, spectral):
+    def _trace_camera(self, sequence, spectral):
         """Radiance and vertices of the camera paths. Where the vertices overflow their buffer, it
         grows and the pass runs again."""
         session = self.session
         while True:
             radiance, _, _, vertices, count = self._camera(
-                session.scene, session.sensor, session._tables, sequences, spectral
+                session.scene, session.sensor, session._tables, sequence, spectral
             )
             found = 0 if session.one_vertex else int(dr.max(count)[0])
             if found <= self.capacity:
@@ -585,13 +583,9 @@ class SubsetIteration(NamedTuple):
         return self.passes.gather(self.photons, self.vertices, radii, self.seed, self.spectral)
 
     def direct(self):
-        passes = self.passes
-        paths, of_each = passes.pixels.paths, passes.session.direct_paths
-        values = np.broadcast_to(np.array(channel_mean(self.radiance)), paths * of_each)
-        others = values[paths:].reshape(paths, of_each - 1).sum(axis=1)
-        return passes.by_pixel((values[:paths] + others) / of_each)
+        return self.passes.by_pixel(channel_mean(self.radiance))
 
 
-LIGHT, CAMERA, EXTRA = 0, 1, 4
-"""Purposes of an iteration's random seeds, besides `IterativeSession.WAVELENGTH` and
-`bdpm_opt.FROZEN`."""
+LIGHT, CAMERA = 0, 1
+"""Purposes of an iteration's random seeds, besides `IterativeSession.WAVELENGTH`,
+`bdpm_opt.FROZEN` and `direct_light.PURPOSE`."""

@@ -33,7 +33,7 @@ def events(session, segments, last_vertex, gathered):
 def of_direct_paths(session, segments):
     """Cost of the camera paths that see direct light only, beside the first: they are as far as the
     first smooth vertex what `path` is, whose segments are the unit."""
-    return (getattr(session, "direct_paths", 1) - 1) * float(segments[0])
+    return session.direct_light.mean_paths * float(segments[0])
 
 
 def cost(plugin, counted, prices=PRICES):

@@ -91,8 +91,12 @@ class PilotedSession(IterativeSession):
         }
         self.corrected = {kind: corrected.boolean(kind) for kind in self.kinds()}
         self.set_camera_paths(fields.integer("camera_paths", 1, self.most_camera_paths()))
+        self.recall_more(fields)
         for each in (radii, corrected, fields):
             each.finish()
+
+    def recall_more(self, fields):
+        """Takes over what a subclass has `learned` besides."""
 
     def set_camera_paths(self, camera_paths):
         """Sends so many camera paths through each pixel from the next iteration on."""

@@ -11,7 +11,7 @@ import mitsuba as mi
 from ..core.random import next_1d_and_2d, next_2d
 from .camera_rays import sample_camera_ray
 from .roulette import russian_roulette
-from .setting import CameraPass, Limits, World
+from .setting import CameraPass, Limits, ListedPass, World
 
 Array = Any
 
@@ -63,7 +63,7 @@ def within_crop(film, splat):
     return dr.all((splat >= offset) & (splat < offset + size))
 
 
-def start_camera_paths(camera_pass: CameraPass):
+def start_camera_paths(camera_pass: CameraPass | ListedPass):
     """Camera rays of a pass.
 
     Returns `(path, active, numbers, ray, weight, splat, aperture)`: the index of each, whether
@@ -71,8 +71,8 @@ def start_camera_paths(camera_pass: CameraPass):
     position for splatting, and the sample that chose the point of the lens.
     """
     sensor = camera_pass.sensor
-    path = dr.arange(mi.UInt32, camera_pass.lanes)
-    pixel, numbers = _pixels_and_numbers(camera_pass, path)
+    path = dr.arange(mi.UInt32, camera_pass.count)
+    pixel, numbers = camera_pass.pixels_and_numbers(path)
     active = pixel < film_sample_count(sensor)
     rng = numbers.at(0)
     unit, splat = film_samples(sensor, pixel, rng)
@@ -84,28 +84,6 @@ def start_camera_paths(camera_pass: CameraPass):
         sensor, time, camera_pass.wavelength_sample, unit, aperture, active
     )
     return path, active, numbers, mi.Ray3f(ray), weight, splat, aperture
-
-
-def _pixels_and_numbers(camera_pass: CameraPass, lane):
-    """The pixel of each lane's path, and its random numbers (`PathNumbers`)."""
-    first, extra = camera_pass.first, camera_pass.extra
-    path = path_of_lane(camera_pass, lane)
-    if extra and dr.width(first) > 1:
-        first = dr.gather(mi.UInt32, first, path)
-    number = path * camera_pass.stride + first
-    numbers = camera_pass.sequence.of_paths(number)
-    if extra:
-        own = number * extra + (lane - camera_pass.count) % extra
-        numbers = numbers.where(lane < camera_pass.count, camera_pass.extra_sequence.of_paths(own))
-    return number // camera_pass.camera_paths, numbers
-
-
-def path_of_lane(camera_pass: CameraPass, lane):
-    """Which of the `count` paths of a pass a lane traces, or is an extra one for."""
-    if not camera_pass.extra:
-        return lane
-    extra = (lane - camera_pass.count) // camera_pass.extra
-    return dr.select(lane < camera_pass.count, lane, extra)
 
 
 def with_gaps(first, skip, n_paths: int, camera_paths: int):
@@ -179,7 +157,12 @@ class CameraVisitor(Protocol):
 
 
 @dr.syntax
-def trace_camera(world: World, limits: Limits, camera_pass: CameraPass, visitor: CameraVisitor):
+def trace_camera(
+    world: World,
+    limits: Limits,
+    camera_pass: CameraPass | ListedPass,
+    visitor: CameraVisitor,
+):
     """Traces the camera paths of a pass and shows what they meet to the `visitor`.
 
     Returns `(radiance, alpha, splat position)` of each path.
@@ -194,7 +177,7 @@ def trace_camera(world: World, limits: Limits, camera_pass: CameraPass, visitor:
     depth = mi.UInt32(0)
     eta = mi.Float(1)
     context = mi.BSDFContext()
-    state = visitor.begin(camera_pass.lanes, splat, aperture)
+    state = visitor.begin(camera_pass.count, splat, aperture)
     visible = mi.Bool((scene.environment() is not None) and not hide_emitters)
     if dr.hint(max_depth == 0, mode="scalar"):
         active &= False

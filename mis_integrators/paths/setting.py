@@ -61,9 +61,7 @@ class CameraPass:
     `integrator`: what moves rays on behind emitters that are hidden (None: none are);
     `sequence`: their random numbers (a `SampleSequence`); `first`: uint32
     of width one, or one a path (see `camera.with_gaps`); `wavelength_sample`: in
-    [0, 1), makes the wavelengths that all paths share; `extra`: further paths of the same pixel for
-    each of these, with random numbers of their own (`extra_sequence`); they follow after all of
-    these, those of a path side by side. What they are for is the visitor's affair.
+    [0, 1), makes the wavelengths that all paths share.
     """
 
     sensor: Any
@@ -74,10 +72,27 @@ class CameraPass:
     camera_paths: int
     wavelength_sample: Array
     stride: int = 1
-    extra: int = 0
-    extra_sequence: Any = None
 
-    @property
-    def lanes(self) -> int:
-        """Camera paths in all."""
-        return self.count * (1 + self.extra)
+    def pixels_and_numbers(self, path):
+        """The pixel of each path, and its random numbers (`PathNumbers`)."""
+        number = path * self.stride + self.first
+        return number // self.camera_paths, self.sequence.of_paths(number)
+
+
+@dataclass(frozen=True)
+class ListedPass:
+    """`count` camera paths through any pixels: path i is the one of number `index[i]` in the
+    sequence of `pixel[i]` (uint32; a pixel that the film does not have: no path). All else as in
+    `CameraPass`."""
+
+    sensor: Any
+    integrator: Any
+    sequence: Any
+    pixel: Array
+    index: Array
+    count: int
+    wavelength_sample: Array
+
+    def pixels_and_numbers(self, path):
+        """As of `CameraPass`; the paths are those of all lanes."""
+        return self.pixel, self.sequence.of_members(self.pixel, self.index)

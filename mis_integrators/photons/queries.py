@@ -13,7 +13,7 @@ from ..core.recording import lanes
 from ..core.records import Layout
 from ..lights.lights import mis_power
 from ..paths.camera import trace_camera
-from ..paths.setting import CameraPass, Limits, World
+from ..paths.setting import CameraPass, Limits, ListedPass, World
 
 LAST_VERTEX = 1 << 31
 """Bit of a vertex' depth that says that all photons are wanted there, else only caustic ones."""
@@ -83,8 +83,8 @@ class Queries:
 class QueryVisitor:
     """Direct light, and vertices that wait for photons (a `CameraVisitor`).
 
-    The extra paths of a pass ask for no photons: they see emission and direct light at their first
-    smooth vertex only, and all but this counts `boost` times with those that ask.
+    Where other paths see emission, and direct light at the first smooth vertex, too, `beyond` is
+    what all else counts over that.
 
     Its state: smooth vertices left behind (the last one counts as the `bdd`-th); whether the last
     vertex scattered by a delta function; the density of the last smooth scattering; the last smooth
@@ -92,11 +92,10 @@ class QueryVisitor:
     the state of `weights`.
     """
 
-    def __init__(self, world, limits, camera_pass, queries, weights):
+    def __init__(self, world, limits, queries, weights, beyond):
         self.scene, self.lights, self.traits = world.scene, world.lights, world.traits
         self.hide_emitters, self.queries, self.weights = limits.hide_emitters, queries, weights
-        self.bdd = queries.bdd
-        self.paths, self.boost = camera_pass.count, 1 + camera_pass.extra
+        self.bdd, self.beyond = queries.bdd, beyond
         self.sections = 1 if weights is None else self.bdd + 1
         self.by_light = weights is not None and weights.weighs_points_of_lights
         self.store = Store(
@@ -134,9 +133,8 @@ class QueryVisitor:
         weights, bsdf = self.weights, at.bsdf
         smooth = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
         at.ends = vertex >= self.bdd  # the path's last smooth vertex
-        if self.boost > 1:
-            at.ends |= ~self._asks(at)
-            times = dr.select(smooth & (vertex > 0), self.boost, times)
+        if self.beyond is not None:
+            times = dr.select(smooth & (vertex > 0), self.beyond, times)
         if weights is not None:
             sums, share = weights.propagate(sums, at.si, bsdf, vertex, smooth)
             share_here = dr.select(smooth, share, share_here)
@@ -162,16 +160,12 @@ class QueryVisitor:
         share = dr.select(ds.delta, 1, mis_power(light_pdf, response_pdf)) * share_here
         return dr.select(smooth, at.throughput * share * response * light, 0)
 
-    def _asks(self, at):
-        """Which paths ask for photons."""
-        return at.path < self.paths if self.boost > 1 else True
-
     def _ask_for_photons(self, state, at, smooth):
         """Stores the vertices at which photons are to be gathered."""
         vertex, _, _, _, share_here, _, sums = state
         weights, store, queries = self.weights, self.store, self.queries
         last = (vertex == self.bdd) | (weights is not None)
-        wants = smooth & (dr.max(at.throughput) > 0) & self._asks(at)
+        wants = smooth & (dr.max(at.throughput) > 0)
         if not queries.has_caustics:
             wants &= last & queries.has_indirect
         slot = mi.UInt32(at.path)
@@ -218,7 +212,12 @@ class QueryVisitor:
 
 
 def trace_camera_paths(
-    world: World, limits: Limits, camera_pass: CameraPass, queries: Queries, weights=None
+    world: World,
+    limits: Limits,
+    camera_pass: CameraPass | ListedPass,
+    queries: Queries,
+    weights=None,
+    beyond=None,
 ):
     """Traces the camera paths of a pass to their `queries.bdd`-th smooth vertex.
 
@@ -235,7 +234,9 @@ def trace_camera_paths(
     direct light at each is weighted. The vertex buffer is then one section for each smooth vertex
     of the path, of `capacity` each (a path's last vertex in the last section), and `count` has one
     entry for each.
+
+    `beyond` (one a path): what direct light counts at smooth vertices beyond the first.
     """
-    visitor = QueryVisitor(world, limits, camera_pass, queries, weights)
+    visitor = QueryVisitor(world, limits, queries, weights, beyond)
     radiance, alpha, splat = trace_camera(world, limits, camera_pass, visitor)
     return radiance, alpha, splat, visitor.store.vertices, visitor.store.count

@@ -54,7 +54,11 @@ class Prediction(NamedTuple):
 
     squared_bias: float
     variance: float
-    """Of one iteration, direct light included."""
+    """Of one iteration, light that does not come from photons included."""
+    direct: float
+    """The part of it that such light has."""
+    photon_light: float
+    """What photons bring to a pixel, on average."""
     gathered: float
     """Photons within a vertex's merge disks."""
     iterations: float
@@ -108,6 +112,8 @@ class PilotResult:
     """Relative variance of the light of a camera path that does not come from photons."""
     mean: np.ndarray
     """(pixels,): the radiance that errors are relative to."""
+    photon_light: float
+    """What photons bring to a pixel, on average."""
     caustic_share: float
 
     def choose(
@@ -183,9 +189,12 @@ class PilotResult:
         cost, cost_of_one = (
             self.cost(choice, number, camera_share) for number in (choice.camera_paths, 1)
         )
+        direct = self.direct / choice.camera_paths
         return Prediction(
             sum(found.squared_bias for found in chosen),
-            self.direct / choice.camera_paths + sum(found.variance for found in chosen),
+            direct + sum(found.variance for found in chosen),
+            direct,
+            self.photon_light,
             sum(self.gathered(kind, radius) for kind, radius in choice.radii.items()),
             count / cost,
             cost / cost_of_one,
@@ -254,7 +263,7 @@ def measure(
     that gathers."""
     if samples is None:
         nothing = np.zeros(pixels.count)
-        return PilotResult(setting, pixels, iterations, seconds, {}, {}, {}, 0.0, nothing, 0.0)
+        return PilotResult(setting, pixels, iterations, seconds, {}, {}, {}, 0.0, nothing, 0.0, 0.0)
     middle = {
         kind: samples.gathered[kind, False][:, middle_index(samples.ladder)]
         for kind in setting.kinds
@@ -296,5 +305,6 @@ def measure(
         between_paths,
         direct_variance(samples.direct, weights),
         mean,
+        float(sum(np.mean(part) for part in middle.values())),
         float(caustics / max(np.mean(mean), 1e-30)),
     )

@@ -16,21 +16,25 @@ def integrator(plugin="bdpm", **parameters):
 
 
 @pytest.mark.parametrize(
-    "material, parameters",
+    "material, count, parameters",
     [
-        ("lambertian", {"bdd": 0}),
-        ("lambertian", {"bdd": 1}),
-        ("lambertian", {"bdd": 0, "camera_paths": 2}),
-        ("rough", {"bdd": 1}),
-        ("rough", {"plugin": "bdpm_opt2"}),
+        ("lambertian", 5, {"bdd": 0}),
+        ("lambertian", 0, {"bdd": 1}),
+        ("lambertian", 5, {"bdd": 0, "camera_paths": 2}),
+        ("rough", 0, {"bdd": 0, "camera_paths": 2}),
+        ("rough", 0, {"bdd": 0, "film": "gaussian"}),
+        ("rough", 5, {"bdd": 1}),
+        ("rough", 0, {"plugin": "bdpm_opt2"}),
     ],
 )
-def test_same_means(rgb, material, parameters):
-    """With one path and with five: `assert_same` with its false-alarm rate."""
-    scene = tray(material, "rectangle")
+def test_same_means(rgb, material, count, parameters):
+    """With one path, and with five or as many as each pixel needs: `assert_same` with its
+    false-alarm rate."""
+    parameters = dict(parameters)
+    scene = tray(material, "rectangle", rfilter=parameters.pop("film", "box"))
     sides = [
-        SessionBatches(integrator(direct_paths=count, **parameters), scene, 2, seed)
-        for seed, count in enumerate((1, 5))
+        SessionBatches(integrator(direct_paths=number, **parameters), scene, 2, seed)
+        for seed, number in enumerate((1, count))
     ]
     assert_same(*collect_until(*sides, **POWER), **POWER)
 
@@ -67,34 +71,59 @@ def test_noise_of_direct_light_falls(rgb):
 
 
 def test_parts_make_the_same_image(rgb, monkeypatch):
-    """Camera paths in several parts, the last one not full, are the paths of one part."""
-    from mis_integrators.integrators import bdpm
+    """Paths in several parts, the last one not full, are the paths of one part."""
+    from mis_integrators.integrators import bdpm, direct_light
 
     scene = tray("lambertian", "rectangle")
     images = []
     for chunk in (1 << 21, 700):
         monkeypatch.setattr(bdpm, "CAMERA_CHUNK", chunk)
-        session = integrator(direct_paths=3).session(scene, 0, 1, 0)
+        monkeypatch.setattr(direct_light, "LARGEST_PART", chunk)
+        session = integrator().session(scene, 0, 1, 0)
         session.iterate()
+        assert session.direct_light.mean_paths > 0.1
         images.append(session.image())
     np.testing.assert_allclose(images[0], images[1], rtol=1e-3, atol=1e-5)
 
 
 def test_only_where_photons_are_gathered(rgb):
     scene = tray("lambertian", "rectangle")
-    assert integrator(max_depth=2).session(scene).direct_paths == 1
-    assert integrator(bdd=0, max_depth=3).session(scene).direct_paths == 4
+    paths = []
+    for parameters in ({"max_depth": 2}, {"bdd": 0, "max_depth": 3}):
+        session = integrator(direct_paths=4, **parameters).session(scene)
+        session.start()
+        paths.append(session.direct_light.mean_paths)
+    assert paths == [0, 3]
+
+
+def test_sessions_of_a_render_send_the_same_paths(rgb):
+    """What another session has learned is all that it takes, the seed apart."""
+    scene = tray("rough", "rectangle")
+    one, other = (integrator(initial_radius=0).session(scene, 0, 7, 16) for _ in range(2))
+    one.start()
+    other.recall(one.learned)
+    other.start()
+    assert one.direct_light.mean_paths > 0
+    for session in (one, other):
+        session.iterate(3)
+    np.testing.assert_array_equal(one.image(), other.image())
 
 
 def test_purposes_differ(rgb):
     """What paths that gather draw, and others, and light, and what only weights learn from."""
-    from mis_integrators.integrators import bdpm, bdpm_opt
+    from mis_integrators.integrators import bdpm, bdpm_opt, direct_light
     from mis_integrators.integrators.common import IterativeSession
 
-    purposes = [bdpm.LIGHT, bdpm.CAMERA, bdpm.EXTRA, bdpm_opt.FROZEN, IterativeSession.WAVELENGTH]
+    purposes = [
+        bdpm.LIGHT,
+        bdpm.CAMERA,
+        direct_light.PURPOSE,
+        bdpm_opt.FROZEN,
+        IterativeSession.WAVELENGTH,
+    ]
     assert len(set(purposes)) == len(purposes)
 
 
 def test_range(rgb):
-    with pytest.raises(Exception, match='parameter "direct_paths" = 0'):
-        integrator(direct_paths=0)
+    with pytest.raises(Exception, match='parameter "direct_paths" = -1'):
+        integrator(direct_paths=-1)

@@ -1,0 +1,90 @@
+"""How many paths each pixel sends for direct light: the law, and the minimum."""
+
+import numpy as np
+import pytest
+from mis_integrators.pilot import direct_paths
+from mis_integrators.pilot.noise import relative_weights
+
+WIDTH = 24
+
+
+def samples_of(lamp=50.0, seed=0):
+    """A noisy left half, a quiet right half, and a lamp whose lower edge crosses the pixels of one
+    row."""
+    rng = np.random.default_rng(seed)
+    image = np.full((direct_paths.TRIALS, 16, WIDTH), 0.2)
+    image[:, :, : WIDTH // 2] *= rng.exponential(size=(direct_paths.TRIALS, 16, WIDTH // 2))
+    image[:, :4, 4:20] = lamp
+    image[:, 4, 4:20] = lamp * (rng.random((direct_paths.TRIALS, 16)) < 0.5)
+    return image.reshape(direct_paths.TRIALS, -1)
+
+
+def objective(paths, samples, light, error, iterations, exponent):
+    """What the module says that it minimises, of paths of one block."""
+    mean, noise = direct_paths.mean_and_noise(samples, WIDTH)
+    relative = relative_weights(mean + light)
+    left = noise * iterations ** (1 - exponent) * paths**-exponent
+    return (
+        np.log(error + np.mean(relative * left))
+        + np.log(error / np.median(relative) + np.mean(left))
+        + 2 * np.log(1 + direct_paths.COST * np.mean(paths - 1))
+    )
+
+
+@pytest.mark.parametrize("iterations, exponent", [(1, 1.0), (64, 1.0), (64, 1.5)])
+def test_no_other_numbers_do_better(iterations, exponent):
+    """In random directions, within the bounds."""
+    samples, rng = samples_of(), np.random.default_rng(1)
+    given = samples, WIDTH, 0.1, 0.05, iterations, exponent
+    best = direct_paths.paths_per_pixel(*given)
+    assert best.min() >= 1 and best.max() > 3
+    least = objective(best, samples, 0.1, 0.05, iterations, exponent)
+    for step in (0.03, 0.3):
+        for _ in range(50):
+            other = best * np.exp(step * rng.normal(size=best.shape))
+            other = np.clip(other, 1, direct_paths.MOST_PATHS)
+            assert objective(other, samples, 0.1, 0.05, iterations, exponent) > least - 1e-9
+
+
+def test_paths_go_where_the_noise_is():
+    paths = direct_paths.paths_per_pixel(samples_of(), WIDTH, 0.1, 0.05, 32, 1.5)
+    paths = paths.reshape(16, WIDTH)
+    assert paths[4, 6:18].min() > 4 * np.median(paths[8:, : WIDTH // 2])
+    assert np.all(paths[8:, WIDTH // 2 + 2 :] == 1)
+    assert np.all(paths[:2, 6:18] == 1)
+
+
+def test_an_edge_between_pixels_counts():
+    """No sample of these pixels differs from the others, but the neighbours do."""
+    image = np.zeros((direct_paths.TRIALS, 8, WIDTH))
+    image[:, :4] = 30.0
+    paths = direct_paths.paths_per_pixel(
+        image.reshape(direct_paths.TRIALS, -1), WIDTH, 0.1, 0.05, 32, 1.5
+    ).reshape(8, WIDTH)
+    assert np.all(paths[3:5] > 2) and np.all(paths[[0, 1, 6, 7]] == 1)
+
+
+def test_quiet_pixels_send_one_path():
+    quiet = np.full((direct_paths.TRIALS, 8 * WIDTH), 0.3)
+    assert np.all(direct_paths.paths_per_pixel(quiet, WIDTH, 0.0, 0.1, 16, 1.5) == 1)
+    assert np.all(direct_paths.paths_per_pixel(0 * quiet, WIDTH, 0.0, 0.0, 16, 1.5) == 1)
+
+
+def test_noisy_photons_need_fewer_paths():
+    few, many = (
+        direct_paths.paths_per_pixel(samples_of(), WIDTH, 0.1, error, 16, 1.0).mean()
+        for error in (1.0, 0.01)
+    )
+    assert few < 0.7 * many
+
+
+def test_error_that_is_left_falls_with_the_paths():
+    """For independent paths by their number; one path in one iteration has its own variance."""
+    rng = np.random.default_rng(3)
+    samples = rng.normal(1.0, 0.1, (64, 32 * WIDTH))
+    one, four = (
+        direct_paths.direct_error(samples, WIDTH, 0.0, np.full(32 * WIDTH, number), 8, 1.0)
+        for number in (1.0, 4.0)
+    )
+    assert one == pytest.approx(4 * four)
+    assert one == pytest.approx(0.01 / 1.1, rel=0.03)
