@@ -105,14 +105,28 @@ def rounded_up(count):
     return -(-count // step) * step
 
 
+ALIGNMENT = 64
+"""Bytes."""
+
+
 def from_numpy(dtype, values):
     """The numbers `values` (NumPy, flat) as a Dr.Jit array of type `dtype` in memory of its own.
     Without the copy Dr.Jit goes on using NumPy's memory, and kernels that read it are compiled anew
-    whenever that happens to be aligned in another way."""
-    array = dtype(np.asarray(values, np.float32 if dr.is_float_v(dtype) else np.uint32))
+    whenever that happens to be aligned in another way; so is the one that copies."""
+    values = np.asarray(values, np.float32 if dr.is_float_v(dtype) else np.uint32)
+    array = dtype(_aligned(values))
     array = array + dr.opaque(dtype, 0)  # (a gather of all would be the array itself)
     dr.eval(array)
     return array
+
+
+def _aligned(values):
+    """A copy (flat) that begins at a multiple of `ALIGNMENT` bytes."""
+    room = np.empty(values.nbytes + ALIGNMENT, np.uint8)
+    first = -room.ctypes.data % ALIGNMENT
+    copy = room[first : first + values.nbytes].view(values.dtype)
+    copy[:] = values.ravel()
+    return copy
 
 
 def to_numpy(vectors):

@@ -79,9 +79,7 @@ class BDPM(IterativeIntegrator):
          where such light is noisy, as a few trials tell. (Default: 0)
      * - camera_paths
        - |int|
-       - Camera paths per pixel and iteration that gather photons. 0 stands for one; in a render of
-         a given time whose radius is automatic, for as many of 1, 2, 4 and 8 as make the least
-         error. (Default: 0)
+       - Camera paths per pixel and iteration that gather photons. (Default: 1)
      * - variance
        - |bool|
        - Adds the channels ``var.R``, ``var.G``, ``var.B`` (mono: ``var.Y``): the estimated variance
@@ -126,8 +124,6 @@ class BDPM(IterativeIntegrator):
             'bdd': 0,
             'max_depth': 10
     """
-
-    CAMERA_PATHS = 0, 0, "at least 0 (0: automatic)"
 
     survey = None
     """A `Survey`, where another session has made it already."""
@@ -210,12 +206,6 @@ class BDPMSession(PilotedSession):
             if needed
         ]
 
-    def set_camera_paths(self, camera_paths):
-        super().set_camera_paths(camera_paths)
-        self.split_paths(CAMERA_CHUNK)
-        self.vertex_capacity = self._vertex_room(self.chunk)
-        self._record_camera_pass()
-
     def _record_camera_pass(self):
         self._camera_pass = self.recorded(self._render_chunk)
 
@@ -228,7 +218,6 @@ class BDPMSession(PilotedSession):
             tuple(self.kinds()),
             integrator.bdd == 0,
             self.camera_paths,
-            self.seconds is not None and not integrator.camera_paths,
             self.iterations_planned,
             self.seconds,
             self.reference_mean,
@@ -525,7 +514,7 @@ class SubsetPasses:
 
     def gather(self, photons, vertices, radii, seed, spectral):
         """What photons bring to the camera paths, by kind and whether it is corrected at edges:
-        (radii, camera paths, pixels)."""
+        (radii, pixels)."""
         session, estimates = self.session, {}
         radii = [dr.opaque(mi.Float, float(radius)) for radius in radii]
         gathered = self._gather(session.scene, session._tables, photons, vertices, radii, spectral)
@@ -554,11 +543,10 @@ class SubsetPasses:
         return mean_photon_count(photon_map, read_queries(vertices), radius)
 
     def by_pixel(self, values):
-        """Values of the camera paths as (camera paths, pixels)."""
+        """Means (pixels,) of values of the camera paths."""
         pixels = self.pixels
-        return np.broadcast_to(np.array(values), pixels.paths).reshape(
-            pixels.camera_paths, pixels.count
-        )
+        values = np.broadcast_to(np.array(values), pixels.paths)
+        return values.reshape(pixels.camera_paths, pixels.count).mean(axis=0)
 
 
 class SubsetIteration(NamedTuple):

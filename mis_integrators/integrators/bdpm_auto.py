@@ -8,7 +8,6 @@ import mitsuba as mi
 from ..core.traits import check_scene, has_media
 from ..core.untrusted import Fields
 from ..volume.traits import check_volume_scene
-from .bdpm import BDPM
 from .choice import CANDIDATES, Decision, choose, handed_on, new_session
 from .common import IterativeIntegrator, IterativeSession
 
@@ -22,7 +21,11 @@ class BDPMAuto(IterativeIntegrator):
 
     .. pluginparameters::
 
-     * - camera_paths, variance, max_depth, rr_depth, hide_emitters, sampler
+     * - camera_paths
+       - |int|
+       - As of :monosp:`bdpm`; 0 stands for one, for ``path`` and in media for as many as keep the
+         machine busy. (Default: 0)
+     * - variance, max_depth, rr_depth, hide_emitters, sampler
        -
        - As of :monosp:`bdpm`.
 
@@ -49,7 +52,7 @@ class BDPMAuto(IterativeIntegrator):
             'type': 'bdpm_auto'
     """
 
-    CAMERA_PATHS = BDPM.CAMERA_PATHS
+    CAMERA_PATHS = 0, 0, "at least 0 (0: automatic)"
 
     def check(self, scene, sensor):
         if has_media(scene):

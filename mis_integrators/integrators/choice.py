@@ -236,7 +236,8 @@ def new_session(plugin, parameters, integrator, scene, sensor, seed, iterations,
     `BDPM`."""
     if plugin == "path":
         return PathSession(integrator, scene, sensor, seed, iterations)
-    made = mi.load_dict({"type": plugin, **handed_on(integrator), **parameters})
+    shared = {**handed_on(integrator), "camera_paths": integrator.initial_camera_paths}
+    made = mi.load_dict({"type": plugin, **shared, **parameters})
     made.survey = survey
     return made.new_session(scene, sensor, seed, iterations)
 
@@ -273,8 +274,7 @@ def _trial(plugin, parameters, session, segments):
         session,
         prediction.squared_bias,
         prediction.variance,
-        (costs.cost(plugin, counted) + costs.of_direct_paths(session, segments))
-        * prediction.cost_of_paths,
+        costs.cost(plugin, counted) + costs.of_direct_paths(session, segments),
     )
 
 

@@ -29,6 +29,8 @@ ITERATION_BITS = 22
 indices have 32 bits."""
 LARGEST_PART = 1 << 21
 """Paths traced at once at most (bounds memory)."""
+LARGEST = 1e18
+"""Number that `Beside` can hold."""
 NOTHING_GATHERED = Queries(0, 0, False, False, True)
 
 
@@ -63,7 +65,7 @@ class DirectLight:
     def recall(self, fields):
         """Takes over what another session of the same render has `learned` (a `Fields`)."""
         if fields.names():
-            self._beside = Beside(**{name: fields.number(name) for name in Beside._fields})
+            self._beside = Beside(**{name: fields.number(name, LARGEST) for name in Beside._fields})
 
     def spread(self, camera_paths, prediction=None):
         """Chooses the paths, beside so many that gather, and a `Prediction` of what these do. Where
@@ -82,9 +84,7 @@ class DirectLight:
             self._beside = Beside(
                 prediction.photon_light, float(error), float(prediction.iterations)
             )
-        beside = self._beside or Beside(
-            iterations=session.iterations_planned or UNPLANNED_ITERATIONS
-        )
+        beside = self._beside or Beside()
         paths = paths_per_pixel(self._trials, self._width, *beside, self._exponent)
         self._send(np.maximum(np.rint(paths).astype(int) - camera_paths, 0), camera_paths)
 

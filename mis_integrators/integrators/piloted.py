@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import time
-from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
 
 from ..core.untrusted import Fields
-from ..pilot.cost import CAMERA_SHARE
 from ..pilot.result import Choice
 from ..pilot.run import run_pilot
 from ..pilot.setting import pilot_pixels
@@ -78,7 +76,6 @@ class PilotedSession(IterativeSession):
         return {
             "radii": {kind: float(radius) for kind, radius in self.radii.items()},
             "corrected": {kind: bool(flag) for kind, flag in self.corrected.items()},
-            "camera_paths": self.camera_paths,
         }
 
     def recall(self, learned):
@@ -90,18 +87,12 @@ class PilotedSession(IterativeSession):
             kind: radii.number(kind, LARGEST_RADIUS, SMALLEST_RADIUS) for kind in self.kinds()
         }
         self.corrected = {kind: corrected.boolean(kind) for kind in self.kinds()}
-        self.set_camera_paths(fields.integer("camera_paths", 1, self.most_camera_paths()))
         self.recall_more(fields)
         for each in (radii, corrected, fields):
             each.finish()
 
     def recall_more(self, fields):
         """Takes over what a subclass has `learned` besides."""
-
-    def set_camera_paths(self, camera_paths):
-        """Sends so many camera paths through each pixel from the next iteration on."""
-        self.resize(camera_paths)
-        self.kept.clear()
 
     def radii_at(self, iteration):
         """Merge radius of each kind of photon."""
@@ -133,29 +124,18 @@ class PilotedSession(IterativeSession):
 
     def _choose_by_clock(self, pilot):
         """Chooses for a guess of how many iterations there is time for, measures what one takes
-        with that choice, and chooses again. Where several camera paths a pixel may pay, what they
-        cost is measured, too."""
+        with that choice, and chooses again."""
         guess = LIKE_A_PILOT * pilot.seconds
         left = max(self.begun + self.seconds - time.perf_counter(), guess)
-        camera_paths, camera_share = self.camera_paths, CAMERA_SHARE
-        first = pilot.choose(left / guess, camera_paths, camera_share)
+        first = pilot.choose(left / guess)
         self._take(first)
         seconds, spent = self._time_first_iterations(guess, left)
-        count = max(left / seconds * pilot.cost(first, camera_paths), 1)
-        if pilot.two_camera_paths_may_pay(count, left / seconds):
-            self._take(replace(first, camera_paths=2))
-            of_two, more = self._time_first_iterations(2 * seconds, left)
-            spent += more
-            camera_share = pilot.camera_share(first, of_two / seconds)
-            camera_paths = pilot.best_camera_paths(count, camera_share)
-        reluctance = min(spent / left, 1)
-        self._take(pilot.choose(count, camera_paths, camera_share, first, reluctance))
+        count = max(left / seconds * pilot.cost(first), 1)
+        self._take(pilot.choose(count, first, reluctance=min(spent / left, 1)))
 
     def _take(self, choice: Choice):
         """Renders with this choice from now on. What was rendered with another is no longer
         kept."""
-        if choice.camera_paths != self.camera_paths:
-            self.set_camera_paths(choice.camera_paths)
         if (choice.radii, choice.corrected) != (self.radii, self.corrected):
             self.kept.clear()
         changed = choice.corrected != self.corrected

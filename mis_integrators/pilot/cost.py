@@ -15,32 +15,17 @@ GATHER_COST = 0.013
 PROBE_COST = 0.15
 """Tuned: cost of the probe rays of corrected estimates, in the same units (0.03 to 0.25)."""
 CAMERA_SHARE = 0.35
-"""Tuned: share of the same units that each camera path of a pixel takes, until it is measured (0.1
-to 0.5 on the bundled scenes)."""
-LEAST_CAMERA_SHARE, MOST_CAMERA_SHARE = 0.1, 0.8
-"""Tuned: bounds of the measured camera share."""
+"""Tuned: share of the same units that each camera path of a pixel takes (0.1 to 0.5 on the bundled
+scenes)."""
 USUAL_PHOTONS = 10
 """Tuned: photons a gather at which an iteration counts as one planned iteration: larger gathers
 must pay for themselves."""
 
 
-def iteration_cost(
-    gathered: Gathered, corrected: bool, camera_paths: int, camera_share: float = CAMERA_SHARE
-) -> Gathered:
+def iteration_cost(gathered: Gathered, corrected: bool, camera_paths: int) -> Gathered:
     """Cost of an iteration that gathers so many photons a vertex, of plain or corrected estimates,
-    with so many camera paths a pixel: 1 + g + (N_B - 1) (s + g), s the `camera_share`."""
+    with so many camera paths a pixel: 1 + g + (N_B - 1) (s + g), s the `CAMERA_SHARE`."""
     gather = GATHER_COST * gathered + PROBE_COST * corrected
-    return (1 + gather + (camera_paths - 1) * (camera_share + gather)) / (
+    return (1 + gather + (camera_paths - 1) * (CAMERA_SHARE + gather)) / (
         1 + GATHER_COST * USUAL_PHOTONS
     )
-
-
-def measured_camera_share(of_one: float, of_two: float, ratio: float, assumed: float) -> float:
-    """The camera share s, where an iteration of two camera paths took `ratio` times as long as one
-    of one: `iteration_cost` is linear in s, with the slope of one over 1 + `GATHER_COST`
-    `USUAL_PHOTONS`.
-
-    `of_one`, `of_two`: `iteration_cost` of both with the share that was `assumed`.
-    """
-    share = assumed + (1 + GATHER_COST * USUAL_PHOTONS) * (ratio * of_one - of_two)
-    return min(max(share, LEAST_CAMERA_SHARE), MOST_CAMERA_SHARE)

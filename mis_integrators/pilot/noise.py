@@ -93,24 +93,12 @@ def bounded_by_larger_disks(
     return floor + seen / radii**2
 
 
-def variance_between_camera_paths(samples: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Relative variance between camera paths of a pixel that share photons, one a radius; zero
-    where there is one path.
-
-    `samples`: (iterations, radii, camera paths, pixels).
-    """
-    if samples.shape[2] == 1:
-        return np.zeros(samples.shape[1])
-    variance = np.var(samples, axis=2, ddof=1).mean(axis=0)
-    return np.array([trimmed_mean(pixels) for pixels in weights * variance])
-
-
 def direct_variance(direct: np.ndarray, weights: np.ndarray) -> float:
-    """Relative variance of the light of a camera path that does not come from photons; infinite
-    where one iteration tells nothing of it. `direct`: (iterations, camera paths, pixels)."""
+    """Relative variance, in an iteration, of light that does not come from photons; infinite where
+    one iteration tells nothing of it. `direct`: (iterations, pixels)."""
     if len(direct) < 2:
         return trimmed_mean(weights * np.full(direct.shape[-1], np.inf))
-    return trimmed_mean(weights * np.var(direct, axis=0, ddof=1).mean(axis=0))
+    return trimmed_mean(weights * np.var(direct, axis=0, ddof=1))
 
 
 def trimmed_mean(values: np.ndarray) -> float:

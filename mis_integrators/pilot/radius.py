@@ -26,7 +26,7 @@ Minimised
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -41,9 +41,6 @@ STEP = 2.0
 LARGEST_SHARE = 0.08
 """Tuned: largest radius of the ladder in units of the spread of the points where photons are
 gathered."""
-LEAST_NOISE = 0.1
-"""Tuned: share of the noise of a pilot's pixels that is left, however many camera paths they
-average: that of their photons."""
 
 
 def ladder(points: np.ndarray, weights: np.ndarray) -> np.ndarray | None:
@@ -140,7 +137,6 @@ def best_radius(
     iterations: Callable[[np.ndarray, bool], np.ndarray],
     used: tuple[float, bool] | None = None,
     reluctance: float = 0.0,
-    more_noise: Mapping[bool, np.ndarray] | None = None,
 ) -> RadiusChoice:
     """The `RadiusChoice` with the least bias^2 + V / n. Where the pilot found no photon it is a
     middling radius.
@@ -152,17 +148,11 @@ def best_radius(
     used : (radius, corrected)
         A choice that is kept unless the least error is below its by more than the share
         `reluctance`.
-    more_noise : by correction, (radii,)
-        Variance of an iteration beyond that of the pilot (less, if negative), because it averages
-        another number of camera paths.
     """
     radii, fine = errors.ladder, errors.fine
     choices = []
     for corrected, bias in errors.squared_bias.items():
-        variance = errors.variance[corrected]
-        if more_noise:
-            variance = np.maximum(variance + more_noise[corrected], LEAST_NOISE * variance)
-        variance = between(fine, radii, variance)
+        variance = between(fine, radii, errors.variance[corrected])
         predicted = bias + variance / iterations(fine, corrected)
         at = int(np.argmin(predicted))
         candidates = [(float(predicted[at]), float(fine[at]), at)]

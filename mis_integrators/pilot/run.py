@@ -39,10 +39,10 @@ class PilotIteration(Protocol):
 
     def gather(self, radii: np.ndarray) -> dict[tuple[str, bool], np.ndarray]:
         """What photons bring, by kind and whether the estimate is corrected at edges: mean over the
-        channels, (radii, camera paths, pixels)."""
+        channels, (radii, pixels)."""
 
     def direct(self) -> np.ndarray:
-        """Light that does not come from photons: mean over the channels, (camera paths, pixels)."""
+        """Light that does not come from photons: mean over the channels, (pixels,)."""
 
 
 class PilotPasses(Protocol):

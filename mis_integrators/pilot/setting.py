@@ -9,6 +9,9 @@ import numpy as np
 
 PILOT_PATHS = 4096
 """Tuned: camera paths of a pilot's iteration, about."""
+MOST_CAMERA_PATHS = 16
+"""Camera paths of a pixel: more of them change little of an iteration's noise, which is then that
+of photons."""
 NEIGHBOURS = 16
 """Tuned: pilot pixels that are expected to look alike."""
 UNPLANNED_ITERATIONS = 64
@@ -31,8 +34,6 @@ class PilotSetting:
     """Whether photons are gathered at the first smooth vertex, which the camera sees."""
     camera_paths: int
     """Camera paths a pixel and iteration."""
-    chooses_camera_paths: bool
-    """Whether another number of them may be chosen."""
     iterations: int | None
     """Iterations planned, if their number is."""
     seconds: float | None
@@ -55,17 +56,13 @@ class PilotSetting:
 
 @dataclass(frozen=True)
 class PilotPixels:
-    """The pixels that a pilot renders: numbers 0, stride, 2 stride, ... of the film's.
-
-    Where an iteration may have several camera paths a pixel the pilot has two, which share the
-    photons of their iteration: their difference tells the noise of camera paths from that of
-    photons.
-    """
+    """The pixels that a pilot renders: numbers 0, stride, 2 stride, ... of the film's."""
 
     stride: int
     count: int
     camera_paths: int
-    """Camera paths through each of them, in one iteration of the pilot."""
+    """Camera paths through each of them, in one iteration of the pilot: as many as in the render,
+    up to `MOST_CAMERA_PATHS`."""
 
     @property
     def paths(self) -> int:
@@ -75,12 +72,11 @@ class PilotPixels:
 
 def pilot_pixels(setting: PilotSetting) -> PilotPixels:
     """The `PilotPixels`, spread over the film and not in columns."""
-    camera_paths = 2 if setting.chooses_camera_paths or setting.camera_paths > 1 else 1
-    count = min(setting.pixels, PILOT_PATHS // camera_paths)
-    stride = setting.pixels // count
-    while stride > 1 and math.gcd(stride, setting.width) > 1:
-        stride -= 1
-    return PilotPixels(stride, count, camera_paths)
+    camera_paths = min(setting.camera_paths, MOST_CAMERA_PATHS)
+    stride = max(setting.pixels * camera_paths // PILOT_PATHS, 1)
+    while math.gcd(stride, setting.width) > 1:
+        stride += 1
+    return PilotPixels(stride, -(-setting.pixels // stride), camera_paths)
 
 
 def neighbourhoods(width: int, pixels: PilotPixels) -> np.ndarray:

@@ -4,10 +4,8 @@ import contextlib
 import dataclasses
 import gc
 import sys
-import time
 
 from mis_integrators._plugins import PLUGINS
-from mis_integrators.pilot.cost import CAMERA_SHARE
 from mis_integrators.pilot.noise import relative_weights, trimmed_mean
 from mis_integrators.pilot.result import PilotResult, PilotSamples, measure
 from mis_integrators.pilot.setting import pilot_pixels
@@ -217,7 +215,7 @@ def test_same_seed_same_edges(rgb):
             {
                 "radii": dict.fromkeys(session.kinds(), 0.3),
                 "corrected": {"caustic": False, "indirect": True},
-                "camera_paths": 1,
+                "direct_light": {},
             }
         )
         session.iterate()
@@ -908,73 +906,14 @@ def test_rare_photons_get_no_smallest_radius(rgb):
     samples = PilotSamples(
         np.array([0.01 * 2**i for i in range(7)]),
         {"indirect": 0.0},
-        {("indirect", corrected): np.zeros((4, 7, 2, 256)) for corrected in (False, True)},
-        np.ones((4, 2, 256)),
+        {("indirect", corrected): np.zeros((4, 7, 256)) for corrected in (False, True)},
+        np.ones((4, 256)),
     )
     choice = measure(setting, pilot_pixels(setting), samples, 4, 1.0).choose(100)
     assert choice.radii["indirect"] == pytest.approx(0.16)
 
 
 # --- Camera paths of an iteration ---------------------------------------------
-
-
-def made_up_pilot(scene, direct_noise, shared=True):
-    """A session, and a pilot of three iterations over a constant image: photons make half of it,
-    with a noise that falls with the radius and that the camera paths of a pixel have in common if
-    it is `shared`; `direct_noise` is that of the other half, relative to the image."""
-    session = bdpm(bdd=0, camera_paths=0, photon_count=3000, initial_radius=0.0).session(
-        scene, seed=1
-    )
-    session.plan_time(200.0, time.perf_counter())
-    setting, rng = session.pilot_setting(), np.random.default_rng(5)
-    pixels = pilot_pixels(setting)
-    shape, ladder = (pixels.camera_paths, pixels.count), 0.1 * 2.0 ** -np.arange(6, -1, -1.0)
-    direct = np.array([0.5 + direct_noise * rng.normal(size=shape) for _ in range(3)])
-    photons = [
-        0.5
-        + 0.05
-        * rng.normal(size=(7, 1 if shared else pixels.camera_paths, pixels.count))
-        * (0.1 / ladder)[:, None, None]
-        for _ in range(3)
-    ]
-    photons = np.array([np.broadcast_to(values, (7, *shape)) for values in photons])
-    gathered = {("indirect", corrected): photons for corrected in (False, True)}
-    samples = PilotSamples(ladder, {"indirect": 10.0}, gathered, direct)
-    return session, measure(setting, pixels, samples, 3, 1.0)
-
-
-@pytest.mark.parametrize(
-    "direct_noise, cost, expected",
-    [(1.0, 0.15, {4, 8}), (1.0, 0.9, {2}), (0.3, 0.3, {2, 4}), (0.02, 0.15, {1})],
-)
-def test_camera_paths_follow_noise_and_cost(rgb, monkeypatch, direct_noise, cost, expected):
-    """Several where camera paths make most of the noise and little of the cost; where they make
-    little of the noise, two are not even tried."""
-    session, pilot = made_up_pilot(box_scene(), direct_noise)
-    tried = []
-
-    def time_first_iterations(guess, left):
-        tried.append(session.camera_paths)
-        seconds = 1 + cost * (session.camera_paths - 1)
-        return seconds, seconds
-
-    monkeypatch.setattr(session, "_time_first_iterations", time_first_iterations)
-    session._choose_by_clock(pilot)
-    assert session.camera_paths in expected
-    assert tried == ([1, 2] if expected != {1} else [1])
-
-
-@pytest.mark.parametrize("shared", [True, False])
-def test_camera_paths_average_their_own_noise_only(rgb, shared):
-    """Of what photons bring, too, where it differs between the camera paths of a pixel (5 % of
-    noise in the estimate)."""
-    _, pilot = made_up_pilot(box_scene(), 0.0, shared)
-    found = []
-    for camera_paths in (1, 2, 8):
-        choice = pilot.choose(100, camera_paths)
-        variance, radius = choice.prediction.variance, choice.radii["indirect"]
-        found.append(variance * radius**2 * (1 if shared else camera_paths))
-    assert found[1:] == pytest.approx([found[0]] * 2, rel=0.25)
 
 
 @pytest.mark.parametrize("camera_paths", [2, 8])
@@ -984,8 +923,8 @@ def test_camera_paths_average_their_own_noise_only(rgb, shared):
     ids=["bdd0", "bdd1", "opt2"],
 )
 def test_noise_of_several_camera_paths_is_foreseen(rgb, plugin, given, camera_paths):
-    """The pilot's two camera paths a pixel say what an iteration of more, or fewer, of them will
-    have: within a factor 1.3 of twelve renders. (Its law is that of independent numbers.)"""
+    """The pilot has as many: within a factor 1.3 of twelve renders. (Its law is that of independent
+    numbers.)"""
     session = mi.load_dict(
         {
             "type": plugin,
@@ -1003,38 +942,6 @@ def test_noise_of_several_camera_paths_is_foreseen(rgb, plugin, given, camera_pa
     mean, variance = session.estimate()
     measured = relative_weights(mean.mean(axis=-1).ravel()) * 12 * variance.mean(axis=-1).ravel()
     assert 1 / 1.3 < session.prediction.variance / trimmed_mean(measured) < 1.3
-
-
-def always_choose_camera_paths(monkeypatch, camera_paths):
-    """Every pilot that may choose a number of camera paths chooses this one, however short the
-    render."""
-    monkeypatch.setattr(PilotResult, "two_camera_paths_may_pay", lambda *_: True)
-    monkeypatch.setattr(PilotResult, "camera_share", lambda *_: CAMERA_SHARE)
-    monkeypatch.setattr(PilotResult, "best_camera_paths", lambda *_: camera_paths)
-
-
-def test_a_timed_render_chooses_its_camera_paths(rgb, monkeypatch):
-    """What is chosen is rendered with, said, and rendered with again by whoever is told."""
-    always_choose_camera_paths(monkeypatch, 4)
-    scene = glossy_box()
-    timed = bdpm(bdd=0, camera_paths=0, photon_count=3000, initial_radius=0.0).session(
-        scene, seed=4
-    )
-    timed.plan_time(1000.0)
-    for _ in range(3):
-        timed.iterate()
-    assert timed.settings["camera_paths"] == timed.camera_paths == 4
-    for camera_paths in (0, 4):
-        same = bdpm(
-            bdd=0, camera_paths=camera_paths, photon_count=3000, initial_radius=0.0
-        ).session(scene, seed=4)
-        same.recall(timed.learned)
-        for _ in range(3):
-            same.iterate()
-        np.testing.assert_allclose(timed.image(), same.image(), rtol=1e-4, atol=1e-5)
-    counted = bdpm(camera_paths=0, photon_count=3000, initial_radius=0.0).session(scene, spp=4)
-    counted.iterate()
-    assert (counted.iterations_planned, counted.settings["camera_paths"]) == (4, 1)
 
 
 # --- Errors -------------------------------------------------------------------
@@ -1064,7 +971,7 @@ def test_a_timed_render_chooses_its_camera_paths(rgb, monkeypatch):
         ("alpha", 0.0, "(0, 1]"),
         ("alpha", 1.1, "(0, 1]"),
         ("alpha", -1.0, "(0, 1]"),
-        ("camera_paths", -1, "at least 0"),
+        ("camera_paths", 0, "at least 1"),
         ("camera_paths", 1.5, "integer"),
         ("camera_paths", True, "integer"),
         ("variance", 1, "true or false"),
@@ -1305,8 +1212,8 @@ def test_timed_iterations_are_of_the_radii_rendered_with(rgb, monkeypatch, chang
     scene, decisions = box_scene(), []
     choose = PilotResult.choose
 
-    def choose_again(pilot, count, camera_paths, camera_share, kept=None, reluctance=0.0):
-        choice = choose(pilot, count, camera_paths, camera_share, kept, 1.0 if kept else 0.0)
+    def choose_again(pilot, count, kept=None, reluctance=0.0):
+        choice = choose(pilot, count, kept, 1.0 if kept else 0.0)
         if changed and decisions:
             radii = {kind: 1.5 * radius for kind, radius in choice.radii.items()}
             choice = dataclasses.replace(choice, radii=radii)

@@ -1,9 +1,10 @@
 """How many paths each pixel sends for direct light: the law, and the minimum."""
 
-import numpy as np
-import pytest
 from mis_integrators.pilot import direct_paths
 from mis_integrators.pilot.noise import relative_weights
+
+import numpy as np
+import pytest
 
 WIDTH = 24
 
