@@ -33,6 +33,7 @@ COLUMNS = {
         "grid ms",
         "camera ms",
         "gather ms",
+        "direct ms",
         "probes ms",
         "no kernel share",
         "path ms",
@@ -88,22 +89,29 @@ class Parts:
         self._kernels: dict[str, list[dict]] = {"light": [], "grid": []}
         self._light_pass, self._map_pass = session._photons, session._map_pass
         session._photons, session._map_pass = self._photons, self._maps
+        self._add_direct_light = session.direct_light.add_to
+        session.direct_light.add_to = self._direct_light
         self.rows: list[dict[str, float]] = []
 
     def __getitem__(self, part: str) -> float:
         """The median over the iterations: of ``light``, ``grid``, ``camera``, ``gather`` (with the
-        probes, if any), or of ``idle``, the share of an iteration in which no kernel runs (Python,
-        launches)."""
+        probes, if any), ``direct`` (paths for direct light alone), or of ``idle``, the share of an
+        iteration in which no kernel runs (Python, launches)."""
         return median(row[part] for row in self.rows)
 
     def observe(self, kernels: list[dict], seconds: float) -> None:
-        """Sort one iteration's kernels: those of the light pass and of the maps are set aside when
-        these are done; of the rest, those up to the first one as wide as all camera paths are the
-        camera pass, the others gather."""
-        compiled = [i for i, kernel in enumerate(kernels) if kernel["type"] == dr.KernelType.JIT]
-        lanes = self._session.chunk * self._session.direct_paths
-        camera = next(i for i in compiled if kernels[i]["size"] == lanes) + 1
-        parts = {**self._kernels, "camera": kernels[:camera], "gather": kernels[camera:]}
+        """Sort one iteration's kernels: those of the light pass, of the maps and of the gather are
+        set aside when these are done; of the last, those up to the first one as wide as all camera
+        paths are the camera pass. The rest is direct light alone."""
+        mine = self._kernels["rest"]
+        compiled = [i for i, kernel in enumerate(mine) if kernel["type"] == dr.KernelType.JIT]
+        camera = next(i for i in compiled if mine[i]["size"] == self._session.chunk) + 1
+        parts = {
+            **{part: self._kernels[part] for part in ("light", "grid")},
+            "camera": mine[:camera],
+            "gather": mine[camera:],
+            "direct": kernels,
+        }
         row = {
             part: sum(kernel["execution_time"] for kernel in mine) for part, mine in parts.items()
         }
@@ -115,6 +123,10 @@ class Parts:
         if self._session._map_pass != self._maps:  # recorded anew, with more room
             self._map_pass, self._session._map_pass = self._session._map_pass, self._maps
         return photons
+
+    def _direct_light(self, *args):
+        self._kernels["rest"] = dr.kernel_history()
+        return self._add_direct_light(*args)
 
     def _maps(self, *args):
         maps = self._map_pass(*args)
@@ -162,6 +174,7 @@ def measure(
         "grid ms": parts["grid"],
         "camera ms": parts["camera"],
         "gather ms": parts["gather"],
+        "direct ms": parts["direct"],
         "probes ms": parts_probing["gather"] - parts["gather"],
         "no kernel share": parts["idle"],
         "path ms": path_sample,

@@ -17,7 +17,7 @@ from ..paths.camera import film_sample_count, film_size
 from ..paths.setting import ListedPass
 from ..photons.queries import Queries, trace_camera_paths
 from ..pilot.cost import USUAL_PHOTONS
-from ..pilot.direct_paths import EXPONENTS, TRIALS, direct_error, paths_per_pixel
+from ..pilot.direct_paths import EXPONENTS, TRIALS, direct_error, measure, paths_per_pixel
 from ..pilot.run import PILOT_INDEX
 from ..pilot.setting import UNPLANNED_ITERATIONS
 from .common import RENDER
@@ -52,9 +52,8 @@ class DirectLight:
     def __init__(self, session):
         self.session = session
         self.mean_paths = self.beyond = None
-        self._beside, self._trials, self._parts = None, None, []
+        self._beside, self._noise, self._parts = None, None, []
         self._render = None  # the recorded pass
-        self._width = film_size(session.sensor)[0]
         self._exponent = EXPONENTS[session.integrator.low_discrepancy]
 
     @property
@@ -76,8 +75,8 @@ class DirectLight:
             extra = max(given - 1, 0) if session.kinds() else 0
             self._send(np.full(pixels, extra * camera_paths), camera_paths)
             return
-        if self._trials is None:
-            self._trials = self._noise(TRIALS)
+        if self._noise is None:
+            self._noise = measure(self._trials(TRIALS), film_size(session.sensor)[0])
         if prediction is not None:
             others = self._without_direct_light(prediction)
             error = others + prediction.squared_bias * prediction.iterations
@@ -85,16 +84,15 @@ class DirectLight:
                 prediction.photon_light, float(error), float(prediction.iterations)
             )
         beside = self._beside or Beside()
-        paths = paths_per_pixel(self._trials, self._width, *beside, self._exponent)
+        paths = paths_per_pixel(self._noise, *beside, self._exponent)
         self._send(np.maximum(np.rint(paths).astype(int) - camera_paths, 0), camera_paths)
 
     def known_by(self, prediction):
         """A `Prediction` made without knowing of these paths, with the noise that they leave."""
-        if self._trials is None:
+        if self._noise is None:
             return prediction
         left = direct_error(
-            self._trials,
-            self._width,
+            self._noise,
             prediction.photon_light,
             self._paths,
             prediction.iterations,
@@ -105,18 +103,18 @@ class DirectLight:
     def _without_direct_light(self, prediction):
         """The variance of a `Prediction` without that of direct light at first smooth vertices, in
         one iteration."""
-        of_one = direct_error(self._trials, self._width, prediction.photon_light, 1.0, 1, 1.0)
+        of_one = direct_error(self._noise, prediction.photon_light, 1.0, 1, 1.0)
         of_all = of_one / self.session.camera_paths
         return prediction.variance - min(prediction.direct, of_all)
 
-    def _noise(self, trials):
+    def _trials(self, trials):
         """Direct light of so many independent paths through each pixel, mean over the channels:
         (trials, pixels)."""
         pixels = film_sample_count(self.session.sensor)
-        measure = self.session.recorded(self._grey)
+        passes = self.session.recorded(self._grey)
         spectral = self.session._spectral(PILOT_INDEX)
         values = [
-            np.array(measure(*self._arguments(part, PILOT_INDEX, spectral)))
+            np.array(passes(*self._arguments(part, PILOT_INDEX, spectral)))
             for part in self._split(np.full(pixels, trials))
         ]
         return np.concatenate(values)[: trials * pixels].reshape(pixels, trials).T

@@ -20,6 +20,8 @@ few steps of a fixed point find them.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from .noise import relative_weights, trimmed_mean
@@ -32,31 +34,47 @@ MOST_PATHS = 256
 """Of a pixel and iteration at most."""
 EXPONENTS = {True: 1.5, False: 1.0}
 """By whether numbers are those of sequences: a above."""
-STEPS = 16
+STEPS = 6
 
 
 def smoothed(values: np.ndarray, width: int) -> np.ndarray:
     """Means over squares of 3 x 3 pixels, smaller at the film's edges: (pixels,), row by row."""
-    image = values.reshape(-1, width)
-    for axis in range(2):
-        padded = np.pad(image, [(1, 1) if axis == k else (0, 0) for k in range(2)], mode="edge")
-        size = image.shape[axis]
-        image = np.mean([np.take(padded, range(k, k + size), axis) for k in range(3)], axis=0)
-    return image.ravel()
+    image = np.pad(values.reshape(-1, width), 1, mode="edge")
+    rows = image[:-2] + image[1:-1] + image[2:]
+    return ((rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:]) / 9).ravel()
 
 
-def mean_and_noise(samples: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray]:
-    """Mean of each pixel and variance of a path through it, (pixels,) each, from all samples of the
-    3 x 3 pixels around: few samples miss an edge that runs close to the pixel's border, but it
-    shows as a difference to the neighbour."""
+class DirectNoise(NamedTuple):
+    """What trials tell of direct light, mean over the channels; (pixels,) each."""
+
+    mean: np.ndarray
+    noise: np.ndarray
+    """Variance of a path, with the differences to the neighbours: few samples miss an edge that
+    runs close to a pixel's border, but it shows there."""
+    own: np.ndarray
+    """Variance of a path, without them."""
+
+
+def measure(samples: np.ndarray, width: int) -> DirectNoise:
+    """The `DirectNoise` of independent paths through each pixel, from those of the 3 x 3 pixels
+    around.
+
+    Parameters
+    ----------
+    samples : (paths, pixels)
+        Light of each path; pixels row by row.
+    width
+        Pixels in a row.
+    """
     samples = samples.astype(np.float64)
-    mean = smoothed(samples.mean(axis=0), width)
-    return mean, np.maximum(smoothed((samples**2).mean(axis=0), width) - mean**2, 0)
+    of_pixel, squares = samples.mean(axis=0), (samples**2).mean(axis=0)
+    own = (squares - of_pixel**2) * (len(samples) / (len(samples) - 1))
+    mean = smoothed(of_pixel, width)
+    return DirectNoise(mean, np.maximum(smoothed(squares, width) - mean**2, 0), own)
 
 
 def paths_per_pixel(
-    samples: np.ndarray,
-    width: int,
+    found: DirectNoise,
     photon_light: float,
     photon_error: float,
     iterations: float,
@@ -66,10 +84,8 @@ def paths_per_pixel(
 
     Parameters
     ----------
-    samples : (paths, pixels)
-        Direct light of independent paths, mean over the channels; pixels row by row.
-    width
-        Pixels in a row.
+    found
+        Of one path.
     photon_light
         Radiance that photons bring to a pixel, on average.
     photon_error
@@ -77,9 +93,8 @@ def paths_per_pixel(
     iterations, exponent
         n and a.
     """
-    mean, noise = mean_and_noise(samples, width)
-    relative = relative_weights(mean + photon_light)
-    noise *= max(iterations, 1) ** (1 - exponent)
+    relative = relative_weights(found.mean + photon_light)
+    noise = found.noise * max(iterations, 1) ** (1 - exponent)
     absolute_error = photon_error / max(float(np.median(relative)), 1e-30)
     paths = np.ones(len(noise))
     for _ in range(STEPS):
@@ -93,15 +108,14 @@ def paths_per_pixel(
 
 
 def direct_error(
-    samples: np.ndarray,
-    width: int,
+    found: DirectNoise,
     photon_light: float,
-    paths: np.ndarray,
+    paths: np.ndarray | float,
     iterations: float,
     exponent: float,
 ) -> float:
     """Relative noise of direct light in one iteration with so many `paths` a pixel; arguments as of
     `paths_per_pixel`."""
-    mean, _ = mean_and_noise(samples, width)
-    noise = samples.var(axis=0, ddof=1) * max(iterations, 1) ** (1 - exponent)
-    return trimmed_mean(relative_weights(mean + photon_light) * noise * paths**-exponent)
+    noise = found.own * max(iterations, 1) ** (1 - exponent)
+    relative = relative_weights(found.mean + photon_light)
+    return trimmed_mean(relative * noise * paths**-exponent)

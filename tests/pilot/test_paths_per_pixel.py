@@ -20,9 +20,13 @@ def samples_of(lamp=50.0, seed=0):
     return image.reshape(direct_paths.TRIALS, -1)
 
 
+def found_in(samples):
+    return direct_paths.measure(samples, WIDTH)
+
+
 def objective(paths, samples, light, error, iterations, exponent):
     """What the module says that it minimises, of paths of one block."""
-    mean, noise = direct_paths.mean_and_noise(samples, WIDTH)
+    mean, noise = direct_paths.measure(samples, WIDTH)[:2]
     relative = relative_weights(mean + light)
     left = noise * iterations ** (1 - exponent) * paths**-exponent
     return (
@@ -36,7 +40,8 @@ def objective(paths, samples, light, error, iterations, exponent):
 def test_no_other_numbers_do_better(iterations, exponent):
     """In random directions, within the bounds."""
     samples, rng = samples_of(), np.random.default_rng(1)
-    given = samples, WIDTH, 0.1, 0.05, iterations, exponent
+    found = found_in(samples)
+    given = found, 0.1, 0.05, iterations, exponent
     best = direct_paths.paths_per_pixel(*given)
     assert best.min() >= 1 and best.max() > 3
     least = objective(best, samples, 0.1, 0.05, iterations, exponent)
@@ -48,7 +53,7 @@ def test_no_other_numbers_do_better(iterations, exponent):
 
 
 def test_paths_go_where_the_noise_is():
-    paths = direct_paths.paths_per_pixel(samples_of(), WIDTH, 0.1, 0.05, 32, 1.5)
+    paths = direct_paths.paths_per_pixel(found_in(samples_of()), 0.1, 0.05, 32, 1.5)
     paths = paths.reshape(16, WIDTH)
     assert paths[4, 6:18].min() > 4 * np.median(paths[8:, : WIDTH // 2])
     assert np.all(paths[8:, WIDTH // 2 + 2 :] == 1)
@@ -60,20 +65,20 @@ def test_an_edge_between_pixels_counts():
     image = np.zeros((direct_paths.TRIALS, 8, WIDTH))
     image[:, :4] = 30.0
     paths = direct_paths.paths_per_pixel(
-        image.reshape(direct_paths.TRIALS, -1), WIDTH, 0.1, 0.05, 32, 1.5
+        found_in(image.reshape(direct_paths.TRIALS, -1)), 0.1, 0.05, 32, 1.5
     ).reshape(8, WIDTH)
     assert np.all(paths[3:5] > 2) and np.all(paths[[0, 1, 6, 7]] == 1)
 
 
 def test_quiet_pixels_send_one_path():
     quiet = np.full((direct_paths.TRIALS, 8 * WIDTH), 0.3)
-    assert np.all(direct_paths.paths_per_pixel(quiet, WIDTH, 0.0, 0.1, 16, 1.5) == 1)
-    assert np.all(direct_paths.paths_per_pixel(0 * quiet, WIDTH, 0.0, 0.0, 16, 1.5) == 1)
+    assert np.all(direct_paths.paths_per_pixel(found_in(quiet), 0.0, 0.1, 16, 1.5) == 1)
+    assert np.all(direct_paths.paths_per_pixel(found_in(0 * quiet), 0.0, 0.0, 16, 1.5) == 1)
 
 
 def test_noisy_photons_need_fewer_paths():
     few, many = (
-        direct_paths.paths_per_pixel(samples_of(), WIDTH, 0.1, error, 16, 1.0).mean()
+        direct_paths.paths_per_pixel(found_in(samples_of()), 0.1, error, 16, 1.0).mean()
         for error in (1.0, 0.01)
     )
     assert few < 0.7 * many
@@ -84,7 +89,7 @@ def test_error_that_is_left_falls_with_the_paths():
     rng = np.random.default_rng(3)
     samples = rng.normal(1.0, 0.1, (64, 32 * WIDTH))
     one, four = (
-        direct_paths.direct_error(samples, WIDTH, 0.0, np.full(32 * WIDTH, number), 8, 1.0)
+        direct_paths.direct_error(found_in(samples), 0.0, np.full(32 * WIDTH, number), 8, 1.0)
         for number in (1.0, 4.0)
     )
     assert one == pytest.approx(4 * four)

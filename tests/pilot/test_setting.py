@@ -2,9 +2,10 @@
 
 import math
 
+from mis_integrators.pilot.setting import PILOT_PATHS, PilotSetting, pilot_pixels
+
 import hypothesis
 from hypothesis import strategies as st
-from mis_integrators.pilot.setting import PILOT_PATHS, PilotSetting, pilot_pixels
 
 
 @hypothesis.given(st.integers(1, 3000), st.integers(1, 3000), st.integers(1, 100))
