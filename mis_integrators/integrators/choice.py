@@ -38,17 +38,12 @@ CANDIDATES = ("path", {}), *PHOTON_MAPPERS
 TRIAL_TIME_SHARE = 0.05
 """Tuned: share of the planned time that the pilot may have; `path` and the first photon mapper are
 tried however long that takes."""
-KEEPS_UP = 4
-"""Tuned: where the error expected of `path` is at most so many times that of the first photon
-mapper, camera paths find much of the light by themselves, and what spoils photon maps are
-highlights on glossy surfaces: optimal weights are likely to be the best. (Where `path` is ahead,
-they seldom are by more than their trial takes.)"""
 WORTH_SHARE = 0.3
-"""Tuned: the share of the time that is left that a trial may then take. If it is won, nothing of it
-was in vain."""
-LIKE_THE_FIRST = 2.5
-"""Tuned: what trying another photon mapper takes, in the seconds that the first one took (optimal
-weights have to learn first): 1.6 to 3."""
+"""Tuned: the share of the time that is left that the trial of optimal weights may take, where they
+are of use: they often win, by more than their trial takes."""
+LIKE_THE_FIRST = 1.5
+"""Tuned: what trying another photon mapper takes, in the seconds that the first one took, which has
+rendered its first iterations (optimal weights have to learn first)."""
 PATH_TRIALS = 16
 """Tuned: samples of `path` on each of the pilot's pixels; a power of two."""
 TRIAL_INDEX = 1 << 28
@@ -155,27 +150,25 @@ def choose(integrator, scene, sensor, seed, iterations, seconds):
         reasons.append(blind)
     else:
         trials.insert(0, _try_path(path, segments, pixels, prediction.mean, budget))
-    weighting = (
-        not blind and 1 < trials[0].error(budget) / max(trials[1].error(budget), 1e-30) < KEEPS_UP
-    )
+    likely = True  # that the first of the candidates with optimal weights is the best
     survey = Survey(first.traits, first.lights, prediction.mean)
     for plugin, parameters in later_candidates(first.traits):
-        likely = weighting and plugin.startswith("bdpm_opt")
+        weighted = plugin.startswith("bdpm_opt")
         if seconds is None:
             time_of_trials = budget, spent, FEWEST_ITERATIONS * usual * 0.5
         else:
             time_of_trials = seconds, time.perf_counter() - began, LIKE_THE_FIRST * first_seconds
         reason = _why_useless(plugin, first.traits, trials, budget) or _why_too_dear(
-            likely, *time_of_trials
+            weighted and likely, *time_of_trials
         )
         if reason:
             reasons.append(f"not {name_of(plugin, parameters)}: {reason}")
             continue
-        weighting &= not likely
+        likely &= not weighted
         planned = max(int(budget / usual), 1)
         session = new_session(plugin, parameters, integrator, scene, sensor, seed, planned, survey)
         session.plan_time(seconds, began)
-        session.start()
+        session.rehearse()
         if session.prediction is not None:
             trials.append(_trial(plugin, parameters, session, segments))
             spent += _pilot_cost(session, segments)

@@ -37,6 +37,7 @@ class PilotedSession(IterativeSession):
         self.corrected = {}  # whether estimates are corrected at edges, by kind of photons
         self.prediction = None  # a `Prediction`, where a pilot has chosen
         self.kept = {}  # iterations that were rendered to measure their time, by number
+        self._rehearsed = None  # a `PilotResult` that has not been rendered by
 
     def kinds(self):
         """Photon maps that the scene needs."""
@@ -106,13 +107,20 @@ class PilotedSession(IterativeSession):
     def start(self):
         if self.begun is None:
             self.begun = time.perf_counter()
-        pilot = self._run_pilot()
+        pilot, self._rehearsed = self._rehearsed or self._run_pilot(), None
         if pilot is None:
             self.radii = self.radii or {}
         elif self.seconds is None:
             self._take(pilot.choose(pilot.setting.planned_iterations))
         else:
             self._choose_by_clock(pilot)
+
+    def rehearse(self):
+        """Runs the pilot, and predicts what as many iterations as are planned would bring; renders
+        nothing."""
+        self._rehearsed = self._run_pilot()
+        if self._rehearsed is not None:
+            self._take(self._rehearsed.choose(self._rehearsed.setting.planned_iterations))
 
     def _run_pilot(self):
         """The `PilotResult`; None where radii are known, or there are no photons to gather."""

@@ -21,7 +21,6 @@ import numpy as np
 import pytest
 from lamplit import LAMP, ROOT, SCENE, command, read, render, run, same, write_scene
 from test_auto import set_price_of_path
-from test_bdpm import always_choose_camera_paths
 
 
 @pytest.fixture
@@ -167,7 +166,7 @@ def test_learned_radii_are_not_learned_again(scene):
     learned = {
         "radii": dict.fromkeys(session.kinds(), 0.123),
         "corrected": dict.fromkeys(session.kinds(), False),
-        "camera_paths": 2,
+        "direct_light": {},
     }
     session.recall(learned)
     session.plan_time(5.0)
@@ -261,8 +260,7 @@ def test_finished_render_is_extended(scene, tmp_path, capsys):
     ],
 )
 def test_image_is_rendered_again_from_itself(scene, tmp_path, monkeypatch, arguments, price):
-    """Whatever the clock decided: camera paths, radii, the method, the number of iterations."""
-    always_choose_camera_paths(monkeypatch, 3)
+    """Whatever the clock decided: radii, the method, the number of iterations."""
     if price:
         set_price_of_path(monkeypatch, price)
     one, other = tmp_path / "a.exr", tmp_path / "b.exr"
@@ -281,19 +279,21 @@ def test_image_is_rendered_again_from_itself(scene, tmp_path, monkeypatch, argum
     del told["again"], again["again"]
     assert told == again
     assert same(image, same_image) and told["seed"] == 7
-    if "bdpm" in arguments:
-        assert told["camera_paths"] == 3 and told["spp"] == 3 * told["iterations"]
 
 
 @pytest.mark.parametrize(
-    "plugin, price, paths", [("bdpm", None, 3), ("bdpm_auto", 1e6, 3), ("bdpm_auto", 1e-6, 4)]
+    "plugin, given, price, paths",
+    [
+        ("bdpm", ["-P", "camera_paths=3"], None, 3),
+        ("bdpm_auto", ["-P", "camera_paths=3"], 1e6, 3),
+        ("bdpm_auto", [], 1e-6, 4),
+    ],
 )
 def test_samples_asked_for_are_made_whatever_was_learned(
-    scene, tmp_path, monkeypatch, plugin, price, paths
+    scene, tmp_path, monkeypatch, plugin, given, price, paths
 ):
     """A timed render that takes several camera paths an iteration goes on to a number of
     samples."""
-    always_choose_camera_paths(monkeypatch, 3)
     film = loading.load(scene, {}, plugin, {}).scene.sensors()[0].film()
     monkeypatch.setattr(
         "mis_integrators.integrators.unidirectional.BUSY", 4 * int(np.prod(film.size()))
@@ -301,7 +301,7 @@ def test_samples_asked_for_are_made_whatever_was_learned(
     if price:
         set_price_of_path(monkeypatch, price)
         monkeypatch.setattr("mis_integrators.integrators.choice.RARE", 1.0)  # caustics or not
-    out = ["-i", plugin, "-o", tmp_path / "a.exr"]
+    out = ["-i", plugin, *given, "-o", tmp_path / "a.exr"]
     assert render(scene, *out, "--time", 0.01, "--checkpoint", 100) == 0
     header, _ = read(tmp_path / "a.exr")
     assert header["camera_paths"] == paths and header["spp"] == paths * header["iterations"]

@@ -19,7 +19,7 @@ from foggy import even, view, volpath
 from foggy import grid as smoke
 from foggy import world as foggy_world
 from test_against_path import MONO, RGB, SPECTRAL, caustic_scene
-from test_bdpm import always_choose_camera_paths, box_scene, glossy_box, last_words
+from test_bdpm import box_scene, glossy_box, last_words
 from worlds import diffuse, film, look, path, tray
 
 
@@ -304,24 +304,15 @@ def test_longer_renders_try_more(rgb):
     assert short <= 2 < long
 
 
-@pytest.mark.parametrize(
-    "behind, spp, tried",
-    [(2, 24, {"bdpm_opt2"}), (100, 24, set()), (0.1, 24, set()), (2, 4, set())],
-)
-def test_weights_are_worth_more_time_where_path_keeps_up(rgb, monkeypatch, behind, spp, tried):
-    """One mixture is tried beyond the pilot's usual share, if there is some time left, where camera
-    paths find much of the light by themselves, but not so much that `path` is ahead."""
+@pytest.mark.parametrize("spp, tried", [(24, {"bdpm_opt2"}), (4, set())])
+def test_weights_are_worth_more_time(rgb, spp, tried):
+    """One mixture is tried beyond the pilot's usual share, if there is some time left."""
     metal = {
         "type": "sphere",
         "center": [0, -1.3, 0.4],
         "radius": 0.3,
         "bsdf": {"type": "roughconductor", "alpha": 0.3},
     }
-    set_price_of_path(monkeypatch, 1)
-    errors = decided(box_scene(metal=metal), spp).settings
-    set_price_of_path(
-        monkeypatch, behind * errors["choice.relmse.bdpm bdd=0"] / errors["choice.relmse.path"]
-    )
     settings = decided(box_scene(metal=metal), spp).settings
     errors = {
         name.removeprefix("choice.relmse.")
@@ -330,7 +321,7 @@ def test_weights_are_worth_more_time_where_path_keeps_up(rgb, monkeypatch, behin
     }
     assert errors == {"path", "bdpm bdd=0"} | tried
     assert any(
-        ("30%" if behind == 2 and not tried else "5%") in reason
+        ("5%" if tried else "30%") in reason
         for name, reason in settings.items()
         if name.startswith("choice.because")
     )
@@ -366,28 +357,6 @@ def test_a_short_render_does_not_spend_its_time_on_trials(rgb, seconds, tried):
     session.start()
     assert ("bdpm_opt2" in session.decision.errors) == tried
     assert "bdpm bdd=0" in session.decision.errors
-
-
-def test_camera_paths_of_the_chosen_are_its_own(rgb, monkeypatch):
-    """Those that its pilot found worth while, which make an iteration dearer by what they cost."""
-    always_choose_camera_paths(monkeypatch, 3)
-    session = auto().session(caustic_scene("point"))
-    session.plan_time(1000.0)
-    session.iterate()
-    assert (
-        session.camera_paths
-        == session.settings["camera_paths"]
-        == session.decision.session.camera_paths
-        == 3
-    )
-    trial = session.decision.trials[0]
-    assert 1.5 < trial.cost / costs.cost(
-        trial.plugin,
-        costs.events(trial.session, [1.0] * 5, 0, session.decision.session.prediction.gathered),
-    )
-    other = auto().session(caustic_scene("point"))
-    other.recall(json.loads(json.dumps(session.learned)))
-    assert other.camera_paths == 3
 
 
 @pytest.mark.parametrize("sampler", ["independent", "sobol"])
