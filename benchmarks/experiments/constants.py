@@ -44,9 +44,6 @@ USUAL = "bdpm:bdd=0"
 BY_CLOCK = (
     "integrators.choice",
     "integrators.piloted",
-    "pilot.result",
-    "pilot.cost.LEAST_CAMERA_SHARE",
-    "pilot.cost.MOST_CAMERA_SHARE",
     "pilot.run.FEWEST_TIMED_ITERATIONS",
     "pilot.run.PILOT_TIME_SHARE",
 )

@@ -19,13 +19,17 @@ Numbers that could be others without anything being wrong: shares, costs, sizes 
 tolerances and formats are not among them. This page is written from the code, where the docstring
 of each begins with "Tuned:", by `python benchmarks/run.py constants --page`; a test compares.
 
-`halved` and `doubled` are errors at equal time over those with the value as it is: relative squared
-errors without the worst 0.1 % of the pixels, geometric mean over scenes that nothing here was tuned
-on, with the standard error over the scenes. (Of a share above one half, what is left to one is
-halved or doubled.) Figures near one, beside their standard error, say that the value does not
-matter much. An empty place is not measured yet, or means nothing: tuples, and constants of the
-multi-view integrator. Measured by `python benchmarks/run.py constants`, whose `--scenes` names the
-scenes.
+`halved` and `doubled` are error times time over that with the value as it is: relative squared
+error without the worst 0.1 % of the pixels, seconds of the processors with set-up and without what
+compiles, geometric mean over scenes that nothing here was tuned on, with the standard error over
+the scenes. (Of a share above one half, what is left to one is halved or doubled.) Both renders have
+the same random numbers and samples, as many as take about a second; where only the clock matters,
+the same time. Figures near one, beside their standard error, say that the value does not matter
+much; so short a render makes much of set-up, and one seed of the luck of a pilot. An empty place is
+not measured yet, or means nothing: tuples, and constants of the multi-view integrator. Measured by
+`python benchmarks/run.py constants --processor-time --time 0.7 --width 96`, whose `--scenes` names
+the scenes: A and B of the peers' scenes, `veach-bidir`, `living-room`, `classroom`, and three
+random scenes of the tests.
 
 """
 

@@ -15,7 +15,7 @@ from ..photons.trace import trace_light_paths
 from .common import MOST_LIGHT_PATHS
 from .weighted import WeightedBDPM, WeightedSession
 
-USUAL_FROZEN_PATHS = 1 << 17
+USUAL_FROZEN_PATHS = 1 << 16
 """Tuned: light sub-paths of the frozen pass, unless the parameter says otherwise."""
 USUAL_PHOTONS = 10
 """Tuned: photons a merge disk of the radius for which the weights of a pilot are made."""
@@ -53,7 +53,7 @@ class BDPMOpt(WeightedBDPM):
        - |int|
        - Light sub-paths of the pass from which the weights learn where light is; they do not
          contribute to the image. 0 stands for
-         131072. (Default: 0)
+         65536. (Default: 0)
      * - photon_count, initial_radius, alpha, direct_paths, camera_paths, variance, max_depth,
          rr_depth, hide_emitters, sampler
        -
@@ -94,7 +94,7 @@ class BDPMOpt(WeightedBDPM):
         self.weights = parameters.choice("weights", "local", ("full", "local"))
         self.mix_diffuse = parameters.boolean("mix_diffuse", False)
         self.frozen_photons = parameters.integer(
-            "frozen_photons", 0, 0, "at least 0 (0: 131072)", high=MOST_LIGHT_PATHS
+            "frozen_photons", 0, 0, "at least 0 (0: 65536)", high=MOST_LIGHT_PATHS
         )
 
     def settings(self):

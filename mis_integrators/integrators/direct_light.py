@@ -37,9 +37,9 @@ NOTHING_GATHERED = Queries(0, 0, False, False, True)
 class Beside(NamedTuple):
     """What the noise of direct light is weighed against: arguments of `paths_per_pixel`."""
 
-    photon_light: float = 0.0
-    photon_error: float = 1 / USUAL_PHOTONS
-    iterations: float = UNPLANNED_ITERATIONS
+    photon_light: float
+    photon_error: float
+    iterations: float
 
 
 class DirectLight:
@@ -83,7 +83,7 @@ class DirectLight:
             self._beside = Beside(
                 prediction.photon_light, float(error), float(prediction.iterations)
             )
-        beside = self._beside or Beside()
+        beside = self._beside or Beside(0.0, 1 / USUAL_PHOTONS, UNPLANNED_ITERATIONS)
         paths = paths_per_pixel(self._noise, *beside, self._exponent)
         self._send(np.maximum(np.rint(paths).astype(int) - camera_paths, 0), camera_paths)
 

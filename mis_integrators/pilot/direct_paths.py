@@ -28,7 +28,7 @@ from .noise import relative_weights, trimmed_mean
 
 TRIALS = 4
 """Tuned: independent paths through each pixel that tell how noisy its direct light is."""
-COST = 0.1
+COST = 0.05
 """Tuned: cost of a path for direct light, over that of one that gathers (photons included)."""
 MOST_PATHS = 256
 """Of a pixel and iteration at most."""

@@ -11,8 +11,6 @@ from experiments import constants
 
 ALLOWED = {
     "pilot/bias.py": {"LEAST_BIAS"},
-    "pilot/cost.py": {"CAMERA_SHARE"},
-    "pilot/result.py": {"CAMERA_SHARE"},
 }
 """Defaults that callers overrule wherever it matters."""
 
