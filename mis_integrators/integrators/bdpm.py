@@ -229,12 +229,12 @@ class BDPMSession(PilotedSession):
     def start(self):
         super().start()
         if self.direct_light.mean_paths is None:
-            self.direct_light.spread(self.camera_paths)
+            self.direct_light.spread()
 
     def _take(self, choice):
         super()._take(choice)
         if not self.kept:
-            self.direct_light.spread(self.camera_paths, self.prediction)
+            self.direct_light.spread(self.prediction)
         if self.prediction is not None:
             self.prediction = self.direct_light.known_by(self.prediction)
 

@@ -66,14 +66,14 @@ class DirectLight:
         if fields.names():
             self._beside = Beside(**{name: fields.number(name, LARGEST) for name in Beside._fields})
 
-    def spread(self, camera_paths, prediction=None):
-        """Chooses the paths, beside so many that gather, and a `Prediction` of what these do. Where
-        nothing is gathered there are none, which would be no cheaper than all others."""
+    def spread(self, prediction=None):
+        """Chooses the paths, given a `Prediction` of what those do that gather. Where nothing is
+        gathered there are none: they would be no cheaper than all others."""
         session = self.session
         pixels, given = film_sample_count(session.sensor), session.integrator.direct_paths
         if given or not session.kinds():
             extra = max(given - 1, 0) if session.kinds() else 0
-            self._send(np.full(pixels, extra * camera_paths), camera_paths)
+            self._send(np.full(pixels, extra * session.camera_paths))
             return
         if self._noise is None:
             self._noise = measure(self._trials(TRIALS), film_size(session.sensor)[0])
@@ -85,7 +85,7 @@ class DirectLight:
             )
         beside = self._beside or Beside(0.0, 1 / USUAL_PHOTONS, UNPLANNED_ITERATIONS)
         paths = paths_per_pixel(self._noise, *beside, self._exponent)
-        self._send(np.maximum(np.rint(paths).astype(int) - camera_paths, 0), camera_paths)
+        self._send(np.maximum(np.rint(paths).astype(int) - session.camera_paths, 0))
 
     def known_by(self, prediction):
         """A `Prediction` made without knowing of these paths, with the noise that they leave."""
@@ -119,14 +119,15 @@ class DirectLight:
         ]
         return np.concatenate(values)[: trials * pixels].reshape(pixels, trials).T
 
-    def _send(self, counts, camera_paths):
-        """From now on, `counts` (pixels,) paths go through each pixel and iteration."""
-        self._paths = counts + camera_paths
+    def _send(self, counts):
+        """From now on, `counts` (pixels,) of these paths go through each pixel and iteration."""
+        gathering = self.session.camera_paths
+        self._paths = counts + gathering
         self.mean_paths, self._parts, self.beyond = float(np.mean(counts)), [], None
         if np.any(counts):
             self._parts = self._split(counts)
             self._render = self.session.recorded(self._block)
-            self.beyond = from_numpy(mi.Float, self._paths / camera_paths)
+            self.beyond = from_numpy(mi.Float, self._paths / gathering)
 
     def add_to(self, block, iteration, spectral):
         """An iteration's block with that of these paths."""

@@ -62,15 +62,16 @@ def measure(samples: np.ndarray, width: int) -> DirectNoise:
     Parameters
     ----------
     samples : (paths, pixels)
-        Light of each path; pixels row by row.
+        Light of each path; pixels row by row. Values that are not finite count as none.
     width
         Pixels in a row.
     """
-    samples = samples.astype(np.float64)
+    samples = np.where(np.isfinite(samples), samples, 0).astype(np.float64)
     of_pixel, squares = samples.mean(axis=0), (samples**2).mean(axis=0)
     own = (squares - of_pixel**2) * (len(samples) / (len(samples) - 1))
     mean = smoothed(of_pixel, width)
-    return DirectNoise(mean, np.maximum(smoothed(squares, width) - mean**2, 0), own)
+    noise = smoothed(squares, width) - mean**2
+    return DirectNoise(mean, np.maximum(noise, 0), np.maximum(own, 0))
 
 
 def paths_per_pixel(

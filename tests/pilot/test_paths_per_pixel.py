@@ -76,6 +76,13 @@ def test_quiet_pixels_send_one_path():
     assert np.all(direct_paths.paths_per_pixel(found_in(0 * quiet), 0.0, 0.0, 16, 1.5) == 1)
 
 
+def test_broken_samples_break_nothing():
+    samples = samples_of()
+    samples[1, 7], samples[2, 300] = np.nan, np.inf
+    paths = direct_paths.paths_per_pixel(found_in(samples), 0.1, 0.05, 16, 1.5)
+    assert np.all(np.isfinite(paths)) and paths.max() > 3
+
+
 def test_noisy_photons_need_fewer_paths():
     few, many = (
         direct_paths.paths_per_pixel(found_in(samples_of()), 0.1, error, 16, 1.0).mean()
