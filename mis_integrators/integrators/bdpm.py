@@ -543,9 +543,11 @@ class SubsetPasses:
         return mean_photon_count(photon_map, read_queries(vertices), radius)
 
     def by_pixel(self, values):
-        """Means (pixels,) of values of the camera paths."""
+        """Means (pixels,) of values of the camera paths; those that are not finite count as
+        none."""
         pixels = self.pixels
         values = np.broadcast_to(np.array(values), pixels.paths)
+        values = np.where(np.isfinite(values), values, 0)
         return values.reshape(pixels.camera_paths, pixels.count).mean(axis=0)
 
 

@@ -165,7 +165,8 @@ class DirectLight:
         return session.scene, session.sensor, session._tables, sequence, done, part, spectral
 
     def _trace(self, sensor, sequence, done, part, spectral):
-        """Radiance, alpha, position for splatting, and whether there is a path."""
+        """Radiance, alpha, position for splatting, and whether there is a path. Light that is not
+        finite counts as none: the paths that gather meet its cause, too, and tell of it."""
         pixel, number, of_pixel = part
         session = self.session
         camera_pass = ListedPass(
@@ -180,8 +181,10 @@ class DirectLight:
         radiance, alpha, position, _, _ = trace_camera_paths(
             session.world, session.limits, camera_pass, NOTHING_GATHERED
         )
+        shown = dr.all(dr.isfinite(radiance))
         if session.limits.hide_emitters:
-            radiance = dr.select(alpha > 0, radiance, 0)
+            shown &= alpha > 0
+        radiance = dr.select(shown, radiance, 0)
         dr.eval(radiance, alpha, position)  # the same kernel for `noise` and for images
         return radiance, alpha, position, pixel < film_sample_count(sensor)
 

@@ -137,7 +137,7 @@ def test_workers_are_told_what_a_pilot_found(scene, client):
     told = {
         "radii": dict.fromkeys(opened.session.kinds(), 0.31),
         "corrected": dict.fromkeys(opened.session.kinds(), False),
-        "camera_paths": 2,
+        "direct_light": {},
     }
     identity = opened.identity()
     opened.session.recall(told)

@@ -41,11 +41,8 @@ def spotted(scene, tmp_path):
 @pytest.mark.parametrize("plugin", [*_plugins.PLUGINS, "path"])
 def test_texel_that_is_no_number(spotted, tmp_path, capsys, plugin):
     """The image is there, finite, and as bright as it should be; the texture is named. Both
-    renders' means have a standard deviation of about 2 %. (The more paths an iteration has, the
-    more iterations a pixel loses where it sees the texel in part.)"""
+    renders' means have a standard deviation of about 2 %."""
     options = ["-D", "size=32", "-i", plugin, "--spp", 16, "--seed", 1]
-    if plugin.startswith("bdpm") and plugin != "bdpm_auto":
-        options += ["-P", "direct_paths=1"]
     assert (
         render(
             spotted,
