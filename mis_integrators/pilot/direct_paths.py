@@ -50,7 +50,8 @@ class DirectNoise(NamedTuple):
     mean: np.ndarray
     noise: np.ndarray
     """Variance of a path, with the differences to the neighbours: few samples miss an edge that
-    runs close to a pixel's border, but it shows there."""
+    runs close to a pixel's border, but it shows there. Geometric mean of two halves of the trials:
+    a rare bright path, which could have come anywhere, is in one of them only."""
     own: np.ndarray
     """Variance of a path, without them."""
 
@@ -69,9 +70,15 @@ def measure(samples: np.ndarray, width: int) -> DirectNoise:
     samples = np.where(np.isfinite(samples), samples, 0).astype(np.float64)
     of_pixel, squares = samples.mean(axis=0), (samples**2).mean(axis=0)
     own = (squares - of_pixel**2) * (len(samples) / (len(samples) - 1))
-    mean = smoothed(of_pixel, width)
-    noise = smoothed(squares, width) - mean**2
-    return DirectNoise(mean, np.maximum(noise, 0), np.maximum(own, 0))
+    halves = [_noise_around(half, width) for half in np.array_split(samples, 2)]
+    noise = np.sqrt(halves[0] * halves[1])
+    return DirectNoise(smoothed(of_pixel, width), noise, np.maximum(own, 0))
+
+
+def _noise_around(samples: np.ndarray, width: int) -> np.ndarray:
+    """Variance of all samples of the 3 x 3 pixels around each: (pixels,)."""
+    mean = smoothed(samples.mean(axis=0), width)
+    return np.maximum(smoothed((samples**2).mean(axis=0), width) - mean**2, 0)
 
 
 def paths_per_pixel(
