@@ -6,6 +6,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 from mis_integrators.core.session import Session
 
@@ -60,11 +61,7 @@ class Contender:
         usual: float | None = None,
     ) -> Contender:
         """Make a session; the time that it takes counts, but for what compiles."""
-        dr.kernel_history_clear()
-        start = time.perf_counter()
-        session = make(seed)
-        seconds = time.perf_counter() - start
-        compiling = min(seconds, compile_seconds(dr.kernel_history()))
+        session, seconds, compiling, _ = timed(lambda: make(seed))
         return cls(
             label,
             session,
@@ -87,12 +84,7 @@ class Contender:
 
     def iterate(self) -> None:
         """Run one iteration against this rendering's own clock."""
-        dr.kernel_history_clear()
-        start = time.perf_counter()
-        self.session.iterate()
-        seconds = time.perf_counter() - start
-        kernels = dr.kernel_history()
-        compiling = min(seconds, compile_seconds(kernels))
+        _, seconds, compiling, kernels = timed(self.session.iterate)
         self.compiling += compiling
         self.seconds.append(seconds - compiling)
         if self.observe:
@@ -120,6 +112,17 @@ class Contender:
             self.usual if len(self.seconds) == 1 and self.usual is not None else self.seconds[-1]
         )
         return self.rendering + 0.5 * next_one < seconds
+
+
+def timed(work: Callable[[], Any]) -> tuple[Any, float, float, list[dict]]:
+    """What `work` returns, its seconds, those of them that went into compiling, and its kernels (as
+    in Dr.Jit's kernel history)."""
+    dr.kernel_history_clear()
+    start = time.perf_counter()
+    result = work()
+    seconds = time.perf_counter() - start
+    kernels = dr.kernel_history()
+    return result, seconds, min(seconds, compile_seconds(kernels)), kernels
 
 
 def compile_seconds(kernels: Sequence[dict]) -> float:

@@ -95,12 +95,12 @@ def run(options: argparse.Namespace) -> None:
     for path in options.scenes:
         opened = open_at_width(path, options.width)
         references = find_references(opened, options, console.log)
-        for key, method, variants in experiments:
+        for key, method, tried in experiments:
             if not _concerns(key, opened):
                 continue
             judge = Judge(method, opened, references, options.time, key.startswith(BY_CLOCK))
             try:
-                ratios = judge.ratios(variants, options.seeds)
+                ratios = judge.ratios(tried, options.seeds)
             except loading.SCENE_ERRORS as error:
                 console.log(f"{opened.name}, {method.label}: {loading.one_line(error)}")
                 continue

@@ -22,6 +22,7 @@ from ..photons.gather import QueryVertices, gather_photons, mean_photon_count
 from ..photons.grid import PhotonMap, build_photon_map, smallest_cell
 from ..photons.queries import Queries, read_queries, trace_camera_paths
 from ..photons.trace import trace_light_paths
+from ..pilot.direct_paths import MOST_PATHS, DirectNoise
 from ..pilot.setting import PilotSetting
 from .common import MOST_LIGHT_PATHS, IterativeIntegrator
 from .direct_light import DirectLight
@@ -30,7 +31,6 @@ from .schedule import read_radius
 
 SPARE_PHOTONS = 1 << 20
 """Unused room beyond half of a photon buffer that is worth the time to record the passes anew."""
-MOST_DIRECT_PATHS = 256
 CAMERA_CHUNK = 1 << 21
 """Camera paths traced at once at most; larger films are traced in parts (bounds memory)."""
 
@@ -43,6 +43,8 @@ class Survey(NamedTuple):
     mean: np.ndarray | None = None
     """Radiance of the pilot's pixels that errors are relative to (None: that which the pilot
     finds)."""
+    direct_noise: DirectNoise | None = None
+    """Of direct light, in each pixel."""
 
 
 class BDPM(IterativeIntegrator):
@@ -139,7 +141,7 @@ class BDPM(IterativeIntegrator):
         )
         self.initial_radius, self.alpha = read_radius(parameters)
         self.direct_paths = parameters.integer(
-            "direct_paths", 0, 0, "at least 0 (0: automatic)", high=MOST_DIRECT_PATHS
+            "direct_paths", 0, 0, "at least 0 (0: automatic)", high=MOST_PATHS
         )
 
     def settings(self):
@@ -161,9 +163,10 @@ class BDPMSession(PilotedSession):
 
     def __init__(self, integrator, scene, sensor, seed, iterations):
         super().__init__(integrator, scene, sensor, seed, iterations)
-        self.traits, self.lights, self.reference_mean = integrator.survey or Survey(
+        survey = integrator.survey or Survey(
             SceneTraits(scene), Lights.seen_by(scene, sensor, integrator.plugin)
         )
+        self.traits, self.lights, self.reference_mean = survey[:3]
         self.world = World(scene, self.lights, self.traits)
         self.light_path_count = integrator.photon_count or min(
             film_sample_count(sensor), MOST_LIGHT_PATHS
@@ -187,7 +190,7 @@ class BDPMSession(PilotedSession):
         self.photons_found = 0  # by the last light pass
         self._sized = False
         self.recorded = recorder()
-        self.direct_light = DirectLight(self)
+        self.direct_light = DirectLight(self, survey.direct_noise)
         self._freeze()
 
     @property
@@ -233,10 +236,10 @@ class BDPMSession(PilotedSession):
 
     def _take(self, choice):
         super()._take(choice)
-        if not self.kept:
-            self.direct_light.spread(self.prediction)
-        if self.prediction is not None:
-            self.prediction = self.direct_light.known_by(self.prediction)
+        if self.prediction is None:
+            self.direct_light.spread()
+        else:
+            self.prediction = self.direct_light.beside(self.prediction, anew=not self.kept)
 
     @property
     def learned(self):
@@ -353,10 +356,10 @@ class BDPMSession(PilotedSession):
 
     def _render_chunk(self, scene, sensor, tables, maps, sequence, first, spectral, radii, beyond):
         camera_pass = self.describe_camera_pass(sensor, sequence, first, spectral)
-        path = dr.arange(mi.UInt32, self.chunk) + first
-        there = path < self.path_count  # the last part may have fewer
+        there = self.in_chunk(first)
         if beyond is not None:
-            beyond = dr.gather(mi.Float, beyond, path // self.camera_paths, there)
+            pixel = (dr.arange(mi.UInt32, self.chunk) + first) // self.camera_paths
+            beyond = dr.gather(mi.Float, beyond, pixel, there)
         radiance, alpha, position, vertices, count = self._trace_camera(
             camera_pass, self.vertex_capacity, spectral, beyond
         )

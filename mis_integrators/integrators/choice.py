@@ -151,7 +151,7 @@ def choose(integrator, scene, sensor, seed, iterations, seconds):
     else:
         trials.insert(0, _try_path(path, segments, pixels, prediction.mean, budget))
     likely = True  # that the first of the candidates with optimal weights is the best
-    survey = Survey(first.traits, first.lights, prediction.mean)
+    survey = Survey(first.traits, first.lights, prediction.mean, first.direct_light.noise)
     for plugin, parameters in later_candidates(first.traits):
         weighted = plugin.startswith("bdpm_opt")
         if seconds is None:

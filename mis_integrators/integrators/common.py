@@ -412,19 +412,23 @@ class IterativeSession:
     def _seed(self, iteration, *purpose):
         return dr.opaque(mi.UInt32, mix(self.seed, iteration, *purpose))
 
+    def _pass_seed(self, iteration, purpose, part=0):
+        """The seed of a pass: shared by all iterations under low-discrepancy numbers (but for each
+        `part` of 2^32 indices), else of this iteration alone."""
+        if self._low_discrepancy(iteration):
+            return self._seed(RENDER, purpose, part)
+        return self._seed(iteration, purpose)
+
     def _sequence(self, iteration, purpose, group_size):
         """The random numbers of a pass whose groups have `group_size` paths an iteration each: all
         paths of a group, over the iterations, share a low-discrepancy sequence. Pilots draw
         independent numbers: their laws are about these."""
-        low_discrepancy = self._low_discrepancy(iteration)
-        first = iteration * group_size
+        part, first = divmod(iteration * group_size, 2**32)
         return SampleSequence(
-            self._seed(RENDER, purpose, first >> 32)
-            if low_discrepancy
-            else self._seed(iteration, purpose),
-            dr.opaque(mi.UInt32, first % 2**32),
+            self._pass_seed(iteration, purpose, part),
+            dr.opaque(mi.UInt32, first),
             group_size,
-            low_discrepancy,
+            self._low_discrepancy(iteration),
         )
 
     def _grown(self, name, count):

@@ -17,16 +17,21 @@ from ..paths.camera import film_sample_count, film_size
 from ..paths.setting import ListedPass
 from ..photons.queries import Queries, trace_camera_paths
 from ..pilot.cost import USUAL_PHOTONS
-from ..pilot.direct_paths import EXPONENTS, TRIALS, direct_error, measure, paths_per_pixel
+from ..pilot.direct_paths import (
+    EXPONENTS,
+    MOST_PATHS,
+    TRIALS,
+    direct_error,
+    measure,
+    paths_per_pixel,
+)
 from ..pilot.run import PILOT_INDEX
 from ..pilot.setting import UNPLANNED_ITERATIONS
-from .common import RENDER
 
 PURPOSE = 4
 """Of the random seed, see `bdpm`."""
-ITERATION_BITS = 22
-"""Iterations 2^22 a to 2^22 (a + 1) - 1 share a sequence: with 2^10 paths a pixel at most, their
-indices have 32 bits."""
+INDICES = 2**32
+"""Of the paths that share a sequence: iterations that would need more have others."""
 LARGEST_PART = 1 << 21
 """Paths traced at once at most (bounds memory)."""
 LARGEST = 1e18
@@ -45,15 +50,14 @@ class Beside(NamedTuple):
 class DirectLight:
     """The passes of a `BDPMSession` that see emission, and direct light at the first smooth vertex.
 
-    `mean_paths`: of these paths, a pixel and iteration (None until that is known); `beyond` (one a
-    pixel; None where there are no such paths): all paths over those that gather.
+    `mean_paths`: of these paths, a pixel and iteration (None until that is known); `noise`: the
+    `DirectNoise` by which they are chosen (None until it is measured).
     """
 
-    def __init__(self, session):
-        self.session = session
-        self.mean_paths = self.beyond = None
-        self._beside, self._noise, self._parts = None, None, []
-        self._render = None  # the recorded pass
+    def __init__(self, session, noise=None):
+        self.session, self.noise = session, noise
+        self.mean_paths = self._paths = self._beside = None
+        self._lists = None  # what `_listed` has made
         self._exponent = EXPONENTS[session.integrator.low_discrepancy]
 
     @property
@@ -66,46 +70,44 @@ class DirectLight:
         if fields.names():
             self._beside = Beside(**{name: fields.number(name, LARGEST) for name in Beside._fields})
 
-    def spread(self, prediction=None):
-        """Chooses the paths, given a `Prediction` of what those do that gather. Where nothing is
-        gathered there are none: they would be no cheaper than all others."""
-        session = self.session
+    def spread(self):
+        """Chooses the paths by what is known of those that gather. Where nothing is gathered there
+        are none: they would be no cheaper than all others."""
+        session, gathering = self.session, self.session.camera_paths
         pixels, given = film_sample_count(session.sensor), session.integrator.direct_paths
-        if given or not session.kinds():
-            extra = max(given - 1, 0) if session.kinds() else 0
-            self._send(np.full(pixels, extra * session.camera_paths))
-            return
-        if self._noise is None:
-            self._noise = measure(self._trials(TRIALS), film_size(session.sensor)[0])
-        if prediction is not None:
-            others = self._without_direct_light(prediction)
-            error = others + prediction.squared_bias * prediction.iterations
-            self._beside = Beside(
-                prediction.photon_light, float(error), float(prediction.iterations)
-            )
-        beside = self._beside or Beside(0.0, 1 / USUAL_PHOTONS, UNPLANNED_ITERATIONS)
-        paths = paths_per_pixel(self._noise, *beside, self._exponent)
-        self._send(np.maximum(np.rint(paths).astype(int) - session.camera_paths, 0))
+        if not session.kinds():
+            paths = np.full(pixels, gathering)
+        elif given:
+            paths = np.full(pixels, given * gathering)
+        else:
+            beside = self._beside or Beside(0.0, 1 / USUAL_PHOTONS, UNPLANNED_ITERATIONS)
+            wanted = paths_per_pixel(self._measured(), *beside, self._exponent)
+            paths = np.maximum(np.rint(wanted).astype(int), gathering)
+        self._paths, self._lists = paths, None
+        self.mean_paths = float(np.mean(paths)) - gathering
 
-    def known_by(self, prediction):
-        """A `Prediction` made without knowing of these paths, with the noise that they leave."""
-        if self._noise is None:
+    def beside(self, prediction, anew):
+        """A `Prediction` made without knowing of these paths, with the noise that they leave; they
+        are chosen by it, where they are to be chosen `anew`."""
+        if self.session.integrator.direct_paths:
+            if anew:
+                self.spread()
             return prediction
-        left = direct_error(
-            self._noise,
-            prediction.photon_light,
-            self._paths,
-            prediction.iterations,
-            self._exponent,
-        )
-        return prediction._replace(variance=self._without_direct_light(prediction) + left)
+        light, iterations = prediction.photon_light, prediction.iterations
+        of_one = direct_error(self._measured(), light, 1.0, 1, 1.0) / self.session.camera_paths
+        others = prediction.variance - min(prediction.direct, of_one)
+        if anew:
+            error = others + prediction.squared_bias * iterations
+            self._beside = Beside(light, float(error), float(iterations))
+            self.spread()
+        left = direct_error(self.noise, light, self._paths, iterations, self._exponent)
+        return prediction._replace(variance=others + left)
 
-    def _without_direct_light(self, prediction):
-        """The variance of a `Prediction` without that of direct light at first smooth vertices, in
-        one iteration."""
-        of_one = direct_error(self._noise, prediction.photon_light, 1.0, 1, 1.0)
-        of_all = of_one / self.session.camera_paths
-        return prediction.variance - min(prediction.direct, of_all)
+    def _measured(self):
+        """The `noise`, measured if need be."""
+        if self.noise is None:
+            self.noise = measure(self._trials(TRIALS), film_size(self.session.sensor)[0])
+        return self.noise
 
     def _trials(self, trials):
         """Direct light of so many independent paths through each pixel, mean over the channels:
@@ -119,21 +121,33 @@ class DirectLight:
         ]
         return np.concatenate(values)[: trials * pixels].reshape(pixels, trials).T
 
-    def _send(self, counts):
-        """From now on, `counts` (pixels,) of these paths go through each pixel and iteration."""
-        gathering = self.session.camera_paths
-        self._paths = counts + gathering
-        self.mean_paths, self._parts, self.beyond = float(np.mean(counts)), [], None
-        if np.any(counts):
-            self._parts = self._split(counts)
-            self._render = self.session.recorded(self._block)
-            self.beyond = from_numpy(mi.Float, self._paths / gathering)
+    @property
+    def beyond(self):
+        """All paths of a pixel over those that gather, one a pixel; None where there are no
+        others."""
+        return self._listed()[1]
 
     def add_to(self, block, iteration, spectral):
         """An iteration's block with that of these paths."""
-        for part in self._parts:
-            block = block + self._render(*self._arguments(part, iteration, spectral), self.beyond)
+        parts, beyond, render = self._listed()
+        for part in parts:
+            block = block + render(*self._arguments(part, iteration, spectral), beyond)
         return block
+
+    def _listed(self):
+        """The paths in parts, `beyond`, and the recorded pass that renders a part: made when they
+        are first rendered."""
+        if self._lists is None:
+            gathering = self.session.camera_paths
+            if not self.mean_paths:
+                self._lists = [], None, None
+            else:
+                self._lists = (
+                    self._split(self._paths - gathering),
+                    from_numpy(mi.Float, self._paths / gathering),
+                    self.session.recorded(self._block),
+                )
+        return self._lists
 
     def _split(self, counts):
         """The paths in parts of equal size: pixel of each, its number there, and the pixel's count.
@@ -156,12 +170,16 @@ class DirectLight:
         ]
 
     def _arguments(self, part, iteration, spectral):
-        session, block = self.session, iteration >> ITERATION_BITS
-        low_discrepancy = session._low_discrepancy(iteration)
-        shared = RENDER, PURPOSE, block
-        seed = session._seed(*shared if low_discrepancy else (iteration, PURPOSE))
-        sequence = SampleSequence(seed, dr.opaque(mi.UInt32, 0), 1, low_discrepancy)
-        done = dr.opaque(mi.UInt32, iteration - (block << ITERATION_BITS))
+        session = self.session
+        most = MOST_PATHS * session.camera_paths
+        block, done = divmod(iteration, INDICES // most)
+        sequence = SampleSequence(
+            session._pass_seed(iteration, PURPOSE, block),
+            dr.opaque(mi.UInt32, 0),
+            1,
+            session._low_discrepancy(iteration),
+        )
+        done = dr.opaque(mi.UInt32, done)
         return session.scene, session.sensor, session._tables, sequence, done, part, spectral
 
     def _trace(self, sensor, sequence, done, part, spectral):
