@@ -44,7 +44,6 @@ USUAL = "bdpm:bdd=0"
 BY_CLOCK = (
     "integrators.choice",
     "integrators.piloted",
-    "pilot.run.FEWEST_TIMED_ITERATIONS",
     "pilot.run.PILOT_TIME_SHARE",
 )
 """Constants, or those of modules, that only renders of a given time read."""

@@ -11,11 +11,11 @@ from .radius import LARGEST_SHARE, ladder
 from .result import PilotResult, PilotSamples, measure
 from .setting import PilotPixels, PilotSetting
 
-FEWEST_ITERATIONS, FEWEST_TIMED_ITERATIONS, MOST_ITERATIONS = 4, 3, 16
-"""Tuned: iterations of a pilot: the fewest, the fewest in renders of a given time, the most."""
+FEWEST_ITERATIONS, MOST_ITERATIONS = 4, 16
+"""Tuned: iterations of a pilot: the fewest, and the most."""
 PILOT_TIME_SHARE = 0.04
 """Tuned: share of the planned iterations, or seconds, that the pilot may have once it has the
-fewest."""
+fewest; the seconds of its first iteration, which may have to compile, do not count."""
 PILOT_INDEX = 1 << 30
 """Iteration numbers of the pilot start here, so that its random numbers are its own."""
 MOST_PHOTONS = 160
@@ -69,7 +69,7 @@ def run_pilot(setting: PilotSetting, pixels: PilotPixels, passes: PilotPasses) -
     photons: dict[str, float] = {}
     gathered: list[dict[tuple[str, bool], np.ndarray]] = []
     direct: list[np.ndarray] = []
-    began = time.perf_counter()
+    spent = 0.0
     for done in range(1, MOST_ITERATIONS + 1):
         start = time.perf_counter()
         iteration = passes.trace(PILOT_INDEX + done - 1)
@@ -79,21 +79,24 @@ def run_pilot(setting: PilotSetting, pixels: PilotPixels, passes: PilotPasses) -
             gathered.append(iteration.gather(radii))
             direct.append(iteration.direct())
         del iteration  # its photons' memory is free for those of the next
-        now = time.perf_counter()
-        if radii is None or has_enough(setting, done, now - began):
+        seconds = time.perf_counter() - start
+        spent += seconds if done > 1 else 0.0
+        if radii is None or has_enough(setting, done, spent):
             break
     samples = None
     if radii is not None:
         estimates = {key: np.array([step[key] for step in gathered]) for key in gathered[0]}
         samples = PilotSamples(radii, photons, estimates, np.array(direct))
-    return measure(setting, pixels, samples, done, now - start)
+    return measure(setting, pixels, samples, done, seconds)
 
 
 def has_enough(setting: PilotSetting, done: int, seconds: float) -> bool:
     """Whether so many iterations, which took so many seconds, are all that the pilot may have."""
+    if done < FEWEST_ITERATIONS:
+        return False
     if setting.seconds is not None:
-        return seconds > PILOT_TIME_SHARE * setting.seconds and done >= FEWEST_TIMED_ITERATIONS
-    return done >= max(PILOT_TIME_SHARE * setting.planned_iterations, FEWEST_ITERATIONS)
+        return seconds > PILOT_TIME_SHARE * setting.seconds
+    return done >= PILOT_TIME_SHARE * setting.planned_iterations
 
 
 def choose_ladder(
