@@ -19,12 +19,6 @@ from ..core.traits import lookup
 from ..weights import recursion
 from .neighbour_radiance import HALVES
 
-AMBIENT_SHARE = 0.02
-"""Tuned: share of the scene's mean irradiance that is taken to reach every vertex, lest one that
-the cache calls dark be left to a strategy that hardly ever makes its paths."""
-STEEPEST_DRIVE = 30.0
-"""Tuned: bound on the corrections 1 + G / f_0 and 1 + tau / (1 - theta), which grow without bound
-where the BSDF falls to zero."""
 LARGEST_SHARE = 2.0
 """Tuned: bound on e drive, the weights that are left for a vertex and those beyond. Right ones
 exceed one where the surroundings are brighter; far larger ones mean that the cache does not know
@@ -231,9 +225,8 @@ class OptimalWeights:
                 dr.maximum(dr.abs(wo.z), SMALLEST_LOBE_COSINE)
             )
             value = dr.select(lit, towards_light, lobe_f)
-        ambient = AMBIENT_SHARE * self.cache.level * lobe_f / (lobe_p * dr.pi)
         indirect = (known.second + known.later) * dr.inv_pi * lobe_f / lobe_p
-        direct, kernel = value * known.direct * scale + ambient, channel_mean(lobe_f)
+        direct, kernel = value * known.direct * scale, channel_mean(lobe_f)
         # The noise law takes direct light for exact. Its noise costs as that of photons does: n
         # times the variance over the radiance.
         noise = channel_mean(self.n * direct) * known.noise * dr.square(1 - known.caustic_share)
@@ -325,18 +318,14 @@ class OptimalWeights:
         """Drive and r of the vertex after the first strategy's, which scattered with value f and
         density p."""
         r = mi.Spectrum(recursion.first_ratio(p, self.camera_paths))
-        return recursion.bounded_drive(
-            dr.minimum(recursion.first_drive(offset, f), STEEPEST_DRIVE), r
-        ), r
+        return recursion.bounded_drive(recursion.first_drive(offset, f), r), r
 
     @staticmethod
     def step(u, tau, r, f, p):
         """Drive and r of the next vertex, after an inner one that scattered with value f and
         density p."""
         next_r = recursion.next_ratio(recursion.kernel_share(r, f), p)
-        drive = dr.minimum(
-            recursion.next_drive(1, u, tau, recursion.kernel_rest(r, f)), STEEPEST_DRIVE * dr.abs(u)
-        )
+        drive = recursion.next_drive(1, u, tau, recursion.kernel_rest(r, f))
         return recursion.bounded_drive(drive, next_r), next_r
 
     def ends(self, bsdf, vertex, mask):
