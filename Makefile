@@ -26,7 +26,7 @@ lint: $(VENV)/installed-test
 gallery: $(VENV)/installed
 	@mkdir -p docs/images out
 	@for scene in scenes/*.xml; do name=$$(basename $$scene .xml); \
-	    $(VENV)/bin/mis-render $$scene -i bdpm -P bdd=0 --time 60 -o out/$$name.exr && cp out/$$name.png docs/images/ || exit 1; done
+	    $(VENV)/bin/mis-render $$scene -i bdpm_auto --time 60 -o out/$$name.exr && cp out/$$name.png docs/images/ || exit 1; done
 	PYTHON=$(VENV)/bin/python tools/plugin_pictures.sh
 
 bench: $(VENV)/installed
