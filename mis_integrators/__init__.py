@@ -2,7 +2,8 @@
 
 Importing this package makes a usable LLVM known to Dr.Jit and registers every plugin for the active
 Mitsuba variant and for each variant set later; it warns if Mitsuba or Dr.Jit is newer than those
-tested, and does nothing else. `render_views` renders several views of a scene together.
+tested, and does nothing else. `render_views` renders several views of a scene together, `denoise`
+takes the noise out of an image.
 """
 
 from typing import Any
@@ -28,3 +29,10 @@ def render_views(scene: Any, integrator: Any = None, spp: int = 0, seed: int = 0
     from .integrators import volpath_multiview
 
     return volpath_multiview.render_views(scene, integrator, spp, seed)
+
+
+def denoise(image: Any, scene: Any = None, sensor: Any = 0) -> Any:
+    """A denoised copy of a rendered image; see `mis_integrators.app.denoising.denoise`."""
+    from .app import denoising
+
+    return denoising.denoise(image, scene, sensor)

@@ -18,12 +18,13 @@ import numpy as np
 from ..core.session import Session
 from ..core.traits import unfinite_data
 from ..core.untrusted import Malformed
-from . import checkpoint, cluster, loading, output, reproduce
+from ..paths.guides import albedo_and_normal
+from . import checkpoint, cluster, denoising, loading, output, reproduce
 from .checkpoint import Checkpoint, CheckpointError
 from .options import parse, versions
 from .progress import Progress, complain
 from .render_loop import Chore, Clock, Interrupt, fewest_iterations, iterate
-from .request import Request
+from .request import Opened, Request
 from .target_error import TargetError
 
 EXIT_OK, EXIT_SCENE, EXIT_USAGE, EXIT_OUTPUT, EXIT_CHECKPOINT, EXIT_CLUSTER, EXIT_INTERRUPTED = (
@@ -89,6 +90,11 @@ def _render_alone(options: argparse.Namespace, interrupt: Interrupt) -> int:
     with contextlib.ExitStack() as stack:
         try:
             learned = _follow(options) if options.like else {}
+            if options.denoise:
+                try:
+                    denoising.require()
+                except ImportError as error:
+                    raise Failure(EXIT_USAGE, f"--denoise: {error}") from error
             needs_views = (
                 "--all-views" if options.all_views else "--frames" if options.frames else None
             )
@@ -139,6 +145,8 @@ def _render_alone(options: argparse.Namespace, interrupt: Interrupt) -> int:
                 )
         # Before the workers are left, which may take long.
         written = _write(options, session, metadata, options.output, kept)
+        if options.denoise:
+            written += _write_denoised(options, opened, session, metadata)
         for suffix in (".preview.exr", ".preview.png") if options.preview else ():
             with contextlib.suppress(OSError):
                 options.output.with_suffix(suffix).unlink()
@@ -206,6 +214,7 @@ def _request(options: argparse.Namespace) -> Request:
         seed=options.seed,
         spp=0 if unbounded else options.spp,
         fine=bool(options.target_error or options.workers or options.scheduler),
+        box_filter=options.denoise,
     )
 
 
@@ -384,10 +393,36 @@ def _write(
         ) from error
 
 
+def _write_denoised(
+    options: argparse.Namespace,
+    opened: Opened,
+    session: Any,
+    metadata: dict[str, str | int | float],
+) -> str:
+    """Write the image without its noise beside the image; what to say of it."""
+    path = output.denoised_path(options.output)
+    try:
+        guides = albedo_and_normal(opened.loaded.scene, opened.sensor)
+        picture, channels = denoising.denoised_picture(session.image(), session.channels, guides)
+        output.write_exr(path, picture, channels, {**metadata, "denoised": denoising.version()})
+        output.write_png(path.with_suffix(".png"), picture, channels)
+    except OSError as error:
+        raise Failure(
+            EXIT_OUTPUT,
+            f"cannot write {path}: {error.strerror or error}; {options.output} is written",
+        ) from error
+    except ValueError as error:
+        raise Failure(EXIT_SCENE, f"{error}; {options.output} is written") from error
+    return f", denoised {path}"
+
+
 def _check_outputs(options: argparse.Namespace) -> None:
     """Refuse, before anything is rendered, what cannot be written in the end."""
     image = options.output
     files = [image, image.with_suffix(".png")]
+    if options.denoise:
+        denoised = output.denoised_path(image)
+        files += [denoised, denoised.with_suffix(".png")]
     if options.preview:
         files += [image.with_suffix(".preview.exr"), image.with_suffix(".preview.png")]
     for file in files:

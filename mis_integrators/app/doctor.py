@@ -92,7 +92,11 @@ def versions() -> list[Finding]:
                 name, f"{version}{'' if advice is None else f', but {ranges} is needed'}", advice
             )
         )
-    for name, extra in (("distributed", "cluster"), ("matplotlib", "bench")):
+    for name, extra in (
+        ("distributed", "cluster"),
+        ("matplotlib", "bench"),
+        ("mitsuba-oidn", "denoise"),
+    ):
         try:
             findings.append(Finding(name, importlib.metadata.version(name)))
         except importlib.metadata.PackageNotFoundError:

@@ -48,12 +48,14 @@ def load(
     plugin: str | None,
     parameters: Mapping[str, Value],
     sampler: str | None = None,
+    box_filter: bool = False,
 ) -> LoadedScene:
     """Load the scene of an XML file under the active variant.
 
     ``variables`` are the values of the scene's ``$variables``. ``plugin`` replaces its integrator,
     which hands on the parameters ``INHERITED``; ``parameters`` are then set on the integrator,
-    replaced or not; ``sampler`` replaces the sensors' samplers, but not their numbers of samples.
+    replaced or not; ``sampler`` replaces the sensors' samplers, but not their numbers of samples;
+    ``box_filter`` the films' reconstruction filters.
     Raises one of ``SCENE_ERRORS`` (see ``one_line``).
     """
     config = mi.parser.ParserConfig(mi.variant())
@@ -80,6 +82,8 @@ def load(
 
     if sampler:
         _replace_samplers(state, sampler)
+    if box_filter:
+        _use_box_filters(state)
     scene = mi.parser.instantiate(config, state)
     for sensor in scene.sensors():
         check_film(sensor, name)
@@ -210,6 +214,24 @@ def _replace_samplers(state: Any, plugin: str) -> None:
             sensor.props["_sampler"] = mi.Properties.ResolvedReference(own[0])
         for index in own:
             state.nodes[index].props = _properties(plugin, counts[0] if counts else {})
+
+
+def _use_box_filters(state: Any) -> None:
+    """Give all films box filters, also those that have none of their own."""
+    for film in [node for node in state.nodes if node.type == mi.ObjectType.Film]:
+        own = [
+            index
+            for index in _children(film)
+            if state.nodes[index].type == mi.ObjectType.ReconstructionFilter
+        ]
+        if not own:
+            node = mi.parser.SceneNode()
+            node.type = mi.ObjectType.ReconstructionFilter
+            state.nodes.append(node)
+            own = [len(state.nodes) - 1]
+            film.props["_rfilter"] = mi.Properties.ResolvedReference(own[0])
+        for index in own:
+            state.nodes[index].props = mi.Properties("box")
 
 
 def _is_sampler(node: Any) -> bool:

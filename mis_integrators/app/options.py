@@ -53,6 +53,9 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
         parser.error(f"argument -o: {options.output} does not end in .exr")
     if options.all_views and options.sensor is not None:
         parser.error("argument --sensor: not allowed with argument --all-views")
+    for flag in ("--all-views", "--frames"):
+        if options.denoise and getattr(options, flag[2:].replace("-", "_")):
+            parser.error(f"argument --denoise: not allowed with argument {flag}")
     if options.like:
         _check_like(parser, options)
     options.sensor = options.sensor or 0
@@ -149,6 +152,12 @@ def _which_image(parser: argparse.ArgumentParser) -> None:
         help="also write each view, FILE.000.png and so on: frames of an animation",
     )
     add(
+        "--denoise",
+        action="store_true",
+        help="also write the image without its noise, FILE.denoised.exr and .png, by Open Image "
+        "Denoise; the film's reconstruction filter becomes a box, as denoisers want it",
+    )
+    add(
         "--variant",
         choices=mi.variants(),
         metavar="V",
@@ -212,6 +221,7 @@ def _check_like(parser: argparse.ArgumentParser, options: argparse.Namespace) ->
         "--seed": options.seed,
         "--sensor": options.sensor,
         "--all-views": options.all_views or None,
+        "--denoise": options.denoise or None,
         "--variant": options.variant,
     }
     for flag, value in told.items():

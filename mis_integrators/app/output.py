@@ -118,6 +118,11 @@ def write_exr(
             raise OSError(str(error)) from error
 
 
+def picture_channels(channels: Sequence[str]) -> tuple[str, ...] | None:
+    """Those of the channels that make a picture; ``None`` if there are none."""
+    return next((names for names, _ in _PICTURES if set(names) <= set(channels)), None)
+
+
 def write_png(path: Path, image: np.ndarray, channels: Sequence[str]) -> bool:
     """Write the colour channels of an image of shape (H, W, C) as sRGB, clipped to [0, 1], without
     alpha.
@@ -125,10 +130,10 @@ def write_png(path: Path, image: np.ndarray, channels: Sequence[str]) -> bool:
     Values that are no numbers become black. Returns ``False``, and writes nothing, if the image has
     no colour channels (a film of spectral bands). Raises ``OSError`` as ``write_exr`` does.
     """
-    kinds = [kind for kind in _PICTURES if set(kind[0]) <= set(channels)]
-    if not kinds:
+    names = picture_channels(channels)
+    if names is None:
         return False
-    names, pixel_format = kinds[0]
+    pixel_format = dict(_PICTURES)[names]
     picture = np.nan_to_num(image[..., [channels.index(name) for name in names]], posinf=1).astype(
         np.float32
     )
@@ -160,6 +165,11 @@ def contact_sheet(images: Sequence[np.ndarray]) -> np.ndarray:
 def frame_path(path: Path, number: int) -> Path:
     """Where the PNG of a view goes: ``NAME.000.png`` beside ``NAME.exr``."""
     return path.with_suffix(f".{number:03d}.png")
+
+
+def denoised_path(path: Path) -> Path:
+    """Where the denoised image goes: ``NAME.denoised.exr`` beside ``NAME.exr``."""
+    return path.with_suffix(".denoised.exr")
 
 
 @contextlib.contextmanager

@@ -60,6 +60,8 @@ def attribute(options: argparse.Namespace, session: Session, learned: dict[str, 
     as what it came to: samples, camera paths of an iteration, and what the session had
     ``learned``."""
     given = {name: getattr(options, name) for name in _OPTIONS}
+    if options.denoise:
+        given["denoise"] = True
     if "camera_paths" in session.settings:
         given["parameters"] = [
             *(pair for pair in given["parameters"] if pair[0] != "camera_paths"),
@@ -93,6 +95,7 @@ def read(image: Path) -> Recipe:
             "all_views": options.boolean("all_views"),
             "seed": options.integer("seed", 0, LARGEST_SEED),
             "spp": options.integer("spp", 1, MOST_SAMPLES),
+            "denoise": "denoise" in options.names() and options.boolean("denoise"),
         },
         told.any("learned"),
         told.text("versions"),

@@ -32,6 +32,7 @@ class Request:
     seed: int
     spp: int | None
     fine: bool
+    box_filter: bool = False
 
     def open(self, needs_views: str | None = None) -> Opened:
         """Load the scene and make the session. ``needs_views`` is an option that only integrators
@@ -50,7 +51,13 @@ class Request:
                 f"{self.variant} needs an NVIDIA GPU and its driver, and Dr.Jit finds none; use "
                 "--variant llvm_ad_rgb"
             ) from None
-        loaded = loading.load(Path(self.scene), self.variables, self.plugin, self.parameters)
+        loaded = loading.load(
+            Path(self.scene),
+            self.variables,
+            self.plugin,
+            self.parameters,
+            box_filter=self.box_filter,
+        )
         sensor = _sensor(loaded.scene, self.sensor)
         spp = sensor.sampler().sample_count() if self.spp is None else self.spp
         if self.spp is None and not spp:
@@ -83,7 +90,9 @@ class Opened:
     def identity(self) -> dict[str, Any]:
         """What the session's sums are of, in JSON's types: see ``checkpoint.difference``."""
         given = asdict(self.request)
+        box = {"reconstruction filter": "box"} if given["box_filter"] else {}
         return {
+            **box,
             "plugin": self.loaded.plugin,
             "variant": given["variant"],
             "sensor": "all" if given["all_views"] else given["sensor"],

@@ -1,0 +1,76 @@
+"""What denoisers want to know of a picture besides its colours: albedo and normal of what the
+camera sees, through glass and in mirrors too."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..core.random import next_1d_and_2d, reversed_bits
+from ..core.sequences import SampleSequence
+from ..core.spectra import channel_mean
+from .camera import border_size, film_sample_count, film_size, start_camera_paths
+from .setting import CameraPass
+
+SAMPLES = 16
+"""Camera paths a pixel: both guides change little from one to another."""
+MOST_DELTA_SURFACES = 16
+"""Delta surfaces that a camera path goes through or is mirrored by."""
+
+
+@dr.syntax
+def first_smooth_surface(scene, camera_pass):
+    """Follows the camera paths of a pass to the first surface that does not scatter by delta
+    functions only.
+
+    Returns `(albedo, normal)`, zero where there is none: the share of light that it scatters, by
+    one sample of its BSDF, times that of the delta surfaces before; and the shading normal.
+    """
+    _, active, numbers, ray, *_ = start_camera_paths(camera_pass)
+    throughput, albedo = mi.UnpolarizedSpectrum(1), mi.UnpolarizedSpectrum(0)
+    normal = mi.Normal3f(0)
+    depth = mi.UInt32(0)
+    while dr.hint(active, label="to the first smooth surface"):
+        si = scene.ray_intersect(ray, active)
+        active &= si.is_valid()
+        depth += 1
+        bsdf = si.bsdf(ray)
+        rng = numbers.at(depth)
+        bs, weight = bsdf.sample(mi.BSDFContext(), si, *next_1d_and_2d(rng, active), active)
+        throughput *= mi.unpolarized_spectrum(weight)
+        smooth = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+        albedo = dr.select(smooth, throughput, albedo)
+        normal = dr.select(smooth, mi.Normal3f(si.sh_frame.n), normal)
+        ray = si.spawn_ray(si.to_world(bs.wo))
+        active &= ~smooth & (depth <= MOST_DELTA_SURFACES)
+    return albedo, normal
+
+
+def albedo_and_normal(scene, sensor, samples: int = SAMPLES) -> tuple[np.ndarray, np.ndarray]:
+    """Guides for a denoiser: the means over camera paths of `first_smooth_surface`, under a box
+    filter.
+
+    Returns two float32 arrays (height, width, 3) of the film's crop window: albedo in [0, 1] (grey
+    in mono and spectral variants), and normal in world space.
+    """
+    count = film_sample_count(sensor)
+    total = np.zeros((6, count))
+    for number in range(samples):
+        sequence = SampleSequence(
+            dr.opaque(mi.UInt32, 0), dr.opaque(mi.UInt32, number), 1, low_discrepancy=True
+        )
+        wavelength = dr.opaque(mi.Float, reversed_bits(number) / 2**32)
+        camera_pass = CameraPass(sensor, None, sequence, mi.UInt32(0), count, 1, wavelength)
+        albedo, normal = first_smooth_surface(scene, camera_pass)
+        if mi.is_spectral or mi.is_monochromatic:
+            albedo = mi.Color3f(channel_mean(albedo))
+        dr.eval(albedo, normal)
+        found = np.concatenate([np.array(albedo), np.array(normal)])
+        total += np.where(np.isfinite(found), found, 0)
+    width, height = film_size(sensor)
+    border = border_size(sensor.film())
+    means = (total / samples).reshape(6, height, width)
+    means = means[:, border : height - border, border : width - border].astype(np.float32)
+    albedo, normal = np.moveaxis(means[:3], 0, -1), np.moveaxis(means[3:], 0, -1)
+    return np.ascontiguousarray(np.clip(albedo, 0, 1)), np.ascontiguousarray(normal)
