@@ -221,7 +221,9 @@ OTHER_TEXT = st.text(st.characters(exclude_characters=string.printable), min_siz
 
 
 @hypothesis.settings(max_examples=300, deadline=None, derandomize=True)
-@hypothesis.given(st.sampled_from([*GOOD["options"], "scheduler", "scene"]), JSON | OTHER_TEXT)
+@hypothesis.given(
+    st.sampled_from([*GOOD["options"], "denoise", "scheduler", "scene"]), JSON | OTHER_TEXT
+)
 def test_any_value_of_an_option_is_refused_or_of_its_type(tmp_path_factory, name, value):
     """What is taken has the type and the range of the command's own option; what is not is one
     printable line."""
@@ -233,7 +235,7 @@ def test_any_value_of_an_option_is_refused_or_of_its_type(tmp_path_factory, name
         assert str(error).isprintable() and len(str(error)) < 1000
         return
     options = recipe.options
-    assert set(options) == set(GOOD["options"]) and name in options
+    assert set(options) == {*GOOD["options"], "denoise"} and name in options
     assert (
         options["plugin"] in (None, *reproduce.MITSUBA_INTEGRATORS, *reproduce._plugins.PLUGINS)
         and options["variant"] in mi.variants()
@@ -241,7 +243,7 @@ def test_any_value_of_an_option_is_refused_or_of_its_type(tmp_path_factory, name
     assert (
         1 <= options["spp"] < 2**31
         and 0 <= options["seed"] < 2**32
-        and type(options["all_views"]) is bool
+        and type(options["all_views"]) is type(options["denoise"]) is bool
         and options["sensor"] >= 0
     )
     for pairs in (options["variables"], options["parameters"]):
