@@ -1,6 +1,6 @@
 # make render   set everything up, then render a bundled scene into out/
 # make test     set everything up, then run the tests
-# make bench    set everything up, then compare all methods on all bundled scenes: out/bench/index.html (half an hour)
+# make bench    set everything up, then compare all methods on all bundled scenes: out/bench/index.html (half an hour to three quarters)
 # make lint     set everything up, then check style, layout and type hints
 # make gallery  set everything up, then render the pictures of docs/ (minutes)
 
@@ -26,7 +26,7 @@ lint: $(VENV)/installed-test
 gallery: $(VENV)/installed
 	@mkdir -p docs/images out
 	@for scene in scenes/*.xml; do name=$$(basename $$scene .xml); \
-	    $(VENV)/bin/mis-render $$scene -i bdpm_auto --time 60 -o out/$$name.exr && cp out/$$name.png docs/images/ || exit 1; done
+	    $(VENV)/bin/mis-render $$scene -i bdpm_auto --seed 1 --time 60 -o out/$$name.exr && cp out/$$name.png docs/images/ || exit 1; done
 	PYTHON=$(VENV)/bin/python tools/plugin_pictures.sh
 
 bench: $(VENV)/installed
