@@ -18,7 +18,6 @@ import numpy as np
 from ..core.session import Session
 from ..core.traits import unfinite_data
 from ..core.untrusted import Malformed
-from ..paths.guides import albedo_and_normal
 from . import checkpoint, cluster, denoising, loading, output, reproduce
 from .checkpoint import Checkpoint, CheckpointError
 from .options import parse, versions
@@ -144,9 +143,7 @@ def _render_alone(options: argparse.Namespace, interrupt: Interrupt) -> int:
                     "light, and does the camera look at it?"
                 )
         # Before the workers are left, which may take long.
-        written = _write(options, session, metadata, options.output, kept)
-        if options.denoise:
-            written += _write_denoised(options, opened, session, metadata)
+        written = _write(options, opened, session, metadata, options.output, kept)
         for suffix in (".preview.exr", ".preview.png") if options.preview else ():
             with contextlib.suppress(OSError):
                 options.output.with_suffix(suffix).unlink()
@@ -360,6 +357,7 @@ def _preview(session: Any, options: argparse.Namespace, path: Path) -> None:
 
 def _write(
     options: argparse.Namespace,
+    opened: Opened,
     session: Any,
     metadata: dict[str, str | int | float],
     path: Path,
@@ -379,6 +377,15 @@ def _write(
                 writing = output.frame_path(path, number)
                 output.write_png(writing, view, channels)
             written += f", {len(views)} frames from {output.frame_path(path, 0)}"
+        if options.denoise:
+            picture, names = denoising.denoised_picture(
+                image, channels, opened.loaded.scene, opened.sensor
+            )
+            writing = output.denoised_path(path)
+            output.write_exr(writing, picture, names, {**metadata, "denoised": denoising.version()})
+            written += f", denoised {writing}"
+            writing = writing.with_suffix(".png")
+            output.write_png(writing, picture, names)
         return written
     except OSError as error:
         rest = (
@@ -391,29 +398,8 @@ def _write(
         raise Failure(
             EXIT_OUTPUT, f"cannot write {writing}: {error.strerror or error}{rest}"
         ) from error
-
-
-def _write_denoised(
-    options: argparse.Namespace,
-    opened: Opened,
-    session: Any,
-    metadata: dict[str, str | int | float],
-) -> str:
-    """Write the image without its noise beside the image; what to say of it."""
-    path = output.denoised_path(options.output)
-    try:
-        guides = albedo_and_normal(opened.loaded.scene, opened.sensor)
-        picture, channels = denoising.denoised_picture(session.image(), session.channels, guides)
-        output.write_exr(path, picture, channels, {**metadata, "denoised": denoising.version()})
-        output.write_png(path.with_suffix(".png"), picture, channels)
-    except OSError as error:
-        raise Failure(
-            EXIT_OUTPUT,
-            f"cannot write {path}: {error.strerror or error}; {options.output} is written",
-        ) from error
-    except ValueError as error:
-        raise Failure(EXIT_SCENE, f"{error}; {options.output} is written") from error
-    return f", denoised {path}"
+    except ValueError as error:  # nothing to denoise
+        raise Failure(EXIT_SCENE, f"{error}; {written} is written") from error
 
 
 def _check_outputs(options: argparse.Namespace) -> None:

@@ -56,11 +56,11 @@ def denoise(image: Any, scene: mi.Scene | None = None, sensor: int | mi.Sensor =
     ValueError
         If the image has another shape, or another size than the sensor's film.
     """
-    require()
+    oidn = require()
     pixels = np.array(image, dtype=np.float32)
     if pixels.ndim not in (2, 3) or 0 in pixels.shape:
         raise ValueError(f"an image of shape (height, width, channels), not {pixels.shape}")
-    guides = None
+    guides: tuple[np.ndarray, ...] = ()
     if scene is not None:
         sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
         size = tuple(int(edge) for edge in sensor.film().crop_size())
@@ -71,34 +71,23 @@ def denoise(image: Any, scene: mi.Scene | None = None, sensor: int | mi.Sensor =
             )
         guides = albedo_and_normal(scene, sensor)
     planes = pixels[..., None] if pixels.ndim == 2 else pixels
-    colours = range(3 if planes.shape[2] >= 3 else 1)
-    planes[..., colours] = denoised_colours(planes[..., colours], guides)
+    colours = planes[..., : 3 if planes.shape[2] >= 3 else 1]
+    clean = np.maximum(np.nan_to_num(colours, nan=0, posinf=0, neginf=0), 0)
+    clean = np.ascontiguousarray(np.broadcast_to(clean, (*clean.shape[:2], 3)))
+    found = oidn.denoise(clean, *guides, hdr=True)
+    colours[...] = np.asarray(found)[..., : colours.shape[2]]
     return pixels
 
 
-def denoised_colours(
-    colours: np.ndarray, guides: tuple[np.ndarray, np.ndarray] | None = None
-) -> np.ndarray:
-    """Denoised colours (height, width, 1 or 3), with the ``guides`` of ``albedo_and_normal``."""
-    clean = np.maximum(np.nan_to_num(colours, nan=0, posinf=0, neginf=0), 0)
-    clean = np.ascontiguousarray(np.broadcast_to(clean, (*clean.shape[:2], 3)), dtype=np.float32)
-    albedo, normal = guides or (None, None)
-    found = require().denoise(clean, albedo, normal, hdr=True)
-    return np.asarray(found)[..., : colours.shape[2]]
-
-
 def denoised_picture(
-    image: np.ndarray,
-    channels: Sequence[str],
-    guides: tuple[np.ndarray, np.ndarray] | None,
+    image: np.ndarray, channels: Sequence[str], scene: mi.Scene, sensor: mi.Sensor
 ) -> tuple[np.ndarray, list[str]]:
-    """The colour channels of an image, denoised, with its alpha: the image and the channels' names.
+    """The colour channels of a scene's image, denoised, with its alpha: the image and the channels'
+    names.
 
     Raises ``ValueError`` if it has no colour channels (a film of spectral bands)."""
     names = picture_channels(channels)
     if names is None:
         raise ValueError("--denoise: the film has no colours, and so there is nothing to denoise")
-    colours = denoised_colours(image[..., [channels.index(name) for name in names]], guides)
-    alpha = [name for name in channels if name == "A"]
-    rest = image[..., [channels.index(name) for name in alpha]]
-    return np.concatenate([colours, rest], axis=2), [*names, *alpha]
+    kept = [*names, *(name for name in channels if name == "A")]
+    return denoise(image[..., [channels.index(name) for name in kept]], scene, sensor), kept

@@ -190,52 +190,48 @@ def _integrator_node(state: Any) -> Any:
 
 def _add_integrator(state: Any) -> Any:
     """Add the integrator that Mitsuba would use for a scene without one."""
-    node = mi.parser.SceneNode()
-    node.type, node.props = mi.ObjectType.Integrator, mi.Properties("path")
-    state.nodes.append(node)
-    state.root.props["_integrator"] = mi.Properties.ResolvedReference(len(state.nodes) - 1)
-    return state.nodes[-1]
+    (index,) = _parts(state, 0, mi.ObjectType.Integrator, "_integrator")
+    state.nodes[index].props = mi.Properties("path")
+    return state.nodes[index]
 
 
 def _replace_samplers(state: Any, plugin: str) -> None:
     """Make all samplers such plugins, also where Mitsuba would choose one."""
-    for sensor in [node for node in state.nodes if node.type == mi.ObjectType.Sensor]:
-        own = [index for index in _children(sensor) if _is_sampler(state.nodes[index])]
+    for sensor in _nodes_of(state, mi.ObjectType.Sensor):
+        own = _parts(state, sensor, mi.ObjectType.Sampler, "_sampler")
         counts = [
             {"sample_count": state.nodes[index].props["sample_count"]}
             for index in own
             if "sample_count" in state.nodes[index].props
         ]
-        if not own:
-            node = mi.parser.SceneNode()
-            node.type = mi.ObjectType.Sampler
-            state.nodes.append(node)
-            own = [len(state.nodes) - 1]
-            sensor.props["_sampler"] = mi.Properties.ResolvedReference(own[0])
         for index in own:
             state.nodes[index].props = _properties(plugin, counts[0] if counts else {})
 
 
 def _use_box_filters(state: Any) -> None:
     """Give all films box filters, also those that have none of their own."""
-    for film in [node for node in state.nodes if node.type == mi.ObjectType.Film]:
-        own = [
-            index
-            for index in _children(film)
-            if state.nodes[index].type == mi.ObjectType.ReconstructionFilter
-        ]
-        if not own:
-            node = mi.parser.SceneNode()
-            node.type = mi.ObjectType.ReconstructionFilter
-            state.nodes.append(node)
-            own = [len(state.nodes) - 1]
-            film.props["_rfilter"] = mi.Properties.ResolvedReference(own[0])
-        for index in own:
+    for film in _nodes_of(state, mi.ObjectType.Film):
+        for index in _parts(state, film, mi.ObjectType.ReconstructionFilter, "_rfilter"):
             state.nodes[index].props = mi.Properties("box")
 
 
-def _is_sampler(node: Any) -> bool:
-    return node.type == mi.ObjectType.Sampler
+def _nodes_of(state: Any, kind: Any) -> list[int]:
+    """Indices of the nodes of that type."""
+    return [index for index, node in enumerate(state.nodes) if node.type == kind]
+
+
+def _parts(state: Any, parent: int, kind: Any, name: str) -> list[int]:
+    """Indices of the nodes of that type within node number ``parent``; where it has none, of one
+    without properties that is added to it under that ``name``."""
+    own = [index for index in _children(state.nodes[parent]) if state.nodes[index].type == kind]
+    if own:
+        return own
+    node = mi.parser.SceneNode()
+    node.type = kind
+    state.nodes.append(node)
+    added = len(state.nodes) - 1
+    state.nodes[parent].props[name] = mi.Properties.ResolvedReference(added)
+    return [added]
 
 
 def _nested_integrators(state: Any, node: Any) -> list[Any]:

@@ -53,8 +53,8 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
         parser.error(f"argument -o: {options.output} does not end in .exr")
     if options.all_views and options.sensor is not None:
         parser.error("argument --sensor: not allowed with argument --all-views")
-    for flag in ("--all-views", "--frames"):
-        if options.denoise and getattr(options, flag[2:].replace("-", "_")):
+    for flag, given in (("--all-views", options.all_views), ("--frames", options.frames)):
+        if options.denoise and given:
             parser.error(f"argument --denoise: not allowed with argument {flag}")
     if options.like:
         _check_like(parser, options)

@@ -60,8 +60,6 @@ def attribute(options: argparse.Namespace, session: Session, learned: dict[str, 
     as what it came to: samples, camera paths of an iteration, and what the session had
     ``learned``."""
     given = {name: getattr(options, name) for name in _OPTIONS}
-    if options.denoise:
-        given["denoise"] = True
     if "camera_paths" in session.settings:
         given["parameters"] = [
             *(pair for pair in given["parameters"] if pair[0] != "camera_paths"),
@@ -76,7 +74,16 @@ def attribute(options: argparse.Namespace, session: Session, learned: dict[str, 
     )
 
 
-_OPTIONS = ("plugin", "variables", "parameters", "variant", "sensor", "all_views", "seed")
+_OPTIONS = (
+    "plugin",
+    "variables",
+    "parameters",
+    "variant",
+    "sensor",
+    "all_views",
+    "seed",
+    "denoise",
+)
 
 
 def read(image: Path) -> Recipe:

@@ -166,7 +166,7 @@ class BDPMSession(PilotedSession):
         survey = integrator.survey or Survey(
             SceneTraits(scene), Lights.seen_by(scene, sensor, integrator.plugin)
         )
-        self.traits, self.lights, self.reference_mean = survey[:3]
+        self.traits, self.lights, self.reference_mean, direct_noise = survey
         self.world = World(scene, self.lights, self.traits)
         self.light_path_count = integrator.photon_count or min(
             film_sample_count(sensor), MOST_LIGHT_PATHS
@@ -190,7 +190,7 @@ class BDPMSession(PilotedSession):
         self.photons_found = 0  # by the last light pass
         self._sized = False
         self.recorded = recorder()
-        self.direct_light = DirectLight(self, survey.direct_noise)
+        self.direct_light = DirectLight(self, direct_noise)
         self._freeze()
 
     @property
