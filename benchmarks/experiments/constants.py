@@ -66,7 +66,7 @@ def variants(constant: Constant) -> dict[str, object]:
     return {name: value for name, value in tried.items() if value is not None}
 
 
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "constants.md"
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "notes" / "constants.md"
 FIGURES = PAGE.with_suffix(".json")
 NOTES = "## What went"
 """What the page's last part begins with, which is written by hand."""

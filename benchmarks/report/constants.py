@@ -1,4 +1,4 @@
-"""The page of the tuned constants, docs/constants.md."""
+"""The page of the tuned constants, docs/notes/constants.md."""
 
 from __future__ import annotations
 
@@ -15,21 +15,31 @@ without the worst 0.1 % of the pixels, and with them."""
 
 TOP = """# Tuned constants
 
-Numbers that could be others without anything being wrong: shares, costs, sizes of tables. Limits,
-tolerances and formats are not among them. This page is written from the code, where the docstring
-of each begins with "Tuned:", by `python benchmarks/run.py constants --page`; a test compares.
+A tuned constant is a number that could have another value without anything being wrong: a share, a
+cost, the size of a table. Limits, tolerances and formats are not among them.
+`python benchmarks/run.py constants --page` writes this page from the code, where the docstring of
+each constant begins with "Tuned:". A test compares both.
 
-`halved` and `doubled` are error times time over that with the value as it is: relative squared
-error without the worst 0.1 % of the pixels, seconds of the processors with set-up and without what
-compiles, geometric mean over scenes that nothing here was tuned on, with the standard error over
-the scenes. (Of a share above one half, what is left to one is halved or doubled.) Both renders have
-the same random numbers and samples, as many as take about a second; where only the clock matters,
-the same time. Figures near one, beside their standard error, say that the value does not matter
-much; so short a render makes much of set-up, and one seed of the luck of a pilot. An empty place is
-not measured yet, or means nothing: tuples, and constants of the multi-view integrator. Measured by
-`python benchmarks/run.py constants --processor-time --time 0.7 --width 96`, whose `--scenes` names
-the scenes: A and B of the peers' scenes, `veach-bidir`, `living-room`, `classroom`, and three
-random scenes of the tests.
+`halved` and `doubled` are error times time with half or twice the value, over that with the value
+as it is:
+
+- The error is the relative squared error without the worst 0.1 % of the pixels.
+- The time is that of all processors, with set-up and without what compiles.
+- The figure is the geometric mean over scenes that nothing here was tuned on, with the standard
+  error over the scenes.
+- Both renders have the same random numbers and samples, as many as take about a second. Where only
+  the clock matters, they have the same time.
+- Of a share above one half, what is left to one is halved or doubled.
+
+A figure that is near one, compared with its standard error, says that the value does not matter
+much. In such short renders set-up counts for much, and with one seed the luck of a pilot does. An
+empty place is not measured yet, or means nothing: tuples, and constants of the multi-view
+integrator. The command is
+
+    python benchmarks/run.py constants --processor-time --time 0.7 --width 96
+
+with `--scenes` for the scenes: A and B of the peers' scenes, `veach-bidir`, `living-room`,
+`classroom`, and three random scenes of the tests.
 
 """
 
