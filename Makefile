@@ -3,12 +3,13 @@
 # make bench    set everything up, then compare all methods on all bundled scenes: out/bench/index.html (half an hour to three quarters)
 # make lint     set everything up, then check style, layout and type hints
 # make gallery  set everything up, then render the pictures of docs/ (minutes)
+# make docs     set everything up, then build the documentation site: out/site/index.html
 
 PYTHON ?= python3
 VENV := .venv
 SETUP := tools/setup.sh
 
-.PHONY: render test lint bench gallery clean
+.PHONY: render test lint bench gallery docs clean
 .DELETE_ON_ERROR:
 
 render: $(VENV)/installed
@@ -28,6 +29,10 @@ gallery: $(VENV)/installed
 	@for scene in scenes/*.xml; do name=$$(basename $$scene .xml); \
 	    $(VENV)/bin/mis-render $$scene -i bdpm_auto --seed 1 --time 60 -o out/$$name.exr && cp out/$$name.png docs/images/ || exit 1; done
 	PYTHON=$(VENV)/bin/python tools/plugin_pictures.sh
+
+docs: $(VENV)/installed
+	$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check --editable '.[docs]'
+	NO_MKDOCS_2_WARNING=1 $(VENV)/bin/python -m mkdocs build --strict
 
 bench: $(VENV)/installed
 	$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check --editable '.[bench]'

@@ -301,7 +301,9 @@ def _parser() -> argparse.ArgumentParser:
         help="where figures are kept, and added to (default: docs/notes/constants.json)",
     )
     command.add_argument(
-        "--page", action="store_true", help="only write docs/notes/constants.md from code and figures"
+        "--page",
+        action="store_true",
+        help="only write docs/notes/constants.md from code and figures",
     )
     command.add_argument(
         "--only", nargs="+", metavar="TEXT", help="constants whose names contain one of these"

@@ -13,6 +13,7 @@ from mis_integrators.app import options
 
 import mitsuba as mi
 import pytest
+import site_files
 
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
@@ -207,6 +208,15 @@ def test_index_names_every_page():
     index = (DOCS / "README.md").read_text()
     names = {page.relative_to(DOCS).as_posix() for page in PAGES} - {"README.md"}
     assert [name for name in sorted(names) if f"({name})" not in index] == []
+
+
+def test_site_has_every_page():
+    """Each page of the repository is in the site's navigation, once, and what it links to is one of
+    the site's files."""
+    files = site_files.site_files()
+    in_navigation = re.findall(r": (\S+\.md)$", (ROOT / "mkdocs.yml").read_text(), re.MULTILINE)
+    assert sorted(in_navigation) == [file for file in files if file.endswith(".md")]
+    assert {"docs/images/house.svg", "mis_integrators/core/sequences.py", "LICENSE"} <= set(files)
 
 
 def test_the_path_through_the_code_is_true():
