@@ -525,3 +525,4 @@ def test_wheel_holds_every_file(tmp_path):
     (entry_points,) = [name for name in names if name.endswith("entry_points.txt")]
     assert "mis-render = mis_render:main" in zipfile.ZipFile(wheel).read(entry_points).decode()
     assert any(name.endswith("licenses/LICENSE") for name in names)
+    assert "mis_integrators/py.typed" in names
