@@ -59,7 +59,7 @@ def main(arguments: list[str] | None = None) -> int:
     except BaseException as error:
         # Libraries turn an interrupt that reaches them into errors of any kind.
         if interrupt.stopped or isinstance(error, KeyboardInterrupt):
-            complain("interrupted, nothing written")
+            complain(f"interrupted, nothing written{_about_earlier(options)}")
             return EXIT_INTERRUPTED
         if not isinstance(error, Failure):
             raise
@@ -158,7 +158,7 @@ def _render_alone(options: argparse.Namespace, interrupt: Interrupt) -> int:
             failure.code, f"{failure}; what was rendered before is written, {report}"
         ) from broken
     if interrupt.requested:
-        complain(f"interrupted after {report}")
+        complain(f"interrupted after {report}{_how_to_go_on(options, kept)}")
         return EXIT_INTERRUPTED
     if not options.quiet:
         complain(report, "")
@@ -222,6 +222,21 @@ def _about_error(target: TargetError | None) -> str:
         return ", relative error unknown after one iteration"
     missed = f" (target {target.target:g} not reached)" if target.error > target.target else ""
     return f", relative error {target.error:.3g}{missed}"
+
+
+def _how_to_go_on(options: argparse.Namespace, kept: Path | None) -> str:
+    """What to say after an interrupt; ``kept``: the checkpoint of what was rendered, if any."""
+    if kept is None:
+        return "" if options.checkpoint else "; only a render with --checkpoint can go on later"
+    with_resume = "" if options.resume else " with --resume"
+    return f"; to go on from {kept}, give the same command{with_resume}"
+
+
+def _about_earlier(options: argparse.Namespace) -> str:
+    """What to say of the checkpoint of an earlier moment, if there is one."""
+    path = checkpoint.beside(options.output)
+    kept = options.checkpoint and os.path.lexists(path)
+    return f"; {path} holds what was rendered earlier, for --resume" if kept else ""
 
 
 def _metadata(

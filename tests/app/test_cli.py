@@ -560,7 +560,50 @@ def test_interrupt_writes_what_there_is(scene, tmp_path, use, capsys):
     header, channels = read(tmp_path / "a.exr")
     assert header["iterations"] == 3
     np.testing.assert_array_equal(channels["R"], 2)
-    assert capsys.readouterr().err.count("\n") == 1
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert f"{tmp_path / 'a.exr'} and {tmp_path / 'a.png'}; only a render with --check" in said
+
+
+def test_interrupt_says_how_to_go_on(scene, tmp_path, capsys, monkeypatch):
+    """In the line that says what was saved; what it says works."""
+
+    class Interrupted(MitsubaSession):
+        def iterate(self, iteration=None):
+            super().iterate(iteration)
+            if self.iterations > 1:
+                signal.raise_signal(signal.SIGINT)
+
+    arguments = scene, "-o", tmp_path / "a.exr", "--target-error", 1e-6, "--spp", 64
+    kept = tmp_path / "a.checkpoint"
+    with monkeypatch.context() as patch:
+        patch.setattr("mis_integrators.core.session.MitsubaSession", Interrupted)
+        for resume, how in (
+            (["--checkpoint", 99], "command with --resume"),
+            (["--resume"], "command"),
+        ):
+            assert render(*arguments, *resume) == 130
+            said = capsys.readouterr().err
+            assert said.endswith(f"a.png; to go on from {kept}, give the same {how}\n")
+    assert render(*arguments, "--resume") == 0
+
+
+def test_second_interrupt_names_the_earlier_checkpoint(scene, tmp_path, capsys, monkeypatch):
+    class Interrupted(MitsubaSession):
+        def iterate(self, iteration=None):
+            super().iterate(iteration)
+            if self.iterations == 2:
+                signal.raise_signal(signal.SIGINT)
+                signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr("mis_integrators.core.session.MitsubaSession", Interrupted)
+    arguments = "--spp", 64, "--target-error", 1e-6, "--checkpoint", 1e-6
+    assert render(scene, "-o", tmp_path / "a.exr", *arguments) == 130
+    assert not (tmp_path / "a.exr").exists()
+    assert capsys.readouterr().err == (
+        f"mis-render: interrupted, nothing written; {tmp_path / 'a.checkpoint'} holds what was "
+        "rendered earlier, for --resume\n"
+    )
 
 
 def test_interrupt_before_the_first_iteration_writes_nothing(scene, tmp_path, use, capsys):
