@@ -18,7 +18,7 @@ import numpy as np
 from ..core.session import Session
 from ..core.traits import unfinite_data
 from ..core.untrusted import Malformed
-from . import checkpoint, cluster, denoising, loading, output, reproduce
+from . import checkpoint, cluster, compare, denoising, loading, output, reproduce
 from .checkpoint import Checkpoint, CheckpointError
 from .options import parse, versions
 from .progress import Progress, complain
@@ -89,15 +89,24 @@ def _render_alone(options: argparse.Namespace, interrupt: Interrupt) -> int:
     with contextlib.ExitStack() as stack:
         try:
             learned = _follow(options) if options.like else {}
-            if options.denoise:
+            for flag, wanted, part in (
+                ("--denoise", options.denoise, denoising),
+                ("--compare", options.compare, compare),
+            ):
                 try:
-                    denoising.require()
+                    if wanted:
+                        part.require()
                 except ImportError as error:
-                    raise Failure(EXIT_USAGE, f"--denoise: {error}") from error
+                    raise Failure(EXIT_USAGE, f"{flag}: {error}") from error
             needs_views = (
                 "--all-views" if options.all_views else "--frames" if options.frames else None
             )
             opened = _request(options).open(needs_views)
+            rival = (
+                compare.prepare(options.compare, options.reference, opened)
+                if options.compare
+                else None
+            )
             for description in unfinite_data(opened.loaded.scene):
                 complain(
                     f"{description} (NaN or infinite): what they light or colour is left out of "
@@ -143,7 +152,7 @@ def _render_alone(options: argparse.Namespace, interrupt: Interrupt) -> int:
                     "light, and does the camera look at it?"
                 )
         # Before the workers are left, which may take long.
-        written = _write(options, opened, session, metadata, options.output, kept)
+        written, clean = _write(options, opened, session, metadata, options.output, kept)
         for suffix in (".preview.exr", ".preview.png") if options.preview else ():
             with contextlib.suppress(OSError):
                 options.output.with_suffix(suffix).unlink()
@@ -162,7 +171,67 @@ def _render_alone(options: argparse.Namespace, interrupt: Interrupt) -> int:
         return EXIT_INTERRUPTED
     if not options.quiet:
         complain(report, "")
+    if rival:
+        first = compare.Rendered(opened, session.image(), clean, clock.rendering)
+        return _compare(options, rival, first, interrupt)
     return EXIT_OK
+
+
+def _compare(
+    options: argparse.Namespace,
+    rival: compare.Rival,
+    first: compare.Rendered,
+    interrupt: Interrupt,
+) -> int:
+    """Render the rival of an image that is written for the same time; put both side by side."""
+    path = output.compared_path(options.output)
+    try:
+        rows = rival.rows(first, _render_rival(options, rival, first, interrupt))
+        try:
+            compare.write_picture(path, rows, rival.names)
+        except OSError as error:
+            reason = error.strerror or error
+            raise Failure(EXIT_OUTPUT, f"cannot write {path}: {reason}") from error
+    except BaseException as error:
+        if interrupt.stopped or isinstance(error, KeyboardInterrupt):
+            complain(f"interrupted, not compared; {options.output} is written")
+            return EXIT_INTERRUPTED
+        if not isinstance(error, Exception):
+            raise
+        failure = error if isinstance(error, Failure) else _failure(error)
+        raise Failure(
+            failure.code, f"--compare {options.compare}: {failure}; {options.output} is written"
+        ) from error
+    if not options.quiet:
+        for line in (*(entry.line for row in rows for entry in row), f"side by side: {path}"):
+            complain(line, "")
+    if interrupt.requested:
+        complain(f"interrupted: {options.compare} had less time")
+        return EXIT_INTERRUPTED
+    return EXIT_OK
+
+
+def _render_rival(
+    options: argparse.Namespace,
+    rival: compare.Rival,
+    first: compare.Rendered,
+    interrupt: Interrupt,
+) -> compare.Rendered:
+    """The rival's image after the time of the first one, as `_render` makes it."""
+    seconds = options.time or first.seconds
+    as_long = {**vars(options), "time": seconds, "spp": None, "target_error": None}
+    session, clock = rival.opened.session, Clock()
+    _, broken = _render(
+        session, rival.opened.sensor, argparse.Namespace(**as_long), {}, clock, None, interrupt
+    )
+    if broken:
+        raise broken
+    image, clean = session.image(), None
+    if options.denoise:
+        clean, _ = denoising.denoised_picture(
+            image, session.channels, rival.opened.loaded.scene, rival.opened.sensor
+        )
+    return compare.Rendered(rival.opened, image, clean, clock.rendering)
 
 
 OUT_OF_MEMORY = "there is not enough memory"
@@ -377,11 +446,13 @@ def _write(
     metadata: dict[str, str | int | float],
     path: Path,
     kept: Path | None,
-) -> str:
+) -> tuple[str, np.ndarray | None]:
+    """Write the image, and what goes with it; returns what was written, in words, and the denoised
+    image, if there is one."""
     png, channels = path.with_suffix(".png"), session.channels
     views = session.view_images() if options.all_views or options.frames else []
     image = output.contact_sheet(views) if options.all_views else session.image()
-    writing, written = path, ""
+    writing, written, clean = path, "", None
     try:
         output.write_exr(path, image, channels, metadata)
         writing, written = png, str(path)
@@ -393,15 +464,15 @@ def _write(
                 output.write_png(writing, view, channels)
             written += f", {len(views)} frames from {output.frame_path(path, 0)}"
         if options.denoise:
-            picture, names = denoising.denoised_picture(
+            clean, names = denoising.denoised_picture(
                 image, channels, opened.loaded.scene, opened.sensor
             )
             writing = output.denoised_path(path)
-            output.write_exr(writing, picture, names, {**metadata, "denoised": denoising.version()})
+            output.write_exr(writing, clean, names, {**metadata, "denoised": denoising.version()})
             written += f", denoised {writing}"
             writing = writing.with_suffix(".png")
-            output.write_png(writing, picture, names)
-        return written
+            output.write_png(writing, clean, names)
+        return written, clean
     except OSError as error:
         rest = (
             f"; {written} is written"
@@ -426,6 +497,8 @@ def _check_outputs(options: argparse.Namespace) -> None:
         files += [denoised, denoised.with_suffix(".png")]
     if options.preview:
         files += [image.with_suffix(".preview.exr"), image.with_suffix(".preview.png")]
+    if options.compare:
+        files.append(output.compared_path(image))
     for file in files:
         try:
             output.make_writable(file)

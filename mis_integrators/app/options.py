@@ -41,7 +41,7 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
         epilog=_EXIT_CODES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    for add_options in (_what, _how_long, _which_image, _what_is_kept, _where):
+    for add_options in (_what, _how_long, _which_image, _comparison, _what_is_kept, _where):
         add_options(parser)
     parser.add_argument("--quiet", action="store_true", help="print errors only")
     parser.add_argument("--version", action="version", version=versions())
@@ -58,6 +58,7 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
             parser.error(f"argument --denoise: not allowed with argument {flag}")
     if options.like:
         _check_like(parser, options)
+    _check_comparison(parser, options)
     options.sensor = options.sensor or 0
     options.seed = options.seed or 0
     options.variant = options.variant or "llvm_ad_rgb"
@@ -165,6 +166,24 @@ def _which_image(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def _comparison(parser: argparse.ArgumentParser) -> None:
+    """What the image is compared with."""
+    add = parser.add_argument
+    add(
+        "--compare",
+        metavar="PLUGIN",
+        help="then render the scene with this integrator for the same time, and write both images "
+        "side by side, FILE.compare.png; -P sets parameters of the first one only, but for "
+        f"{', '.join(loading.INHERITED)}",
+    )
+    add(
+        "--reference",
+        type=Path,
+        metavar="REFERENCE.exr",
+        help="with --compare: print each one's relMSE, MSE and FLIP against this image",
+    )
+
+
 def _what_is_kept(parser: argparse.ArgumentParser) -> None:
     """What is written while rendering goes on."""
     add = parser.add_argument
@@ -229,6 +248,25 @@ def _check_like(parser: argparse.ArgumentParser, options: argparse.Namespace) ->
             parser.error(f"argument {flag}: not allowed with argument --like")
     if options.like.resolve() == options.output.resolve():
         parser.error(f"argument -o: {options.output} is the image of --like")
+
+
+def _check_comparison(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
+    """Refuses what is about one render alone."""
+    if options.reference and not options.compare:
+        parser.error("argument --reference: needs argument --compare")
+    alone = {
+        "--like": options.like,
+        "--all-views": options.all_views,
+        "--frames": options.frames,
+        "--checkpoint": options.checkpoint,
+        "--resume": options.resume,
+        "--preview": options.preview,
+        "--workers": options.workers,
+        "--scheduler": options.scheduler,
+    }
+    for flag, value in alone.items():
+        if options.compare and value:
+            parser.error(f"argument --compare: not allowed with argument {flag}")
 
 
 def versions() -> str:

@@ -17,6 +17,9 @@ import mitsuba as mi
 import numpy as np
 import OpenEXR
 
+from ..core.untrusted import open_regular
+
+_MAGIC = b"\x76\x2f\x31\x01"
 # Channels that make a picture, and what Mitsuba calls them.
 _PICTURES = ((("R", "G", "B"), "RGB"), (("X", "Y", "Z"), "XYZ"), (("Y",), "Y"))
 
@@ -123,6 +126,21 @@ def picture_channels(channels: Sequence[str]) -> tuple[str, ...] | None:
     return next((names for names, _ in _PICTURES if set(names) <= set(channels)), None)
 
 
+def picture_bitmap(image: np.ndarray, channels: Sequence[str]) -> mi.Bitmap | None:
+    """The bytes that ``write_png`` writes; ``None`` without colour channels."""
+    names = picture_channels(channels)
+    if names is None:
+        return None
+    pixel_format = dict(_PICTURES)[names]
+    picture = np.nan_to_num(image[..., [channels.index(name) for name in names]], posinf=1).astype(
+        np.float32
+    )
+    formats = mi.Bitmap.PixelFormat
+    return mi.Bitmap(picture, getattr(formats, pixel_format)).convert(
+        formats.Y if pixel_format == "Y" else formats.RGB, mi.Struct.Type.UInt8, srgb_gamma=True
+    )
+
+
 def write_png(path: Path, image: np.ndarray, channels: Sequence[str]) -> bool:
     """Write the colour channels of an image of shape (H, W, C) as sRGB, clipped to [0, 1], without
     alpha.
@@ -130,23 +148,21 @@ def write_png(path: Path, image: np.ndarray, channels: Sequence[str]) -> bool:
     Values that are no numbers become black. Returns ``False``, and writes nothing, if the image has
     no colour channels (a film of spectral bands). Raises ``OSError`` as ``write_exr`` does.
     """
-    names = picture_channels(channels)
-    if names is None:
+    bitmap = picture_bitmap(image, channels)
+    if bitmap is None:
         return False
-    pixel_format = dict(_PICTURES)[names]
-    picture = np.nan_to_num(image[..., [channels.index(name) for name in names]], posinf=1).astype(
-        np.float32
-    )
-    formats = mi.Bitmap.PixelFormat
-    bitmap = mi.Bitmap(picture, getattr(formats, pixel_format)).convert(
-        formats.Y if pixel_format == "Y" else formats.RGB, mi.Struct.Type.UInt8, srgb_gamma=True
-    )
     with replacing(path) as temporary:
         try:
             bitmap.write(str(temporary), mi.Bitmap.FileFormat.PNG)
         except RuntimeError as error:
             raise OSError(str(error)) from error
     return True
+
+
+def is_exr(path: Path) -> bool:
+    """Whether a file begins as EXR files do. Raises ``OSError`` if it cannot be read."""
+    with open_regular(path) as file:
+        return file.read(len(_MAGIC)) == _MAGIC
 
 
 def contact_sheet(images: Sequence[np.ndarray]) -> np.ndarray:
@@ -170,6 +186,11 @@ def frame_path(path: Path, number: int) -> Path:
 def denoised_path(path: Path) -> Path:
     """Where the denoised image goes: ``NAME.denoised.exr`` beside ``NAME.exr``."""
     return path.with_suffix(".denoised.exr")
+
+
+def compared_path(path: Path) -> Path:
+    """Where the images of ``--compare`` go: ``NAME.compare.png`` beside ``NAME.exr``."""
+    return path.with_suffix(".compare.png")
 
 
 @contextlib.contextmanager

@@ -14,7 +14,8 @@ import OpenEXR
 
 from .. import _plugins
 from ..core.session import Session
-from ..core.untrusted import Fields, Malformed, open_regular, parse, shown
+from ..core.untrusted import Fields, Malformed, parse, shown
+from . import output
 from .options import LARGEST_SEED, MOST_SAMPLES, MOST_SENSORS, versions
 
 ATTRIBUTE = "again"
@@ -32,7 +33,6 @@ MITSUBA_INTEGRATORS = (
 )
 """Mitsuba's own integrators that make images: no other names, nor names of files, are taken from
 a header."""
-_MAGIC = b"\x76\x2f\x31\x01"
 
 
 @dataclass(frozen=True)
@@ -114,9 +114,7 @@ def read(image: Path) -> Recipe:
 
 def _attribute_of(image: Path, what: str) -> str:
     try:
-        with open_regular(image) as file:
-            is_exr = file.read(len(_MAGIC)) == _MAGIC
-        header = OpenEXR.File(str(image), header_only=True).header() if is_exr else {}
+        header = OpenEXR.File(str(image), header_only=True).header() if output.is_exr(image) else {}
     except Exception as error:  # OpenEXR raises errors of many kinds for files that are damaged
         raise Malformed(
             f"{what}: cannot be read: "
