@@ -1,7 +1,8 @@
 """Emitters seen from both sides: points chosen on them for direct light, and light sub-paths
 started from them.
 
-Emitters are chosen by power. Positional and directional emission densities are ours throughout,
+Emitters are chosen by power for light sub-paths, and for direct light by what they bring to the
+place (`nearby`). Positional and directional emission densities are ours throughout,
 because Mitsuba's `sample_ray` returns a ray's weight without its density, draws its own
 wavelengths, and starts the rays of a rotated `envmap` from the wrong disk; textured area lights are
 sampled by surface area (by their texture, `path`'s way, they come out wrong where texture
@@ -19,6 +20,7 @@ from ..core.random import next_1d_and_2d, next_2d, next_floats, streams
 from ..core.spectra import channel_mean
 from ..core.traits import UnsupportedScene, lookup, registry_table
 from .environment_guide import AIMED_SHARE, EnvironmentGuide, direction_cell, infinite_emitters
+from .nearby import NearbyChoice
 
 POWER_SAMPLES = 4096
 """Tuned: rays by which the power of a textured emitter is estimated."""
@@ -97,14 +99,15 @@ def _invariant_key(emitter):
 
 
 class Lights:
-    """All emitters of a scene, chosen by power.
+    """All emitters of a scene.
 
     Parameters: `scene`; `guide`, an `EnvironmentGuide` or None (needed for light sub-paths exactly
     if the scene has infinite emitters); `by_power`: choose emitters by power, or else evenly, as
-    Mitsuba does (without a guide the power of infinite emitters says little).
+    Mitsuba does (without a guide the power of infinite emitters says little); `sensor`: around
+    whose view emitters are told apart by what they bring (or None: everywhere).
     """
 
-    def __init__(self, scene, plugin="bdpm", guide=None, by_power=True):
+    def __init__(self, scene, plugin="bdpm", guide=None, by_power=True, sensor=None):
         self.scene = scene
         # Mitsuba loads a scene's objects in parallel, in no fixed order; random numbers must not
         # depend on it.
@@ -128,19 +131,25 @@ class Lights:
         uniform = UNIFORM_SHARE * power.sum() / max(np.count_nonzero(power), 1)
         weights = (1 - UNIFORM_SHARE) * power + uniform * (power > 0) if by_power else power > 0
         self.choice = EmitterSelection(weights)
+        self.nearby = None  # how emitters are chosen for direct light, where not as `choice` does
         self.numbers = registry_table(
             self.emitters, mi.EmitterPtr, range(len(self.emitters)), mi.UInt32
         )
         self.kind_table = mi.UInt32([_KINDS.index(k) for k in self.kinds])
         self._spot_tables(self.emitters)
         self._surface_tables(self.emitters)
+        if by_power and self.choice.count > 1 and not self.dark:
+            self.nearby = NearbyChoice(self, power > 0, sensor)
 
     @classmethod
     def seen_by(cls, scene, sensor, plugin):
         """The lights of a scene; its environments, if any, send their light sub-paths where
         `sensor` will see something of them."""
         return cls(
-            scene, plugin, EnvironmentGuide(scene, sensor) if infinite_emitters(scene) else None
+            scene,
+            plugin,
+            EnvironmentGuide(scene, sensor) if infinite_emitters(scene) else None,
+            sensor=sensor,
         )
 
     @property
@@ -169,6 +178,8 @@ class Lights:
         ]
         if self.choice.count > 1:
             arrays += [self.choice._pmf, self.choice._cdf]
+        if self.nearby is not None:
+            arrays += self.nearby.tables()
         return arrays + (self.guide.tables() if self.guide is not None else [])
 
     def needs_photons_for_direct_light(self):
@@ -292,7 +303,10 @@ class Lights:
             choice, sample = next_1d_and_2d(rng, active)
         else:
             choice, sample = mi.Float(0), next_2d(rng, active)
-        index, probability = self.choice.sample(choice)
+        if self.nearby is not None:
+            index, probability = self.nearby.sample(ref.p, choice)
+        else:
+            index, probability = self.choice.sample(choice)
         emitter = self.pointer(index)
         textured = active & self._textured_mask(emitter) if self.has_textured else mi.Bool(False)
         if self._aims:
@@ -383,8 +397,14 @@ class Lights:
         `ref`."""
         pdf = self._pdf_of_emitter(ref, ds, active)
         if len(self.emitters) > 1:
-            pdf *= self.choice.probability(lookup(self.numbers, ds.emitter, mi.UInt32, active))
+            pdf *= self._direct_choice(ref, lookup(self.numbers, ds.emitter, mi.UInt32, active))
         return dr.select(active, pdf, 0)
+
+    def _direct_choice(self, ref, index):
+        """Probability of emitter `index` for direct light at `ref`."""
+        if self.nearby is not None:
+            return self.nearby.probability(ref.p, index)
+        return self.choice.probability(index)
 
     def _pdf_of_emitter(self, ref, ds, active):
         """`pdf_direct` without the emitter's choice."""
@@ -490,6 +510,9 @@ class Lights:
                 ratio = dr.select(
                     chosen, getattr(self, "_ratio_" + name)(ref, ds, index, chosen), ratio
                 )
+        if self.nearby is not None:
+            chosen = self.nearby.probability(ref.p, index)
+            ratio *= dr.select(chosen > 0, self.choice.probability(index) / chosen, 0)
         return ratio
 
     # --- starts of light sub-paths, apart from what follows --------------------------------------

@@ -8,8 +8,9 @@ from typing import Any, Protocol
 import drjit as dr
 import mitsuba as mi
 
-from ..core.random import next_1d_and_2d, next_2d
+from ..core.random import next_1d_and_2d
 from ..core.traits import lookup
+from .perturbed import sample_perturbed
 from .roulette import russian_roulette
 from .setting import LightPass, Limits, World
 
@@ -28,46 +29,6 @@ def lane_count(n_paths):
     )
 
 
-def delta_adjoint(wi, wo, eta):
-    """Ratio of the cosines of `wi` and `wo` to the normal at which a delta function scattered,
-    which a bump or normal map keeps to itself: it lies along wi + eta wo (reflection: eta = 1). One
-    where nothing was deflected."""
-    half = wi + wo * eta
-    ratio = dr.abs(dr.dot(wi, half) / dr.dot(wo, half))
-    return dr.select((dr.squared_norm(half) > 1e-6) & dr.isfinite(ratio), ratio, 1)
-
-
-def sample_perturbed(bsdf, si, bs, delta, weight, rng, active, perturbed):
-    """Replaces a light sub-path's BSDF sample where bump or normal maps perturb normals inside
-    BSDFs (lanes `perturbed`).
-
-    The adjoint factor of shading normals is then out of sight, so smooth scattering is evaluated
-    from the camera's side, where light may even leave below the perturbed horizon: half of the
-    directions come from the geometric hemisphere instead. Returns `(bs, delta, weight)`, on those
-    lanes with the weight that lacks only the ratio of the geometric cosines.
-    """
-    smooth = active & perturbed & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-    aside = smooth & (rng.next_float32(active) < 0.5)
-    facing = mi.Vector3f(dr.mulsign(si.n, dr.dot(si.n, si.to_world(si.wi))))
-    towards = mi.Frame3f(facing).to_world(mi.warp.square_to_cosine_hemisphere(next_2d(rng, active)))
-    bs.wo = dr.select(aside, si.to_local(towards), bs.wo)
-    bs.eta = dr.select(aside, 1, bs.eta)
-    delta = delta & ~aside
-    view = mi.SurfaceInteraction3f(si)
-    view.wi = mi.Vector3f(bs.wo)
-    scattered = smooth & ~delta
-    response = bsdf.eval(mi.BSDFContext(), view, si.wi, scattered)
-    own_pdf = bsdf.pdf(mi.BSDFContext(mi.TransportMode.Importance), si, bs.wo, scattered)
-    pdf = 0.5 * (own_pdf + dr.maximum(dr.dot(facing, si.to_world(bs.wo)), 0) * dr.inv_pi)
-    once = dr.select(smooth, 2, mi.Float(1))  # a delta event of a BSDF with a smooth part too
-    special = dr.select(
-        delta,
-        weight * (once * delta_adjoint(si.wi, bs.wo, bs.eta)),
-        dr.select(pdf > 1e-9, response / pdf, 0),
-    )
-    return bs, delta, dr.select(perturbed, special, weight)
-
-
 def scatter_light(traits, si, bsdf, rng, active):
     """Samples where a light sub-path goes on from a surface.
 
@@ -76,16 +37,13 @@ def scatter_light(traits, si, bsdf, rng, active):
     for which shading and geometric normal disagree about the side. The factor includes the adjoint
     one of shading normals (Veach 1997, section 5.3).
     """
-    bs, weight = bsdf.sample(
-        mi.BSDFContext(mi.TransportMode.Importance),
-        si,
-        *next_1d_and_2d(rng, active),
-        active,
-    )
-    delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
     if traits.has_perturbed:
         perturbed = lookup(traits.perturbed, bsdf, mi.Bool, active)
-        bs, delta, weight = sample_perturbed(bsdf, si, bs, delta, weight, rng, active, perturbed)
+        bs, delta, weight = sample_perturbed(bsdf, si, rng, perturbed, active)
+    else:
+        context = mi.BSDFContext(mi.TransportMode.Importance)
+        bs, weight = bsdf.sample(context, si, *next_1d_and_2d(rng, active), active)
+        delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
     wo = si.to_world(bs.wo)
     wi_shading, wo_shading = mi.Frame3f.cos_theta(si.wi), mi.Frame3f.cos_theta(bs.wo)
     wi_geometric, wo_geometric = dr.dot(si.n, si.to_world(si.wi)), dr.dot(si.n, wo)

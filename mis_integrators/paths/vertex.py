@@ -13,6 +13,7 @@ import mitsuba as mi
 
 from ..core.spectra import channel_mean
 from ..core.traits import lookup
+from .perturbed import smooth_density
 
 SMALLEST_COSINE = 1e-6
 ROUGH = -1.0
@@ -83,10 +84,10 @@ class VertexBSDF:
             rough_light = self.bsdf.pdf(
                 mi.BSDFContext(mi.TransportMode.Importance), lit, seen.wi, rough
             )
-            if traits.has_perturbed:  # what `sample_perturbed` does
+            if traits.has_perturbed:
                 perturbed = rough & lookup(traits.perturbed, self.bsdf, mi.Bool, rough)
-                aside = dr.maximum(dr.mulsign(geometric_camera, geometric_light), 0) * dr.inv_pi
-                rough_light = dr.select(perturbed, 0.5 * (rough_light + aside), rough_light)
+                special = smooth_density(self.bsdf, lit, seen.wi, rough_light, perturbed)
+                rough_light = dr.select(perturbed, special, rough_light)
             value = dr.select(rough, rough_value, value)
             p_camera, p_light = (
                 dr.select(rough, rough_camera, p_camera),
