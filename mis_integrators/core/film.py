@@ -263,9 +263,10 @@ class Accumulator:
         inside = slice(border, -border) if border else slice(None)
         return np.array(tensor)[inside, inside]
 
-    def put(self, film, variance):
+    def put(self, film, variance, layers=None):
         """Writes the accumulated image into a film prepared with matching AOVs: with channels of
-        the `variance` or not, then those of the techniques."""
+        the `variance` or not, then those of the techniques, then those of `layers` (a tensor with
+        the block's border, or None)."""
         tensor = self.sums["total"]
         if variance:
             channels = self.variance_of_mean() * tensor[:, :, -1:]
@@ -274,6 +275,9 @@ class Accumulator:
             )
         if self.technique_channels:
             tensor = dr.concat([tensor, self.sums["techniques"]], axis=2)
+        if layers is not None:
+            weight = self.sums["total"][:, :, -1:]  # by which the film will divide them
+            tensor = dr.concat([tensor, mi.TensorXd(layers) * weight], axis=2)
         # Scaled, so that sums fit into single precision; the weights' sums are scaled alike.
         tensor = mi.TensorXf(tensor * 2.0 ** -self.iterations.bit_length())
         film.put_block(mi.ImageBlock(tensor, film.crop_offset(), film.rfilter(), border=True))

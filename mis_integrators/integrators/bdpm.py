@@ -87,6 +87,13 @@ class BDPM(IterativeIntegrator):
        - Adds the channels ``var.R``, ``var.G``, ``var.B`` (mono: ``var.Y``): the estimated variance
          of the pixel mean over the iterations, of which there must be two at least. (Default: no,
          i.e. |false|)
+     * - aovs
+       - |string|
+       - Adds layers of what the camera sees, ``name:type`` with commas between them, as Mitsuba's
+         ``aov``: of the types ``albedo``, ``sh_normal`` (through glass and in mirrors), ``depth``,
+         ``position``, ``geo_normal``, ``uv``, ``shape_index``, ``prim_index`` (of the first
+         surface). Channels are ``name.R``, ``name.X`` and so on, after all others. (Default:
+         ``none``)
      * - max_depth
        - |int|
        - Longest path in segments, both halves together (-1: unlimited). A value of 1 shows only

@@ -65,6 +65,13 @@ class BDPT(IterativeIntegrator):
        - Adds the channels ``var.R``, ``var.G``, ``var.B`` (mono: ``var.Y``): the estimated variance
          of the pixel mean over the iterations, of which there must be two at least. (Default: no,
          i.e. |false|)
+     * - aovs
+       - |string|
+       - Adds layers of what the camera sees, ``name:type`` with commas between them, as Mitsuba's
+         ``aov``: of the types ``albedo``, ``sh_normal`` (through glass and in mirrors), ``depth``,
+         ``position``, ``geo_normal``, ``uv``, ``shape_index``, ``prim_index`` (of the first
+         surface). Channels are ``name.R``, ``name.X`` and so on, after all others. (Default:
+         ``none``)
      * - max_depth
        - |int|
        - Longest path in segments, both halves together (-1: unlimited). A value of 1 shows only
@@ -119,8 +126,8 @@ class BDPT(IterativeIntegrator):
             "from 1 (balance) to 8; 2 is the power heuristic",
         )
 
-    def aov_names(self):
-        return super().aov_names() + (
+    def estimated_channels(self):
+        return super().estimated_channels() + (
             technique_channels(self.techniques, self.technique_weights) if self.techniques else []
         )
 

@@ -19,6 +19,7 @@ import numpy as np
 from ..core.recording import lanes
 from ..core.spectra import channel_mean
 from ..core.stratified_variance import contrasts, extrapolated
+from ..paths.layers import written
 from ..paths.path_length_statistics import mean_segments
 from ..pilot.noise import relative_weights, trimmed_mean
 from ..pilot.run import FEWEST_ITERATIONS
@@ -95,7 +96,7 @@ class Trial:
 
 
 def handed_on(integrator):
-    """The parameters that every integrator of this package shares."""
+    """The parameters that every integrator of this package shares, that of media among them."""
     return {
         name: getattr(integrator, name)
         for name in (
@@ -229,7 +230,11 @@ def new_session(plugin, parameters, integrator, scene, sensor, seed, iterations,
     `BDPM`."""
     if plugin == "path":
         return PathSession(integrator, scene, sensor, seed, iterations)
-    shared = {**handed_on(integrator), "camera_paths": integrator.initial_camera_paths}
+    shared = {
+        **handed_on(integrator),
+        "camera_paths": integrator.initial_camera_paths,
+        "aovs": written(integrator.layers),
+    }
     made = mi.load_dict({"type": plugin, **shared, **parameters})
     made.survey = survey
     return made.new_session(scene, sensor, seed, iterations)

@@ -3,6 +3,7 @@ at the end."""
 
 from __future__ import annotations
 
+import functools
 import math
 
 import drjit as dr
@@ -18,6 +19,7 @@ from ..core.sequences import SampleSequence
 from ..core.traits import UnsupportedScene, check_film, check_scene, check_variant, unfinite_data
 from ..core.untrusted import Fields
 from ..paths.camera import film_sample_count, with_gaps
+from ..paths.layers import channel_names, render_layers, written
 from ..paths.setting import CameraPass, LightPass, Limits
 from ..pilot.run import PILOT_INDEX
 from .parameters import Parameters
@@ -54,12 +56,18 @@ class IterativeIntegrator(mi.AdjointIntegrator):
         self.variance = parameters.boolean("variance", False)
         self.sampler = parameters.choice("sampler", SAMPLERS[0], SAMPLERS)
         self.warned_of_sampler = False
+        self.layers = self.read_layers(parameters)
         self.read_parameters(parameters)
+        parameters.check_channels(self.layers, self.estimated_channels())
         parameters.finish()
         super().__init__(props)
 
     def read_parameters(self, parameters):
         """Reads the subclass's own parameters (there need not be any)."""
+
+    def read_layers(self, parameters):
+        """The layers (`paths.layers.Layer`) that the parameter `aovs` asks for."""
+        return parameters.layers("aovs")
 
     def new_session(self, scene, sensor, seed, iterations):
         """The object that runs iterations; see `mis_integrators.core.session.Session`. Every
@@ -70,8 +78,12 @@ class IterativeIntegrator(mi.AdjointIntegrator):
         """Raises `UnsupportedScene` for a scene that this integrator cannot render."""
         check_scene(scene, sensor, self.plugin)
 
-    def aov_names(self):
+    def estimated_channels(self):
+        """Names of the channels beside the image's that iterations are summed for."""
         return variance_channels() if self.variance else []
+
+    def aov_names(self):
+        return [*self.estimated_channels(), *channel_names(self.layers)]
 
     def to_string(self):
         lines = ",\n".join(f"  {name} = {value}" for name, value in self.settings().items())
@@ -96,6 +108,7 @@ class IterativeIntegrator(mi.AdjointIntegrator):
             "hide_emitters": self.hide_emitters,
             "camera_paths": self.camera_paths,
             "variance": self.variance,
+            "aovs": written(self.layers),
             "sampler": self.sampler,
         }
 
@@ -444,7 +457,22 @@ class IterativeSession:
 
     def fill_film(self):
         """Hands what has been rendered so far to the sensor's film, ready to develop."""
-        self.accumulator.put(self._emptied(self.sensor.film()), self.integrator.variance)
+        self.accumulator.put(
+            self._emptied(self.sensor.film()), self.integrator.variance, self._layers
+        )
+
+    LAYERS = 6
+    """Purpose of the random seed of the layers."""
+
+    @functools.cached_property
+    def _layers(self):
+        """The layers' channels, made when the image is first looked at (None where there are
+        none)."""
+        if not self.integrator.layers:
+            return None
+        with dr.suspend_grad():
+            seed = mix(self.seed, RENDER, self.LAYERS)
+            return render_layers(self.scene, self.sensor, self.integrator.layers, seed)
 
     def _emptied(self, film):
         """The film, empty, with all channels."""

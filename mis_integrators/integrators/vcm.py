@@ -47,7 +47,7 @@ class VCM(BDPT):
        - |float|
        - Radius reduction of progressive photon mapping, in (0, 1]: iteration i uses R_i^2 = R_0^2
          (i + 1)^(alpha - 1). 1 keeps the radius. (Default: 1)
-     * - camera_paths, variance, max_depth, rr_depth, hide_emitters, sampler
+     * - camera_paths, variance, aovs, max_depth, rr_depth, hide_emitters, sampler
        -
        - As of :monosp:`bdpt`.
 
