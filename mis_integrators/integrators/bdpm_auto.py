@@ -7,7 +7,7 @@ import mitsuba as mi
 
 from ..core.traits import UnsupportedScene, check_scene, has_media
 from ..core.untrusted import Fields
-from ..paths.layers import written
+from ..paths.layers import CHANNELS, SPLIT, written
 from ..volume.traits import check_volume_scene
 from .choice import CANDIDATES, Decision, choose, handed_on, new_session
 from .common import IterativeIntegrator, IterativeSession
@@ -54,6 +54,7 @@ class BDPMAuto(IterativeIntegrator):
     """
 
     CAMERA_PATHS = 0, 0, "at least 0 (0: automatic)"
+    LAYERS = *CHANNELS, *SPLIT
 
     def check(self, scene, sensor):
         if has_media(scene):

@@ -82,8 +82,8 @@ class BDPTRIS(ResampledIntegrator):
        - Adds layers of what the camera sees, ``name:type`` with commas between them, as Mitsuba's
          ``aov``: of the types ``albedo``, ``sh_normal`` (through glass and in mirrors), ``depth``,
          ``position``, ``geo_normal``, ``uv``, ``shape_index``, ``prim_index`` (of the first
-         surface). Channels are ``name.R``, ``name.X`` and so on, after all others. (Default:
-         ``none``)
+         surface); and ``direct``, ``indirect``, ``caustic``, which sum to the image. Channels are
+         ``name.R``, ``name.X`` and so on, after all others. (Default: ``none``)
      * - max_depth
        - |int|
        - Longest path in segments (-1: unlimited). A value of 1 shows only directly visible

@@ -19,7 +19,8 @@ from ..core.sequences import SampleSequence
 from ..core.traits import UnsupportedScene, check_film, check_scene, check_variant, unfinite_data
 from ..core.untrusted import Fields
 from ..paths.camera import film_sample_count, with_gaps
-from ..paths.layers import channel_names, render_layers, written
+from ..paths.layers import CHANNELS, channel_names, render_layers, written
+from ..paths.light_classes import CLASSES
 from ..paths.setting import CameraPass, LightPass, Limits
 from ..pilot.run import PILOT_INDEX
 from .parameters import Parameters
@@ -45,6 +46,8 @@ class IterativeIntegrator(mi.AdjointIntegrator):
     CAMERA_PATHS = 1, 1, "at least 1"
     """Default, least value and range in words of the parameter `camera_paths`; 0 stands for as many
     as the session finds worth while."""
+    LAYERS = tuple(CHANNELS)
+    """Types of layers that the parameter `aovs` may ask for."""
 
     def __init__(self, props):
         parameters = Parameters(props)
@@ -67,7 +70,12 @@ class IterativeIntegrator(mi.AdjointIntegrator):
 
     def read_layers(self, parameters):
         """The layers (`paths.layers.Layer`) that the parameter `aovs` asks for."""
-        return parameters.layers("aovs")
+        return parameters.layers("aovs", self.LAYERS)
+
+    @property
+    def splits_light(self):
+        """Whether layers ask for classes of light (`paths.light_classes`)."""
+        return any(layer.type in CLASSES for layer in self.layers)
 
     def new_session(self, scene, sensor, seed, iterations):
         """The object that runs iterations; see `mis_integrators.core.session.Session`. Every
@@ -242,7 +250,10 @@ class IterativeSession:
         self.iterations_planned = iterations
         self.camera_paths = integrator.initial_camera_paths
         self.accumulator = Accumulator(
-            sensor.film(), integrator.variance, stratified=integrator.low_discrepancy
+            sensor.film(),
+            integrator.variance,
+            stratified=integrator.low_discrepancy,
+            class_channels=3 * len(CLASSES) if integrator.splits_light else 0,
         )
         self.variant = mi.variant()
         settle(scene)
@@ -457,22 +468,24 @@ class IterativeSession:
 
     def fill_film(self):
         """Hands what has been rendered so far to the sensor's film, ready to develop."""
-        self.accumulator.put(
-            self._emptied(self.sensor.film()), self.integrator.variance, self._layers
-        )
+        layers = [
+            CLASSES.index(layer.type) if layer.type in CLASSES else self._layers[layer.name]
+            for layer in self.integrator.layers
+        ]
+        film = self._emptied(self.sensor.film())
+        self.accumulator.put(film, self.integrator.variance, layers)
 
-    LAYERS = 6
-    """Purpose of the random seed of the layers."""
+    SURFACES = 6
+    """Purpose of the random seed of layers of surfaces."""
 
     @functools.cached_property
     def _layers(self):
-        """The layers' channels, made when the image is first looked at (None where there are
-        none)."""
-        if not self.integrator.layers:
-            return None
+        """The layers of surfaces by name, made when the image is first looked at."""
+        layers = [layer for layer in self.integrator.layers if layer.type not in CLASSES]
         with dr.suspend_grad():
-            seed = mix(self.seed, RENDER, self.LAYERS)
-            return render_layers(self.scene, self.sensor, self.integrator.layers, seed)
+            seed = mix(self.seed, RENDER, self.SURFACES)
+            rendered = render_layers(self.scene, self.sensor, layers, seed)
+        return {layer.name: tensor for layer, tensor in zip(layers, rendered)}
 
     def _emptied(self, film):
         """The film, empty, with all channels."""

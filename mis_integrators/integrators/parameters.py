@@ -3,7 +3,7 @@ sampling."""
 
 from __future__ import annotations
 
-from ..paths.layers import CHANNELS, channel_names, parse_layers
+from ..paths.layers import channel_names, parse_layers
 
 REFUSED = {
     "samples_per_pass": 'iterations are passes already; use "camera_paths" and spp',
@@ -76,16 +76,16 @@ class Parameters:
             self._fail(name, value, " or ".join(f'"{word}"' for word in allowed))
         return value
 
-    def layers(self, name):
-        """The layers (`paths.layers.Layer`) that a text asks for."""
+    def layers(self, name, types):
+        """The layers (`paths.layers.Layer`) of some `types` that a text asks for."""
         text = self._get(name, "")
         try:
-            return parse_layers(text if type(text) is str else repr(text))
+            return parse_layers(text if type(text) is str else repr(text), types)
         except ValueError as error:
             self._fail(
                 name,
                 text,
-                f'pairs "name:type" with commas between them, types being {", ".join(CHANNELS)}; '
+                f'pairs "name:type" with commas between them, types being {", ".join(types)}; '
                 f"{error}",
             )
 

@@ -3,6 +3,7 @@ variables, of which its own integrator `aov` makes no layers for integrators lik
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import drjit as dr
@@ -12,6 +13,7 @@ from ..core.film import splat_channels
 from ..core.traits import lookup, registry_table
 from .camera import start_camera_paths
 from .guides import SAMPLES, camera_passes, displayed_albedo, first_smooth_surface
+from .light_classes import CLASSES
 
 CHANNELS = {
     "albedo": "RGB",
@@ -23,7 +25,9 @@ CHANNELS = {
     "shape_index": "I",
     "uv": "UV",
 }
-"""The types of layers, and the last letters of their channels' names."""
+"""The types of layers of surfaces, and the last letters of their channels' names."""
+SPLIT = dict.fromkeys(CLASSES, "RGB")
+"""The same of layers that split the light, which integrators must do themselves."""
 BEHIND_DELTA = {"albedo", "sh_normal"}
 """Types that are of the first surface that scatters smoothly; all others are of the first one."""
 NONE = "none"
@@ -31,7 +35,7 @@ NONE = "none"
 
 
 class Layer(NamedTuple):
-    """A layer's name, and its type (one of `CHANNELS`)."""
+    """A layer's name, and its type (one of `CHANNELS` or `SPLIT`)."""
 
     name: str
     type: str
@@ -39,13 +43,13 @@ class Layer(NamedTuple):
     @property
     def channels(self) -> list[str]:
         """The names of its channels."""
-        return [f"{self.name}.{letter}" for letter in CHANNELS[self.type]]
+        return [f"{self.name}.{letter}" for letter in (CHANNELS | SPLIT)[self.type]]
 
 
-def parse_layers(text: str) -> tuple[Layer, ...]:
-    """The layers that a text like ``albedo:albedo,nn:sh_normal`` asks for: pairs ``name:type`` with
-    commas between them, as of Mitsuba's ``aov``. Raises ``ValueError``, which says what is
-    wrong."""
+def parse_layers(text: str, types: Iterable[str] = CHANNELS) -> tuple[Layer, ...]:
+    """The layers of some `types` that a text like ``albedo:albedo,nn:sh_normal`` asks for: pairs
+    ``name:type`` with commas between them, as of Mitsuba's ``aov``. Raises ``ValueError``, which
+    says what is wrong."""
     if text.strip() in ("", NONE):
         return ()
     layers = []
@@ -53,7 +57,7 @@ def parse_layers(text: str) -> tuple[Layer, ...]:
         name, colon, kind = pair.strip().partition(":")
         if not colon or not name or not name.isprintable() or " " in name:
             raise ValueError(f'"{pair.strip()}" is no pair of a name and a type')
-        if kind not in CHANNELS:
+        if kind not in types:
             raise ValueError(f'there is no type "{kind}"')
         if name in [layer.name for layer in layers]:
             raise ValueError(f'the name "{name}" is there twice')
@@ -108,8 +112,8 @@ def values_of_types(scene, camera_pass, types, numbers):
 
 
 def render_layers(scene, sensor, layers: tuple[Layer, ...], seed=0, samples: int = SAMPLES):
-    """The channels of the layers (not none): a tensor (height, width, channels) with the border
-    that blocks of the film have. Means over `samples` camera paths a pixel under the film's
+    """The layers (of `CHANNELS`), a list of tensors (height, width, channels) with the border that
+    blocks of the film have. Means over `samples` camera paths a pixel under the film's
     reconstruction filter; albedo is at most one. `seed`: an integer.
 
     Albedo and shading normal are those of `guides.first_smooth_surface`, through glass and in
@@ -129,16 +133,12 @@ def render_layers(scene, sensor, layers: tuple[Layer, ...], seed=0, samples: int
         dr.eval(total)
     weight = total[:, :, -1:]
     means = total[:, :, :-1] * dr.select(weight != 0, dr.rcp(dr.select(weight != 0, weight, 1)), 0)
-    return _at_most_white(means, layers)
-
-
-def _at_most_white(means, layers):
-    """Single samples of a BSDF, and filters that have negative lobes, may leave albedo outside
-    [0, 1]."""
     parts, first = [], 0
     for layer in layers:
         last = first + len(layer.channels)
         part = means[:, :, first:last]
+        # Single samples of a BSDF, and filters with negative lobes, may leave [0, 1].
         parts.append(dr.clip(part, 0, 1) if layer.type == "albedo" else part)
         first = last
-    return dr.concat(parts, axis=2)
+    dr.eval(parts)
+    return parts
