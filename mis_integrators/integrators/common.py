@@ -237,7 +237,8 @@ class IterativeIntegrator(mi.AdjointIntegrator):
 
 class IterativeSession:
     """Runs iterations and accumulates them; a subclass implements `_iteration(index) -> block
-    tensor`.
+    tensor`. (Where light is split, the block has three channels for each of
+    `light_classes.CLASSES` before its last one.)
 
     `seed` is an integer; iteration `i` draws all its random numbers from (seed, i), so any subset
     of the iterations can be rendered anywhere. They are independent, or parts of sequences

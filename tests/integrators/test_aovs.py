@@ -416,6 +416,16 @@ def test_split_of_films_in_parts(rgb, monkeypatch, plugin, module, size):
     np.testing.assert_allclose(layers, image[..., :3], rtol=1e-4, atol=1e-6)
 
 
+def test_automatic_choice_leaves_out_what_cannot_split(rgb):
+    """Light of two segments is `path`'s business, unless it is to be split."""
+    scene = tray("lambertian", "constant", size=12)
+    for aovs, plugin in (("a:albedo", "path"), ("d:direct", "bdpm")):
+        integrator = mi.load_dict({"type": "bdpm_auto", "aovs": aovs, "max_depth": 2})
+        session = integrator.session(scene, seed=1, spp=4)
+        session.iterate()
+        assert session.settings["choice"] == plugin and session.settings["aovs"] == aovs
+
+
 def test_split_beside_images_of_techniques(rgb):
     """All of them in one image: the pyramid's come first, and each sums to the image."""
     scene = tray("delta", "constant", size=12)
