@@ -92,16 +92,17 @@ def values_of_types(scene, camera_pass, types, numbers):
         found |= {"albedo": displayed_albedo(albedo), "sh_normal": normal}
     if set(types) - BEHIND_DELTA:
         si = scene.ray_intersect(ray, there)
+        valid = si.is_valid()
         shape = dr.select(si.instance != None, si.instance, si.shape)  # noqa: E711 (array comparison)
+        known = valid & (dr.reinterpret_array(mi.UInt32, shape) < dr.width(numbers))
         found |= {
             "depth": [si.t],
             "geo_normal": si.n,
             "position": si.p,
             "prim_index": [mi.Float(si.prim_index)],
-            "shape_index": [mi.Float(lookup(numbers, shape, mi.UInt32, si.is_valid()))],
+            "shape_index": [mi.Float(lookup(numbers, shape, mi.UInt32, known))],
             "uv": si.uv,
         }
-        valid = si.is_valid()
         for name in found.keys() - BEHIND_DELTA:
             found[name] = [dr.select(valid, value, 0) for value in found[name]]
     finite = {
