@@ -82,12 +82,12 @@ def denoise(image: Any, scene: mi.Scene | None = None, sensor: int | mi.Sensor =
 def denoised_picture(
     image: np.ndarray, channels: Sequence[str], scene: mi.Scene, sensor: mi.Sensor
 ) -> tuple[np.ndarray, list[str]]:
-    """The colour channels of a scene's image, denoised, with its alpha: the image and the channels'
-    names.
+    """A scene's image with its colour channels denoised and first, all others as they are: the
+    image and the channels' names.
 
     Raises ``ValueError`` if it has no colour channels (a film of spectral bands)."""
     names = picture_channels(channels)
     if names is None:
         raise ValueError("--denoise: the film has no colours, and so there is nothing to denoise")
-    kept = [*names, *(name for name in channels if name == "A")]
-    return denoise(image[..., [channels.index(name) for name in kept]], scene, sensor), kept
+    order = [*names, *(name for name in channels if name not in names)]
+    return denoise(image[..., [channels.index(name) for name in order]], scene, sensor), order

@@ -45,13 +45,16 @@ def colour_channels(radiance, matrix):
     return radiance
 
 
-def splat_samples(film, position, radiance, alpha, matrix, active, weight=1):
+def splat_samples(film, position, radiance, alpha, matrix, active, weight=1, classes=()):
     """Reconstructs one pass: an image tensor (height, width, channels), border included, that holds
-    sums of filter weight times (R, G, B, [alpha,] 1); `matrix` as for `colour_channels`. Samples
-    may have a `weight` of their own, in all channels."""
+    sums of filter weight times (R, G, B, [alpha,] [classes,] 1); `matrix` as for `colour_channels`.
+    Samples may have a `weight` of their own, in all channels. `classes`: spectra into which the
+    radiance is split, three channels each."""
     values = [value * weight for value in colour_channels(radiance, matrix)]
     if mi.has_flag(film.flags(), mi.FilmFlags.Alpha):
         values.append(alpha * weight)
+    for light in classes:
+        values += [value * weight for value in colour_channels(light, matrix)]
     return splat_channels(film, position, [*values, mi.Float(weight)], active)
 
 
@@ -108,8 +111,16 @@ def as_camera_weights(light, block, expected):
 
 
 def with_colour(block, colour):
-    """A block of camera samples with `colour` (height, width, 3) added to its own."""
-    return dr.concat([block[:, :, :3] + colour, block[:, :, 3:]], axis=2)
+    """A block of camera samples with `colour` (height, width, 3) added to its own; further channels
+    of that are added to those before the block's last one."""
+    if colour.shape[2] == 3:
+        return dr.concat([block[:, :, :3] + colour, block[:, :, 3:]], axis=2)
+    more = colour.shape[2] - 3
+    last, first = block.shape[2] - 1, block.shape[2] - 1 - more
+    parts = [block[:, :, :3] + colour[:, :, :3], block[:, :, first:last] + colour[:, :, 3:]]
+    if first > 3:  # alpha
+        parts.insert(1, block[:, :, 3:first])
+    return dr.concat([*parts, block[:, :, last:]], axis=2)
 
 
 def add_squares(sums, colour, weight):
@@ -152,19 +163,23 @@ class Accumulator:
     The sums are `total`; `left_out`, how many iterations had a value at the pixel that is not
     finite and are left out there, weight and all; with the variance `square` (colour squared),
     `cross` (colour times weight), `weight_square`; `techniques` if there are such images.
+    Blocks have `class_channels` before their last one.
 
     Where iterations are `stratified` together (low-discrepancy numbers), the variance needs
     `grey_square` and the segments (see `segments`) of grey and weight, too; grey is the mean of the
     colours.
     """
 
-    def __init__(self, film, with_variance, technique_channels=0, stratified=False):
+    def __init__(
+        self, film, with_variance, technique_channels=0, stratified=False, class_channels=0
+    ):
         self.film, self.with_variance, self.technique_channels, self.stratified = (
             film,
             with_variance,
             technique_channels,
             stratified,
         )
+        self.class_channels = class_channels
         self.sums = Sums(mi.TensorXd)
 
     @property
@@ -178,7 +193,8 @@ class Accumulator:
         width, height = self.film.crop_size()
         size = height + border, width + border
         channels = {
-            "total": 5 if mi.has_flag(self.film.flags(), mi.FilmFlags.Alpha) else 4,
+            "total": (5 if mi.has_flag(self.film.flags(), mi.FilmFlags.Alpha) else 4)
+            + self.class_channels,
             "left_out": 1,
         }
         if self.with_variance:
@@ -263,17 +279,27 @@ class Accumulator:
         inside = slice(border, -border) if border else slice(None)
         return np.array(tensor)[inside, inside]
 
-    def put(self, film, variance):
+    def put(self, film, variance, layers=()):
         """Writes the accumulated image into a film prepared with matching AOVs: with channels of
-        the `variance` or not, then those of the techniques."""
-        tensor = self.sums["total"]
+        the `variance` or not, then those of the techniques, then those of `layers`: each a tensor
+        with the block's border, or the number of a class of light."""
+        tensor = total = self.sums["total"]
+        weight, split = total[:, :, -1:], total.shape[2] - 1 - self.class_channels
+        if self.class_channels:
+            tensor = dr.concat([total[:, :, :split], weight], axis=2)
         if variance:
-            channels = self.variance_of_mean() * tensor[:, :, -1:]
+            channels = self.variance_of_mean() * weight
             tensor = dr.concat(
                 [tensor, channels[:, :, :1] if mi.is_monochromatic else channels], axis=2
             )
         if self.technique_channels:
             tensor = dr.concat([tensor, self.sums["techniques"]], axis=2)
+        for layer in layers:
+            if isinstance(layer, int):
+                channels = total[:, :, split + 3 * layer : split + 3 * layer + 3]
+            else:
+                channels = mi.TensorXd(layer) * weight  # by which the film will divide them
+            tensor = dr.concat([tensor, channels], axis=2)
         # Scaled, so that sums fit into single precision; the weights' sums are scaled alike.
         tensor = mi.TensorXf(tensor * 2.0 ** -self.iterations.bit_length())
         film.put_block(mi.ImageBlock(tensor, film.crop_offset(), film.rfilter(), border=True))

@@ -135,6 +135,26 @@ def to_numpy(vectors):
     return np.stack([np.array(component) for component in vectors])
 
 
+SIGN = 1 << 31
+"""The bit of a float that holds its sign."""
+
+
+def with_mark(value, mark):
+    """A spectrum that is nowhere negative, with a bit in the sign of its first channel."""
+    value = mi.Spectrum(value)
+    bits = float_bits(value[0]) & (SIGN - 1)
+    value[0] = bits_float(bits | dr.select(mark, mi.UInt32(SIGN), mi.UInt32(0)))
+    return value
+
+
+def read_mark(value):
+    """The spectrum and the bit that `with_mark` has put together."""
+    value = mi.Spectrum(value)
+    bits = float_bits(value[0])
+    value[0] = bits_float(bits & (SIGN - 1))
+    return value, bits >= SIGN
+
+
 class Store:
     """Arrays that a symbolic loop scatters into. A plain object, so that Dr.Jit does not take them
     for the loop's state."""

@@ -16,6 +16,8 @@ from ..core.spectra import channel_mean
 from ..core.traits import SceneTraits, lookup
 from ..lights.lights import Lights
 from ..paths.camera import film_sample_count, film_size
+from ..paths.layers import CHANNELS, SPLIT
+from ..paths.light_classes import LightClasses
 from ..paths.setting import World
 from ..photons.coverage import covered_share
 from ..photons.gather import QueryVertices, gather_photons, mean_photon_count
@@ -87,6 +89,13 @@ class BDPM(IterativeIntegrator):
        - Adds the channels ``var.R``, ``var.G``, ``var.B`` (mono: ``var.Y``): the estimated variance
          of the pixel mean over the iterations, of which there must be two at least. (Default: no,
          i.e. |false|)
+     * - aovs
+       - |string|
+       - Adds layers of what the camera sees, ``name:type`` with commas between them, as Mitsuba's
+         ``aov``: of the types ``albedo``, ``sh_normal`` (through glass and in mirrors), ``depth``,
+         ``position``, ``geo_normal``, ``uv``, ``shape_index``, ``prim_index`` (of the first
+         surface); and ``direct``, ``indirect``, ``caustic``, which sum to the image. Channels are
+         ``name.R``, ``name.X`` and so on, after all others. (Default: ``none``)
      * - max_depth
        - |int|
        - Longest path in segments, both halves together (-1: unlimited). A value of 1 shows only
@@ -127,6 +136,7 @@ class BDPM(IterativeIntegrator):
             'max_depth': 10
     """
 
+    LAYERS = *CHANNELS, *SPLIT
     survey = None
     """A `Survey`, where another session has made it already."""
 
@@ -273,6 +283,7 @@ class BDPMSession(PilotedSession):
             self.describe_light_pass(sensor, sequence, self.light_path_count, spectral),
             self.photon_capacity,
             light_state=self._light_state(spectral),
+            marked=self.integrator.splits_light,
         )
 
     def _light_state(self, spectral):
@@ -283,17 +294,25 @@ class BDPMSession(PilotedSession):
         """The weights of camera paths (a `mis.state.MergeState`); None where there are none."""
         return None
 
-    def _trace_camera(self, camera_pass, capacity, spectral, beyond=None):
-        """Traces the paths of a `CameraPass`, with room for so many vertices."""
+    def _trace_camera(self, camera_pass, capacity, spectral, beyond=None, classes=None):
+        """Traces the paths of a `CameraPass`, with room for so many vertices; `classes` as of
+        `trace_camera_paths`."""
         queries = Queries(
             self.last_vertex, capacity, self.has_caustics, self.has_indirect, self.one_vertex
         )
         return trace_camera_paths(
-            self.world, self.limits, camera_pass, queries, self._merge_state(spectral), beyond
+            self.world,
+            self.limits,
+            camera_pass,
+            queries,
+            self._merge_state(spectral),
+            beyond,
+            classes,
         )
 
     def _gather(self, photon_map, vertices, kind, radii, spectral, grey=False):
-        """What photons of one kind bring to each vertex, for each radius."""
+        """What photons of one kind bring to each vertex, for each radius (and class: see
+        `gather_photons`)."""
         return self._merge(photon_map, read_queries(vertices), kind, radii, spectral, grey)
 
     def _merge(self, photon_map, record, kind, radii, spectral, grey=False, weigh=None, scale=1):
@@ -309,6 +328,7 @@ class BDPMSession(PilotedSession):
             self.integrator.max_depth,
             weigh,
             grey,
+            self.integrator.splits_light,
         )
 
     def _covered(self, scene, tables, vertices, radius, seed):
@@ -360,26 +380,38 @@ class BDPMSession(PilotedSession):
         if beyond is not None:
             pixel = (dr.arange(mi.UInt32, self.chunk) + first) // self.camera_paths
             beyond = dr.gather(mi.Float, beyond, pixel, there)
+        classes = None
+        if self.integrator.splits_light:
+            classes = LightClasses(self.chunk, None, ("met", "next_event"))
         radiance, alpha, position, vertices, count = self._trace_camera(
-            camera_pass, self.vertex_capacity, spectral, beyond
+            camera_pass, self.vertex_capacity, spectral, beyond, classes
         )
-        if radii:
+        if classes is not None:
+            dr.eval(radiance, alpha, position, vertices, count, classes.entries)
+            classes = classes.radiance()
+        elif radii:
             dr.eval(radiance, alpha, position, vertices, count)
         for kind, radius in radii.items():
             photon_map = PhotonMap.with_grid(
                 maps[kind], self.traits.bounds, self._cell(radius), self.photon_capacity
             )
-            (gathered,) = self._gather(photon_map, vertices, kind, [radius], spectral)
+            parts = self._gather(photon_map, vertices, kind, [radius], spectral)
             if self.corrected[kind]:
-                gathered *= dr.rcp(
+                correction = dr.rcp(
                     self._covered(scene, tables, vertices, radius, sequence.own_seed())
                 )
-            gathered = self._per_path(gathered, vertices, self.chunk)
-            radiance += gathered if beyond is None else gathered * beyond
+                parts = [gathered * correction for gathered in parts]
+            for number, gathered in enumerate(parts):
+                gathered = self._per_path(gathered, vertices, self.chunk)
+                gathered = gathered if beyond is None else gathered * beyond
+                radiance += gathered
+                if classes is not None:
+                    classes[number] += gathered
         if self.integrator.hide_emitters:
             radiance = dr.select(
                 alpha > 0, radiance, 0
             )  # as `path` does: what is behind nothing but null surfaces is hidden
+            classes = classes and [dr.select(alpha > 0, light, 0) for light in classes]
         return splat_samples(
             sensor.film(),
             position,
@@ -388,6 +420,7 @@ class BDPMSession(PilotedSession):
             spectral["matrix"],
             there,
             1 if beyond is None else dr.rcp(beyond),
+            classes or (),
         ), count
 
     # ------------------------------------------------------------------ iterations

@@ -5,8 +5,9 @@ from __future__ import annotations
 
 import mitsuba as mi
 
-from ..core.traits import check_scene, has_media
+from ..core.traits import UnsupportedScene, check_scene, has_media
 from ..core.untrusted import Fields
+from ..paths.layers import CHANNELS, SPLIT, written
 from ..volume.traits import check_volume_scene
 from .choice import CANDIDATES, Decision, choose, handed_on, new_session
 from .common import IterativeIntegrator, IterativeSession
@@ -25,7 +26,7 @@ class BDPMAuto(IterativeIntegrator):
        - |int|
        - As of :monosp:`bdpm`; 0 stands for one, for ``path`` and in media for as many as keep the
          machine busy. (Default: 0)
-     * - variance, max_depth, rr_depth, hide_emitters, sampler
+     * - variance, aovs, max_depth, rr_depth, hide_emitters, sampler
        -
        - As of :monosp:`bdpm`.
 
@@ -53,10 +54,16 @@ class BDPMAuto(IterativeIntegrator):
     """
 
     CAMERA_PATHS = 0, 0, "at least 0 (0: automatic)"
+    LAYERS = *CHANNELS, *SPLIT
 
     def check(self, scene, sensor):
         if has_media(scene):
             check_volume_scene(scene, self.plugin)
+            if self.layers:
+                raise UnsupportedScene(
+                    f'{self.plugin}: parameter "aovs" = {written(self.layers)!r}: of scenes with '
+                    "media, which volpath_multiview renders, there are no layers"
+                )
         else:
             check_scene(scene, sensor, self.plugin)
 

@@ -54,8 +54,8 @@ class BDPMOpt(WeightedBDPM):
        - Light sub-paths of the pass from which the weights learn where light is; they do not
          contribute to the image. 0 stands for
          65536. (Default: 0)
-     * - photon_count, initial_radius, alpha, direct_paths, camera_paths, variance, max_depth,
-         rr_depth, hide_emitters, sampler
+     * - photon_count, initial_radius, alpha, direct_paths, camera_paths, variance, aovs,
+         max_depth, rr_depth, hide_emitters, sampler
        -
        - As of :monosp:`bdpm`.
 

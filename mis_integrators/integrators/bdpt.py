@@ -23,6 +23,8 @@ from ..lights.lights import Lights
 from ..mis.vertex_merging import ConnectionWeights
 from ..paths.camera import with_gaps
 from ..paths.connect import by_path, join, join_sensor, list_pairs, visible
+from ..paths.layers import CHANNELS, SPLIT
+from ..paths.light_classes import LightClasses, by_class, class_of
 from ..paths.sensor import Lens
 from ..paths.setting import World
 from ..paths.subpaths import Kept, read_vertices, trace_camera_subpaths, trace_light_subpaths
@@ -65,6 +67,13 @@ class BDPT(IterativeIntegrator):
        - Adds the channels ``var.R``, ``var.G``, ``var.B`` (mono: ``var.Y``): the estimated variance
          of the pixel mean over the iterations, of which there must be two at least. (Default: no,
          i.e. |false|)
+     * - aovs
+       - |string|
+       - Adds layers of what the camera sees, ``name:type`` with commas between them, as Mitsuba's
+         ``aov``: of the types ``albedo``, ``sh_normal`` (through glass and in mirrors), ``depth``,
+         ``position``, ``geo_normal``, ``uv``, ``shape_index``, ``prim_index`` (of the first
+         surface); and ``direct``, ``indirect``, ``caustic``, which sum to the image. Channels are
+         ``name.R``, ``name.X`` and so on, after all others. (Default: ``none``)
      * - max_depth
        - |int|
        - Longest path in segments, both halves together (-1: unlimited). A value of 1 shows only
@@ -103,6 +112,7 @@ class BDPT(IterativeIntegrator):
             'max_depth': 10
     """
 
+    LAYERS = *CHANNELS, *SPLIT
     techniques, technique_weights = 0, True
 
     def read_parameters(self, parameters):
@@ -119,8 +129,8 @@ class BDPT(IterativeIntegrator):
             "from 1 (balance) to 8; 2 is the power heuristic",
         )
 
-    def aov_names(self):
-        return super().aov_names() + (
+    def estimated_channels(self):
+        return super().estimated_channels() + (
             technique_channels(self.techniques, self.technique_weights) if self.techniques else []
         )
 
@@ -195,11 +205,19 @@ class BDPTSession(IterativeSession):
     def _trace_light(self, scene, sensor, tables, sequence, first, spectral):
         light_pass = self.describe_light_pass(sensor, sequence, self.light_chunk, spectral, first)
         return trace_light_subpaths(
-            self.world, self.limits, light_pass, self.weights(spectral), self.capacity["light"]
+            self.world,
+            self.limits,
+            light_pass,
+            self.weights(spectral),
+            self.capacity["light"],
+            self.integrator.splits_light,
         )
 
     def _trace_camera(self, scene, sensor, tables, sequence, first, skip, spectral):
         ledger = self._ledger() if self.integrator.techniques else None
+        classes = None
+        if self.integrator.splits_light:
+            classes = LightClasses(self.chunk, None, ("met", "next_event"))
         first = with_gaps(first, skip, self.chunk, self.camera_paths)
         radiance, alpha, position, vertices, count = trace_camera_subpaths(
             self.world,
@@ -209,8 +227,10 @@ class BDPTSession(IterativeSession):
             self.capacity["camera"],
             ledger,
             self.shortest,
+            classes,
         )
-        return radiance, alpha, position, vertices, count, ledger.entries if ledger else None
+        entries = {name: x for of in (ledger, classes) if of for name, x in of.entries.items()}
+        return radiance, alpha, position, vertices, count, entries or None
 
     def _ledger(self, entries=None):
         return Ledger(
@@ -238,9 +258,14 @@ class BDPTSession(IterativeSession):
         share = self.weights(spectral).connected(pair, z, y)
         total = mi.Spectrum(radiance)
         dr.scatter_reduce(dr.ReduceOp.Add, total, pair.value * share, z["path"], seen)
-        if entries:
+        if self.integrator.techniques:
             ledger = self._ledger(dict(entries))
             ledger.connected(z["path"], z["depth"], y["depth"], pair.value, share, seen)
+        if self.integrator.splits_light:
+            classes = LightClasses(self.chunk, entries, ("joined",))
+            number = class_of(mi.UInt32(2), y["mark"])
+            classes.add("joined", z["path"], number, pair.value * share, seen)
+            entries = classes.entries
         return total, entries
 
     def _join_sensor(self, scene, sensor, tables, light, seed, spectral):
@@ -264,6 +289,10 @@ class BDPTSession(IterativeSession):
         value = joined.value * (self.pixel_paths / self.light_path_count)
         share = self.weights(spectral).seen_by_sensor(joined, y)
         channels = list(colour_channels(value * share, spectral["matrix"]))
+        if self.integrator.splits_light:
+            smooth = dr.select(y["depth"] == 1, mi.UInt32(1), mi.UInt32(2))
+            for light in by_class(class_of(smooth, y["mark"]), value * share):
+                channels.extend(colour_channels(light, spectral["matrix"]))
         if self.integrator.techniques:
             value = value * share if self.integrator.technique_weights else value
             channels += sensor_images(
@@ -274,11 +303,14 @@ class BDPTSession(IterativeSession):
     def _splat(self, radiance, alpha, position, first, spectral, entries):
         """Block of the camera paths, and that of their techniques (or None)."""
         active, film, techniques = self.in_chunk(first), self.sensor.film(), None
-        if entries:
+        classes = ()
+        if self.integrator.splits_light:
+            classes = LightClasses(self.chunk, entries).radiance()
+        if self.integrator.techniques:
             channels = camera_images(self._ledger(entries), spectral["matrix"])
             techniques = splat_channels(film, position, channels, active)
         return splat_samples(
-            film, position, radiance, alpha, spectral["matrix"], active
+            film, position, radiance, alpha, spectral["matrix"], active, classes=classes
         ), techniques
 
     # ------------------------------------------------------------------ iterations
@@ -318,8 +350,8 @@ class BDPTSession(IterativeSession):
             radiance, entries = self._connection_pass(
                 self.scene, self._tables, radiance, camera, light[0], pairs, spectral, entries
             )
-            radiance = self._merge(radiance, camera, count, light, spectral)
-            dr.eval(radiance)  # else its sums may still wait when the film's are made
+            radiance, entries = self._merge(radiance, camera, count, light, spectral, entries)
+            dr.eval(radiance, entries)  # else its sums may still wait when the film's are made
             if self.lens:
                 lit = self._sensor_pass(
                     self.scene,
@@ -331,17 +363,19 @@ class BDPTSession(IterativeSession):
                 )
         return *self._splat(radiance, alpha, position, first, spectral, entries), lit
 
-    def _merge(self, radiance, camera, count, light, spectral):
-        """Radiance of camera paths with that of merges added (none here)."""
-        return radiance
+    def _merge(self, radiance, camera, count, light, spectral, entries):
+        """Radiance of camera paths, and the entries of its classes, with that of merges added (none
+        here)."""
+        return radiance, entries
 
     def _run(self, iteration):
         spectral = self._spectral(iteration)
         block, techniques, light = self.sum_of_chunks(partial(self._chunk, iteration, spectral))
         if light is not None:
             light = as_camera_weights(light, block, self.expected_weight)
-            block = with_colour(block, light[:, :, :3])
-            techniques = None if techniques is None else techniques + light[:, :, 3:]
+            colours = 3 + self.accumulator.class_channels
+            block = with_colour(block, light[:, :, :colours])
+            techniques = None if techniques is None else techniques + light[:, :, colours:]
         if techniques is not None:
             techniques = (
                 with_rest(techniques, block) if self.integrator.technique_weights else techniques

@@ -15,7 +15,7 @@ class PCBPT(ResampledIntegrator):
     .. pluginparameters::
 
      * - light_paths, resamples, cache_neighbors, target, light_tracing, camera_paths, variance,
-         max_depth, rr_depth, hide_emitters, sampler
+         aovs, max_depth, rr_depth, hide_emitters, sampler
        -
        - As of :monosp:`bdpt_ris`.
 
@@ -77,6 +77,13 @@ class BDPTRIS(ResampledIntegrator):
        - Adds the channels ``var.R``, ``var.G``, ``var.B`` (mono: ``var.Y``): the estimated variance
          of the pixel mean over the iterations, of which there must be two at least. (Default: no,
          i.e. |false|)
+     * - aovs
+       - |string|
+       - Adds layers of what the camera sees, ``name:type`` with commas between them, as Mitsuba's
+         ``aov``: of the types ``albedo``, ``sh_normal`` (through glass and in mirrors), ``depth``,
+         ``position``, ``geo_normal``, ``uv``, ``shape_index``, ``prim_index`` (of the first
+         surface); and ``direct``, ``indirect``, ``caustic``, which sum to the image. Channels are
+         ``name.R``, ``name.X`` and so on, after all others. (Default: ``none``)
      * - max_depth
        - |int|
        - Longest path in segments (-1: unlimited). A value of 1 shows only directly visible

@@ -19,6 +19,7 @@ import numpy as np
 from ..core.recording import lanes
 from ..core.spectra import channel_mean
 from ..core.stratified_variance import contrasts, extrapolated
+from ..paths.layers import written
 from ..paths.path_length_statistics import mean_segments
 from ..pilot.noise import relative_weights, trimmed_mean
 from ..pilot.run import FEWEST_ITERATIONS
@@ -95,7 +96,7 @@ class Trial:
 
 
 def handed_on(integrator):
-    """The parameters that every integrator of this package shares."""
+    """The parameters that every integrator of this package shares, that of media among them."""
     return {
         name: getattr(integrator, name)
         for name in (
@@ -121,15 +122,18 @@ def choose(integrator, scene, sensor, seed, iterations, seconds):
     path = PathSession(integrator, scene, sensor, seed, iterations)
     plugin, parameters = FIRST
     first = new_session(plugin, parameters, integrator, scene, sensor, seed, iterations)
+    split = integrator.splits_light
     if not first.kinds():
-        return Decision("path", {}, path, [_no_photons(integrator, first)])
+        chosen = (plugin, parameters, first) if split else ("path", {}, path)
+        reason = _no_photons(integrator, first)
+        return Decision(*chosen, [f"{name_of(*chosen[:2])}: {reason}"])
     first.plan_time(seconds, began)
     first.start()
     prediction = first.prediction
     if prediction is None:
-        return Decision(
-            "path", {}, path, ["path: no camera path meets a surface that scatters smoothly"]
-        )
+        chosen = (plugin, parameters, first) if split else ("path", {}, path)
+        reason = "no camera path meets a surface that scatters smoothly"
+        return Decision(*chosen, [f"{name_of(*chosen[:2])}: {reason}"])
     first_seconds = time.perf_counter() - began
 
     pixels = prediction.pixels
@@ -145,7 +149,8 @@ def choose(integrator, scene, sensor, seed, iterations, seconds):
     trials, reasons = [_trial(plugin, parameters, first, segments)], []
     spent, usual = _pilot_cost(first, segments), trials[0].cost
     budget = (prediction.iterations if seconds else iterations or UNPLANNED_ITERATIONS) * usual
-    blind = _why_not_path(first, prediction)
+    blind = "not path: it does not split the light" if split else None
+    blind = blind or _why_not_path(first, prediction)
     if blind:
         reasons.append(blind)
     else:
@@ -229,7 +234,11 @@ def new_session(plugin, parameters, integrator, scene, sensor, seed, iterations,
     `BDPM`."""
     if plugin == "path":
         return PathSession(integrator, scene, sensor, seed, iterations)
-    shared = {**handed_on(integrator), "camera_paths": integrator.initial_camera_paths}
+    shared = {
+        **handed_on(integrator),
+        "camera_paths": integrator.initial_camera_paths,
+        "aovs": written(integrator.layers),
+    }
     made = mi.load_dict({"type": plugin, **shared, **parameters})
     made.survey = survey
     return made.new_session(scene, sensor, seed, iterations)
@@ -237,8 +246,8 @@ def new_session(plugin, parameters, integrator, scene, sensor, seed, iterations,
 
 def _no_photons(integrator, session):
     if session.lights.dark:
-        return "path: the scene has no light"
-    return f"path: light of at most {integrator.max_depth} segments needs no photons"
+        return "the scene has no light"
+    return f"light of at most {integrator.max_depth} segments needs no photons"
 
 
 def _why_not_path(session, prediction):

@@ -3,6 +3,7 @@ at the end."""
 
 from __future__ import annotations
 
+import functools
 import math
 
 import drjit as dr
@@ -18,6 +19,8 @@ from ..core.sequences import SampleSequence
 from ..core.traits import UnsupportedScene, check_film, check_scene, check_variant, unfinite_data
 from ..core.untrusted import Fields
 from ..paths.camera import film_sample_count, with_gaps
+from ..paths.layers import CHANNELS, channel_names, render_layers, written
+from ..paths.light_classes import CLASSES
 from ..paths.setting import CameraPass, LightPass, Limits
 from ..pilot.run import PILOT_INDEX
 from .parameters import Parameters
@@ -43,6 +46,8 @@ class IterativeIntegrator(mi.AdjointIntegrator):
     CAMERA_PATHS = 1, 1, "at least 1"
     """Default, least value and range in words of the parameter `camera_paths`; 0 stands for as many
     as the session finds worth while."""
+    LAYERS = tuple(CHANNELS)
+    """Types of layers that the parameter `aovs` may ask for."""
 
     def __init__(self, props):
         parameters = Parameters(props)
@@ -54,12 +59,23 @@ class IterativeIntegrator(mi.AdjointIntegrator):
         self.variance = parameters.boolean("variance", False)
         self.sampler = parameters.choice("sampler", SAMPLERS[0], SAMPLERS)
         self.warned_of_sampler = False
+        self.layers = self.read_layers(parameters)
         self.read_parameters(parameters)
+        parameters.check_channels(self.layers, self.estimated_channels())
         parameters.finish()
         super().__init__(props)
 
     def read_parameters(self, parameters):
         """Reads the subclass's own parameters (there need not be any)."""
+
+    def read_layers(self, parameters):
+        """The layers (`paths.layers.Layer`) that the parameter `aovs` asks for."""
+        return parameters.layers("aovs", self.LAYERS)
+
+    @property
+    def splits_light(self):
+        """Whether layers ask for classes of light (`paths.light_classes`)."""
+        return any(layer.type in CLASSES for layer in self.layers)
 
     def new_session(self, scene, sensor, seed, iterations):
         """The object that runs iterations; see `mis_integrators.core.session.Session`. Every
@@ -70,8 +86,12 @@ class IterativeIntegrator(mi.AdjointIntegrator):
         """Raises `UnsupportedScene` for a scene that this integrator cannot render."""
         check_scene(scene, sensor, self.plugin)
 
-    def aov_names(self):
+    def estimated_channels(self):
+        """Names of the channels beside the image's that iterations are summed for."""
         return variance_channels() if self.variance else []
+
+    def aov_names(self):
+        return [*self.estimated_channels(), *channel_names(self.layers)]
 
     def to_string(self):
         lines = ",\n".join(f"  {name} = {value}" for name, value in self.settings().items())
@@ -96,6 +116,7 @@ class IterativeIntegrator(mi.AdjointIntegrator):
             "hide_emitters": self.hide_emitters,
             "camera_paths": self.camera_paths,
             "variance": self.variance,
+            "aovs": written(self.layers),
             "sampler": self.sampler,
         }
 
@@ -216,7 +237,8 @@ class IterativeIntegrator(mi.AdjointIntegrator):
 
 class IterativeSession:
     """Runs iterations and accumulates them; a subclass implements `_iteration(index) -> block
-    tensor`.
+    tensor`. (Where light is split, the block has three channels for each of
+    `light_classes.CLASSES` before its last one.)
 
     `seed` is an integer; iteration `i` draws all its random numbers from (seed, i), so any subset
     of the iterations can be rendered anywhere. They are independent, or parts of sequences
@@ -229,7 +251,10 @@ class IterativeSession:
         self.iterations_planned = iterations
         self.camera_paths = integrator.initial_camera_paths
         self.accumulator = Accumulator(
-            sensor.film(), integrator.variance, stratified=integrator.low_discrepancy
+            sensor.film(),
+            integrator.variance,
+            stratified=integrator.low_discrepancy,
+            class_channels=3 * len(CLASSES) if integrator.splits_light else 0,
         )
         self.variant = mi.variant()
         settle(scene)
@@ -444,7 +469,24 @@ class IterativeSession:
 
     def fill_film(self):
         """Hands what has been rendered so far to the sensor's film, ready to develop."""
-        self.accumulator.put(self._emptied(self.sensor.film()), self.integrator.variance)
+        layers = [
+            CLASSES.index(layer.type) if layer.type in CLASSES else self._layers[layer.name]
+            for layer in self.integrator.layers
+        ]
+        film = self._emptied(self.sensor.film())
+        self.accumulator.put(film, self.integrator.variance, layers)
+
+    SURFACES = 6
+    """Purpose of the random seed of layers of surfaces."""
+
+    @functools.cached_property
+    def _layers(self):
+        """The layers of surfaces by name, made when the image is first looked at."""
+        layers = [layer for layer in self.integrator.layers if layer.type not in CLASSES]
+        with dr.suspend_grad():
+            seed = mix(self.seed, RENDER, self.SURFACES)
+            rendered = render_layers(self.scene, self.sensor, layers, seed)
+        return {layer.name: tensor for layer, tensor in zip(layers, rendered)}
 
     def _emptied(self, film):
         """The film, empty, with all channels."""

@@ -14,6 +14,7 @@ from ..core.packing import from_numpy
 from ..core.sequences import SampleSequence
 from ..core.spectra import channel_mean
 from ..paths.camera import film_sample_count, film_size
+from ..paths.light_classes import by_class, class_of
 from ..paths.setting import ListedPass
 from ..photons.queries import Queries, trace_camera_paths
 from ..pilot.cost import USUAL_PHOTONS
@@ -213,6 +214,9 @@ class DirectLight:
     def _block(self, scene, sensor, tables, sequence, done, part, spectral, beyond):
         radiance, alpha, position, there = self._trace(sensor, sequence, done, part, spectral)
         weight = dr.rcp(dr.gather(mi.Float, beyond, part[0], there))
+        classes = ()
+        if self.session.integrator.splits_light:
+            classes = by_class(class_of(mi.UInt32(1), mi.Bool(False)), radiance)  # all is direct
         return splat_samples(
-            sensor.film(), position, radiance, alpha, spectral["matrix"], there, weight
+            sensor.film(), position, radiance, alpha, spectral["matrix"], there, weight, classes
         )

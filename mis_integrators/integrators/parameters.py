@@ -3,6 +3,8 @@ sampling."""
 
 from __future__ import annotations
 
+from ..paths.layers import channel_names, parse_layers
+
 REFUSED = {
     "samples_per_pass": 'iterations are passes already; use "camera_paths" and spp',
     "timeout": 'use "mis-render --time SECONDS"',
@@ -28,10 +30,7 @@ class Parameters:
         self.plugin = props.plugin_name()
         self.known = []
         for name, advice in REFUSED.items():
-            if name in props:
-                raise ParameterError(
-                    f'{self.plugin}: parameter "{name}" is not supported: {advice}'
-                )
+            self.refuse(name, advice)
 
     def _fail(self, name, value, allowed):
         raise ParameterError(
@@ -76,6 +75,33 @@ class Parameters:
         if value not in allowed:
             self._fail(name, value, " or ".join(f'"{word}"' for word in allowed))
         return value
+
+    def layers(self, name, types):
+        """The layers (`paths.layers.Layer`) of some `types` that a text asks for."""
+        text = self._get(name, "")
+        try:
+            return parse_layers(text if type(text) is str else repr(text), types)
+        except ValueError as error:
+            self._fail(
+                name,
+                text,
+                f'pairs "name:type" with commas between them, types being {", ".join(types)}; '
+                f"{error}",
+            )
+
+    def refuse(self, name, reason):
+        """Refuses a parameter that other plugins have."""
+        if name in self.props:
+            raise ParameterError(f'{self.plugin}: parameter "{name}" is not supported: {reason}')
+
+    def check_channels(self, layers, others):
+        """Refuses layers whose channels are called like `others`."""
+        for channel in channel_names(layers):
+            if channel in others:
+                raise ParameterError(
+                    f'{self.plugin}: parameter "aovs": the channel "{channel}" is there already; '
+                    "choose another name"
+                )
 
     def finish(self):
         """Refuses whatever was given but not asked for."""

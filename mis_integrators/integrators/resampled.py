@@ -31,10 +31,18 @@ from ..mis.resampling import (
 from ..paths.camera import with_gaps
 from ..paths.camera_vertices import STEP, LightEnd, hit_layout, sum_before, trace_camera_vertices
 from ..paths.connect import join_sensor
+from ..paths.layers import CHANNELS, SPLIT
+from ..paths.light_classes import LightClasses, by_class, class_of
 from ..paths.light_starts import sample_light_starts
 from ..paths.sensor import Lens
 from ..paths.setting import World
-from ..paths.subpaths import read_vertices, seen_normal, trace_light_subpaths, vertex_bsdf_of
+from ..paths.subpaths import (
+    NO_PARENT,
+    read_vertices,
+    seen_normal,
+    trace_light_subpaths,
+    vertex_bsdf_of,
+)
 from ..paths.vertex import scattered_mean
 from ..resampling.cache_points import CacheGrid
 from ..resampling.light_vertices import END, LightVertices, list_light_vertices
@@ -65,6 +73,7 @@ class ResampledIntegrator(IterativeIntegrator):
     """Parameters of both plugins; `aware` tells them apart."""
 
     CAMERA_PATHS = 4, 1, "at least 1"
+    LAYERS = *CHANNELS, *SPLIT
     aware = True
 
     def read_parameters(self, parameters):
@@ -192,7 +201,12 @@ class ResampledSession(IterativeSession):
     def _trace_light(self, scene, sensor, tables, sequence, first, spectral):
         light_pass = self.describe_light_pass(sensor, sequence, self.light_chunk, spectral, first)
         return trace_light_subpaths(
-            self.world, self.limits, light_pass, self.weights(), self.capacity["light"]
+            self.world,
+            self.limits,
+            light_pass,
+            self.weights(),
+            self.capacity["light"],
+            self.integrator.splits_light,
         )
 
     def _trace_camera(self, scene, sensor, tables, sequence, first, skip, spectral):
@@ -319,7 +333,8 @@ class ResampledSession(IterativeSession):
         spectral,
     ):
         """Radiance of camera paths with that of connections of their `count` vertices to drawn
-        light sub-paths added. `proposals`: as of `_proposals`."""
+        light sub-paths added, and the entries of its classes (None where light is not split).
+        `proposals`: as of `_proposals`."""
         light, starts, places, found, pmfs = proposals
         integrator, weights = self.integrator, self.weights()
         ends = self._ends(starts, light, places, found)
@@ -363,7 +378,13 @@ class ResampledSession(IterativeSession):
         )
         total = radiance + dr.zeros(mi.Spectrum, self.chunk)  # radiance may be a single zero
         dr.scatter_reduce(dr.ReduceOp.Add, total, estimate, z["path"], active)
-        return total
+        if not self.integrator.splits_light:
+            return total, None
+        classes = LightClasses(self.chunk, None, ("joined",))
+        alone = (sent.vertices == 1) & (z["parent"] == NO_PARENT)
+        number = class_of(dr.select(alone, mi.UInt32(1), mi.UInt32(2)), sent.mark)
+        classes.add("joined", z["path"], number, estimate, active)
+        return total, classes.entries
 
     def _share(self, weights, camera, z, sent, value, forward, back, segments, active):
         """Weight w_t of a connection among all techniques of its joint path."""
@@ -385,19 +406,31 @@ class ResampledSession(IterativeSession):
         nearer = sum_before(camera, z, z["parent"], end, weights, active)
         return own * dr.rcp(dr.maximum(own + forward * cosine * sent.mis_sum + nearer, 1e-20))
 
-    def _meet(self, tables, radiance, camera, hits, hit_count):
+    def _meet(self, tables, radiance, camera, hits, hit_count, entries):
         """Radiance of camera paths with that of emission that they meet beyond the first vertex
-        added."""
+        added, and the entries of its classes."""
         index = lanes(self.capacity["hits"])
         active = index < dr.gather(mi.UInt32, hit_count, 0)
         hit = hit_layout().read(hits, index, active)
         end = LightEnd(hit["start"], hit["light_mean"], mi.Float(1), hit["across"], hit["depth"])
         nearer = sum_before(camera, hit, hit["parent"], end, self.weights(), active)
         total = radiance + dr.zeros(mi.Spectrum, self.chunk)  # radiance may be a single zero
-        dr.scatter_reduce(
-            dr.ReduceOp.Add, total, hit["value"] * dr.rcp(1 + nearer), hit["path"], active
-        )
-        return total
+        value = hit["value"] * dr.rcp(1 + nearer)
+        dr.scatter_reduce(dr.ReduceOp.Add, total, value, hit["path"], active)
+        if not self.integrator.splits_light:
+            return total, None
+        classes = LightClasses(self.chunk, entries, ("met",))
+        classes.add("met", hit["path"], self._class_of_hit(hit, camera, active), value, active)
+        return total, classes.entries
+
+    @staticmethod
+    def _class_of_hit(hit, camera, active):
+        """The class of emission that is met: by the parents, which have scattered smoothly, and by
+        the density of the last direction, none after a delta function."""
+        scattered = hit["parent"] != NO_PARENT
+        before = dr.gather(mi.UInt32, camera["parent"], hit["parent"], active & scattered)
+        later = dr.select(before == NO_PARENT, mi.UInt32(1), mi.UInt32(2))
+        return class_of(dr.select(scattered, later, 0), hit["d_vcm"] == 0)
 
     def _join_sensor(self, scene, sensor, tables, light, count, seed, spectral):
         """As `_meet_sensor`."""
@@ -420,12 +453,12 @@ class ResampledSession(IterativeSession):
             active,
         )
         value = joined.value * (self.weights().seen_by_sensor(joined, y) / self.ratio)
-        return splat_channels(
-            sensor.film(),
-            joined.film,
-            colour_channels(value, spectral["matrix"]),
-            joined.active,
-        )
+        channels = list(colour_channels(value, spectral["matrix"]))
+        if self.integrator.splits_light:
+            smooth = dr.select(y["depth"] == 1, mi.UInt32(1), mi.UInt32(2))
+            for part in by_class(class_of(smooth, y["mark"]), value):
+                channels.extend(colour_channels(part, spectral["matrix"]))
+        return splat_channels(sensor.film(), joined.film, channels, joined.active)
 
     # ------------------------------------------------------------------ before the first iteration
 
@@ -584,9 +617,9 @@ class ResampledSession(IterativeSession):
 
     def _radiance(self, iteration, chunk, traced, proposals, spectral):
         """Radiance of camera paths (`trace_camera_vertices`) with everything that they meet and are
-        connected to."""
+        connected to, and by class what was added (None where light is not split)."""
         radiance, _, _, camera, count, hits, hit_count = traced
-        radiance = self._connection_pass(
+        radiance, entries = self._connection_pass(
             self.scene,
             self.sensor,
             self._tables,
@@ -598,13 +631,13 @@ class ResampledSession(IterativeSession):
             dr.opaque(mi.UInt32, chunk * self.chunk),
             spectral,
         )
-        radiance = self._hit_pass(self._tables, radiance, camera, hits, hit_count)
-        dr.eval(radiance)  # else its sums may still wait when the film's are made
-        return radiance
+        radiance, entries = self._hit_pass(self._tables, radiance, camera, hits, hit_count, entries)
+        dr.eval(radiance, entries)  # else its sums may still wait when the film's are made
+        return radiance, entries
 
     def _meet_sensor(self, light, seed, spectral):
         """Block of the light sub-paths (`trace_light_subpaths`) that meet the sensor: three
-        channels."""
+        channels, and three for each class."""
         vertices, found, _ = light
         return self._sensor_pass(
             self.scene, self.sensor, self._tables, vertices, found, seed, spectral
@@ -615,9 +648,10 @@ class ResampledSession(IterativeSession):
         sensor (or None). `light`: the first part's light sub-paths."""
         traced = self._camera(iteration, chunk, spectral)
         radiance, alpha, position, *_ = traced
-        block = None
+        block = entries = None
+        seen = radiance  # emission that the camera's rays meet at once
         if self.lit:
-            radiance = self._radiance(iteration, chunk, traced, proposals, spectral)
+            radiance, entries = self._radiance(iteration, chunk, traced, proposals, spectral)
             for part in (
                 range(chunk * self.light_rounds, (chunk + 1) * self.light_rounds)
                 if self.lens
@@ -633,6 +667,12 @@ class ResampledSession(IterativeSession):
             radiance = dr.select(
                 alpha > 0, radiance, 0
             )  # as `path` does: what is behind nothing but null surfaces is hidden
+        classes = ()
+        if self.integrator.splits_light:
+            classes = LightClasses(self.chunk, entries).radiance()
+            classes[0] += seen
+            if self.integrator.hide_emitters:
+                classes = [dr.select(alpha > 0, light, 0) for light in classes]
         return splat_samples(
             self.sensor.film(),
             position,
@@ -640,6 +680,7 @@ class ResampledSession(IterativeSession):
             alpha,
             spectral["matrix"],
             self.in_chunk(*self.all_over_the_film(chunk)),
+            classes=classes,
         ), block
 
     def start(self):

@@ -10,6 +10,7 @@ from ..core.packing import to_numpy
 from ..core.recording import lanes
 from ..core.untrusted import Fields
 from ..mis.vertex_merging import ConnectionWeights
+from ..paths.light_classes import CLASSES, LightClasses
 from ..paths.subpaths import read_vertices
 from ..photons.gather import KeptVertices, gather_photons
 from ..photons.grid import smallest_cell
@@ -47,7 +48,7 @@ class VCM(BDPT):
        - |float|
        - Radius reduction of progressive photon mapping, in (0, 1]: iteration i uses R_i^2 = R_0^2
          (i + 1)^(alpha - 1). 1 keeps the radius. (Default: 1)
-     * - camera_paths, variance, max_depth, rr_depth, hide_emitters, sampler
+     * - camera_paths, variance, aovs, max_depth, rr_depth, hide_emitters, sampler
        -
        - As of :monosp:`bdpt`.
 
@@ -166,7 +167,7 @@ class VCMSession(BDPTSession):
         eta = dr.pi * dr.square(spectral["radius"]) * self.light_chunk
         return ConnectionWeights(self.lights, plain.beta, plain.ratio, eta)
 
-    def _merge_vertices(self, scene, tables, radiance, camera, count, light, spectral):
+    def _merge_vertices(self, scene, tables, radiance, camera, count, light, spectral, entries):
         vertices, light_count, _ = light
         cell = dr.maximum(
             spectral["radius"],
@@ -183,17 +184,26 @@ class VCMSession(BDPTSession):
         def weigh(index, f, p, back, active):
             return weights.merged(z, state_of(photon_map, index, active), p, back())
 
-        (merged,) = gather_photons(
+        parts = gather_photons(
             photon_map,
             KeptVertices(self.traits, z, spectral["wavelengths"], active),
             [spectral["radius"]],
             self.light_chunk,
             self.integrator.max_depth,
             weigh,
+            marked=self.integrator.splits_light,
         )
-        total = mi.Spectrum(radiance)
-        dr.scatter_reduce(dr.ReduceOp.Add, total, merged, z["path"], active)
-        return total
+        total, (merged, *others) = mi.Spectrum(radiance), parts
+        dr.scatter_reduce(dr.ReduceOp.Add, total, sum(others, merged), z["path"], active)
+        if self.integrator.splits_light:
+            names = [f"merged.{name}" for name in CLASSES]
+            classes = LightClasses(self.chunk, entries, names)
+            for number, (name, merged) in enumerate(zip(names, parts)):
+                classes.add(name, z["path"], mi.UInt32(number), merged, active)
+            entries = classes.entries
+        return total, entries
 
-    def _merge(self, radiance, camera, count, light, spectral):
-        return self._merge_pass(self.scene, self._tables, radiance, camera, count, light, spectral)
+    def _merge(self, radiance, camera, count, light, spectral, entries):
+        return self._merge_pass(
+            self.scene, self._tables, radiance, camera, count, light, spectral, entries
+        )

@@ -119,9 +119,15 @@ class VolpathMultiview(IterativeIntegrator):
         self.weights = parameters.choice("weights", "mis", HEURISTICS)
         self.add_nulls = parameters.boolean("add_nulls", True)
 
+    def read_layers(self, parameters):
+        parameters.refuse("aovs", "of media and of several views there are no layers")
+        return ()
+
     def settings(self):
+        settings = super().settings()
+        del settings["aovs"]
         return {
-            **super().settings(),
+            **settings,
             "shift": self.shift,
             "weights": self.weights,
             "add_nulls": self.add_nulls,

@@ -129,11 +129,12 @@ class WeightedSession(BDPMSession):
         integrator = self.integrator
         width = query_layout().capacity(vertices["words"])
         section = width // (integrator.first_vertex + integrator.strategies)
-        totals = [dr.zeros(mi.Float if grey else mi.Spectrum, width) for _ in radii]
+        totals = None
         for level in range(integrator.strategies):
             first = (level + integrator.first_vertex) * section
             record = read_queries(vertices, first, section)
             merged = self._merge_weighted(photon_map, record, kind, level, radii, spectral, grey)
+            totals = totals or [dr.zeros(type(values), width) for values in merged]
             for total, values in zip(totals, merged):
                 dr.scatter(total, values, dr.arange(mi.UInt32, section) + first)
         dr.eval(totals)

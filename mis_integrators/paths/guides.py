@@ -47,6 +47,26 @@ def first_smooth_surface(scene, camera_pass):
     return albedo, normal
 
 
+def camera_passes(sensor, samples: int, seed=0):
+    """Passes of one camera path a pixel each, `samples` of them: parts of one sequence, each with
+    wavelengths of its own. `seed`: an integer."""
+    for number in range(samples):
+        sequence = SampleSequence(
+            dr.opaque(mi.UInt32, seed), dr.opaque(mi.UInt32, number), 1, low_discrepancy=True
+        )
+        wavelength = dr.opaque(mi.Float, reversed_bits(number) / 2**32)
+        yield CameraPass(
+            sensor, None, sequence, mi.UInt32(0), film_sample_count(sensor), 1, wavelength
+        )
+
+
+def displayed_albedo(albedo):
+    """Three channels of an albedo, grey in mono and spectral variants."""
+    if mi.is_spectral or mi.is_monochromatic:
+        return mi.Color3f(channel_mean(albedo))
+    return albedo
+
+
 def albedo_and_normal(scene, sensor, samples: int = SAMPLES) -> tuple[np.ndarray, np.ndarray]:
     """Guides for a denoiser: the means over camera paths of `first_smooth_surface`, under a box
     filter.
@@ -54,17 +74,10 @@ def albedo_and_normal(scene, sensor, samples: int = SAMPLES) -> tuple[np.ndarray
     Returns two float32 arrays (height, width, 3) of the film's crop window: albedo in [0, 1] (grey
     in mono and spectral variants), and normal in world space.
     """
-    count = film_sample_count(sensor)
-    total = np.zeros((6, count))
-    for number in range(samples):
-        sequence = SampleSequence(
-            dr.opaque(mi.UInt32, 0), dr.opaque(mi.UInt32, number), 1, low_discrepancy=True
-        )
-        wavelength = dr.opaque(mi.Float, reversed_bits(number) / 2**32)
-        camera_pass = CameraPass(sensor, None, sequence, mi.UInt32(0), count, 1, wavelength)
+    total = np.zeros((6, film_sample_count(sensor)))
+    for camera_pass in camera_passes(sensor, samples):
         albedo, normal = first_smooth_surface(scene, camera_pass)
-        if mi.is_spectral or mi.is_monochromatic:
-            albedo = mi.Color3f(channel_mean(albedo))
+        albedo = displayed_albedo(albedo)
         dr.eval(albedo, normal)
         found = np.concatenate([np.array(albedo), np.array(normal)])
         total += np.where(np.isfinite(found), found, 0)

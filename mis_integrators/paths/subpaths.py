@@ -20,6 +20,7 @@ from ..core.packing import Store
 from ..core.records import Layout
 from .camera import trace_camera, within_crop
 from .light import trace_light
+from .light_classes import class_of, scattered_history, start_of_camera_path
 from .sensor import Lens
 from .setting import CameraPass, LightPass, Limits, World
 from .vertex import VertexBSDF, scattered_mean
@@ -68,21 +69,27 @@ class Kept:
     capacity: int
 
 
-def new_vertices(traits, capacity, states=STATES):
+def new_vertices(traits, capacity, states=STATES, marked=False):
     """Room for `capacity` vertices, a dictionary: `words` (records of `vertex_layout`), `parent`
     (the place of the vertex before, or `NO_PARENT`), and where surfaces are not all Lambertian
     `hit` (records of `hit_record`), from which the surface interaction is made again. Only the
-    places below the count are valid."""
+    places below the count are valid.
+
+    If they are `marked`, for the classes of light, also `mark`: of light sub-paths whether what
+    they met first scattered by a delta function, of camera sub-paths whether they have scattered
+    smoothly nowhere before."""
     buffer = {
         "words": vertex_layout(states).room(capacity),
         "parent": dr.empty(mi.UInt32, capacity),
     }
     if traits.has_rough:
         buffer["hit"] = hit_record().room(capacity)
+    if marked:
+        buffer["mark"] = dr.zeros(mi.Bool, capacity)
     return buffer
 
 
-def keep_vertex(store, at, throughput, number, parent, state, keep):
+def keep_vertex(store, at, throughput, number, parent, state, keep, mark=None):
     """Writes the vertex at which sub-paths have arrived into the buffer; returns the place (valid
     if there was room for it).
 
@@ -107,6 +114,8 @@ def keep_vertex(store, at, throughput, number, parent, state, keep):
     dr.scatter(store.vertices["parent"], parent, slot, keep)
     if "hit" in store.vertices:
         hit_record().write(store.vertices["hit"], {"hit": at.hit}, slot, keep)
+    if mark is not None:
+        dr.scatter(store.vertices["mark"], mark, slot, keep)
     return slot
 
 
@@ -116,6 +125,8 @@ def read_vertices(vertices, index, active, only=None, states=STATES):
     record = vertex_layout(states).read(vertices["words"], index, active, only)
     if "parent" in vertices and (only is None or "parent" in only):
         record["parent"] = dr.gather(mi.UInt32, vertices["parent"], index, active)
+    if "mark" in vertices and (only is None or "mark" in only):
+        record["mark"] = dr.gather(mi.Bool, vertices["mark"], index, active)
     if "hit" in vertices and (only is None or "hit" in only):
         record |= hit_record().read(vertices["hit"], index, active)
     return record
@@ -152,14 +163,14 @@ class VertexVisitor:
     """Keeps the smooth vertices of light sub-paths (a `LightVisitor`).
 
     Its state: how many vertices a sub-path has kept, the place of the last one, the density of its
-    direction (per solid angle; zero after a delta function), the last surface's point, and the
-    state of `weights`.
+    direction (per solid angle; zero after a delta function), the last surface's point, the state of
+    `weights`, and if vertices are `marked` their mark.
     """
 
-    def __init__(self, traits, weights, n_paths, capacity):
-        self.traits, self.weights = traits, weights
+    def __init__(self, traits, weights, n_paths, capacity, marked):
+        self.traits, self.weights, self.marked = traits, weights, marked
         self.store = Store(
-            vertices=new_vertices(traits, capacity, weights.states),
+            vertices=new_vertices(traits, capacity, weights.states, marked),
             room=dr.opaque(mi.UInt32, capacity),
             count=dr.zeros(mi.UInt32, 1),
             lengths=dr.zeros(mi.UInt32, n_paths),
@@ -168,14 +179,17 @@ class VertexVisitor:
     def blank(self, lanes):
         number, parent = dr.zeros(mi.UInt32, lanes), dr.full(mi.UInt32, NO_PARENT, lanes)
         density, origin = dr.zeros(mi.Float, lanes), dr.zeros(mi.Point3f, lanes)
-        return [number, parent, density, origin, self.weights.blank(lanes)]
+        return [number, parent, density, origin, self.weights.blank(lanes), self._unmarked()]
+
+    def _unmarked(self):
+        return [mi.Bool(False)] if self.marked else []
 
     def begin(self, state):
-        _, _, density, origin, sums = state
-        return [mi.UInt32(0), mi.UInt32(NO_PARENT), density, origin, sums]
+        _, _, density, origin, sums, _ = state
+        return [mi.UInt32(0), mi.UInt32(NO_PARENT), density, origin, sums, self._unmarked()]
 
     def arrive(self, state, at, active):
-        number, parent, density, origin, sums = state
+        number, parent, density, origin, sums, mark = state
         si, weights = at.si, self.weights
         first = active & at.first
         squared = dr.maximum(dr.squared_norm(si.p - origin), 1e-20)
@@ -188,32 +202,38 @@ class VertexVisitor:
         smooth = active & mi.has_flag(at.bsdf.flags(), mi.BSDFFlags.Smooth)
         at.vertex_bsdf = VertexBSDF.at(self.traits, si, at.bsdf, smooth)
         slot = keep_vertex(
-            self.store, at, at.flux, number, parent, dict(zip(weights.states, sums)), smooth
+            self.store, at, at.flux, number, parent, dict(zip(weights.states, sums)), smooth, *mark
         )
         number = dr.select(smooth, number + 1, number)
         dr.scatter(self.store.lengths, number, at.path, smooth)
-        return [number, dr.select(smooth, slot, parent), density, origin, sums]
+        return [number, dr.select(smooth, slot, parent), density, origin, sums, mark]
 
     def leave(self, state, at, wo, delta, active):
-        number, parent, _, _, sums = state
+        number, parent, _, _, sums, mark = state
         si, away = at.si, at.si.to_world(wo)
         value, p_back, p_forward = at.vertex_bsdf.f_and_pdfs(away, at.towards, active & ~delta)
         mean = scattered_mean(value, si.n, at.towards)
         sums = _either(active, self.weights.scatter(sums, p_forward, p_back, delta, mean), sums)
         density = dr.select(delta, 0, p_forward * dr.abs(dr.dot(si.n, away)))
-        return [number, parent, density, mi.Point3f(si.p), sums]
+        mark = [dr.select(at.first, delta, before) for before in mark]
+        return [number, parent, density, mi.Point3f(si.p), sums, mark]
 
 
 def trace_light_subpaths(
-    world: World, limits: Limits, light_pass: LightPass, weights, capacity: int
+    world: World,
+    limits: Limits,
+    light_pass: LightPass,
+    weights,
+    capacity: int,
+    marked: bool = False,
 ):
     """Traces the light sub-paths of a pass.
 
     Returns `(vertices, count, lengths)`: the kept vertices, how many there were (width one; more
     than `capacity`: the surplus is missing), and the number of kept vertices of each path.
-    `throughput` is flux through the surface, for one sub-path.
+    `throughput` is flux through the surface, for one sub-path. `marked`: as of `new_vertices`.
     """
-    visitor = VertexVisitor(world.traits, weights, light_pass.count, capacity)
+    visitor = VertexVisitor(world.traits, weights, light_pass.count, capacity, marked)
     trace_light(world, limits, light_pass, visitor)
     store = visitor.store
     return store.vertices, store.count, store.lengths
@@ -225,17 +245,17 @@ class CameraVertexVisitor:
 
     Its state: how many vertices a sub-path has kept, the place of the last one, the density of its
     direction (per solid angle; zero after a delta function), the last vertex of whichever kind,
-    and the state of `weights`.
+    the state of `weights`, and with `classes` what these carry along.
     """
 
-    def __init__(self, world, limits, sensor, weights, capacity, ledger, shortest):
+    def __init__(self, world, limits, sensor, weights, capacity, ledger, shortest, classes):
         self.scene, self.lights, self.traits = world.scene, world.lights, world.traits
         self.film, self.lens = sensor.film(), Lens(sensor)
-        self.weights, self.ledger = weights, ledger
+        self.weights, self.ledger, self.classes = weights, ledger, classes
         self.hide_emitters = limits.hide_emitters
         self.deepest = limits.max_depth - shortest if limits.max_depth > 0 else None
         self.store = Store(
-            vertices=new_vertices(self.traits, capacity, weights.states),
+            vertices=new_vertices(self.traits, capacity, weights.states, classes is not None),
             room=dr.opaque(mi.UInt32, capacity),
             count=dr.zeros(mi.UInt32, 1),
         )
@@ -243,10 +263,11 @@ class CameraVertexVisitor:
     def begin(self, n_paths, splat, aperture):
         self.inside, self.aperture = within_crop(self.film, splat), aperture
         origin, sums = dr.zeros(mi.Interaction3f), self.weights.blank(n_paths)
-        return [mi.UInt32(0), mi.UInt32(NO_PARENT), mi.Float(0), origin, sums]
+        history = [] if self.classes is None else start_of_camera_path()
+        return [mi.UInt32(0), mi.UInt32(NO_PARENT), mi.Float(0), origin, sums, history]
 
     def emission(self, state, at, active):
-        _, _, density, origin, sums = state
+        _, _, density, origin, sums, history = state
         lights = self.lights
         ds = mi.DirectionSample3f(self.scene, at.si, origin)
         shown = active & (ds.emitter != None)  # noqa: E711 (array comparison)
@@ -263,13 +284,15 @@ class CameraVertexVisitor:
         light = at.throughput * ds.emitter.eval(at.si, shown)
         if self.ledger is not None:
             self.ledger.hit_emitter(at.path, at.depth, light, share, shown)
+        if self.classes is not None:
+            self.classes.add("met", at.path, class_of(*history), light * share, shown)
         return dr.select(shown, light * share, 0)
 
     def unfinished(self, state):
         return mi.Bool(True)
 
     def arrive(self, state, at, rng, active):
-        number, parent, density, origin, sums = state
+        number, parent, density, origin, sums, history = state
         si, weights = at.si, self.weights
         smooth = active & mi.has_flag(at.bsdf.flags(), mi.BSDFFlags.Smooth)
         cosine = dr.abs(dr.dot(si.n, at.towards))
@@ -289,14 +312,17 @@ class CameraVertexVisitor:
         direct = mi.Spectrum(0)
         if not self.lights.dark:
             direct = self._direct(sums, at, rng, smooth)
+            if self.classes is not None:
+                kind = class_of(history[0] + 1, mi.Bool(False))
+                self.classes.add("next_event", at.path, kind, direct, smooth)
         wanted = smooth & (dr.max(at.throughput) > 0)
         if self.deepest is not None:
             wanted &= mi.Int32(at.depth) <= self.deepest
-        slot = keep_vertex(
-            self.store, at, at.throughput, number, parent, dict(zip(weights.states, sums)), wanted
-        )
+        mark = [history[0] == 0] if history else []
+        state = dict(zip(weights.states, sums))
+        slot = keep_vertex(self.store, at, at.throughput, number, parent, state, wanted, *mark)
         number = dr.select(wanted, number + 1, number)
-        return [number, dr.select(wanted, slot, parent), density, origin, sums], direct
+        return [number, dr.select(wanted, slot, parent), density, origin, sums, history], direct
 
     def _direct(self, sums, at, rng, smooth):
         """Radiance of direct light at smooth vertices, by next-event estimation."""
@@ -321,13 +347,14 @@ class CameraVertexVisitor:
         return dr.select(reached, light * share, 0)
 
     def leave(self, state, at, rng, bs, weight, delta, active):
-        number, parent, _, _, sums = state
+        number, parent, _, _, sums, history = state
         si, wo = at.si, at.si.to_world(bs.wo)
         value, p_forward, p_back = at.vertex_bsdf.f_and_pdfs(at.towards, wo, active & ~delta)
         mean = scattered_mean(value, si.n, wo)
         sums = _either(active, self.weights.scatter(sums, p_forward, p_back, delta, mean), sums)
         density = dr.select(delta, 0, p_forward * dr.abs(dr.dot(si.n, wo)))
-        return [number, parent, density, mi.Interaction3f(si), sums], weight, active
+        history = scattered_history(history, delta, active) if history else []
+        return [number, parent, density, mi.Interaction3f(si), sums, history], weight, active
 
 
 def trace_camera_subpaths(
@@ -338,6 +365,7 @@ def trace_camera_subpaths(
     capacity: int,
     ledger=None,
     shortest: int = 2,
+    classes=None,
 ):
     """Traces the camera paths of a pass, with the light that they meet and that next-event
     estimation finds at each smooth vertex, weighted.
@@ -347,9 +375,11 @@ def trace_camera_subpaths(
     joined with; `count` as in `trace_light_subpaths`. `ledger`, if given, learns every
     contribution (`integrators.pyramid`): `hit_emitter(path, depth, value, share, mask)` and
     `next_event(...)`, with the length of the joint path in segments, and the weight apart.
+    `classes` (a `LightClasses` with the entries `met` and `next_event`): learns the radiance by
+    class; the vertices are then marked.
     """
     visitor = CameraVertexVisitor(
-        world, limits, camera_pass.sensor, weights, capacity, ledger, shortest
+        world, limits, camera_pass.sensor, weights, capacity, ledger, shortest, classes
     )
     radiance, alpha, splat = trace_camera(world, limits, camera_pass, visitor)
     return radiance, alpha, splat, visitor.store.vertices, visitor.store.count

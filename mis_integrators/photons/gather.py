@@ -13,8 +13,10 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from ..core.packing import read_mark
 from ..core.spectra import channel_mean
 from ..core.traits import lookup
+from ..paths.light_classes import CLASSES, by_class, class_of
 from ..paths.subpaths import vertex_bsdf_of
 from .grid import for_each_photon
 from .photon import read_power
@@ -72,6 +74,7 @@ class QueryVertices:
         self.p, self.n, self.plane, self.depth = si.p, si.n, si.n, depth & (LAST_VERTEX - 1)
         self.facing = mi.Frame3f.cos_theta(si.wi)
         self.side = dr.dot(si.n, -ray.d)
+        self.first = record.get("first")
         self.factor = mi.Spectrum(throughput) * scale
         self.lambertian, self.f, self.pdf = mi.Bool(True), mi.Spectrum(0), mi.Float(0)
         if traits.has_rough:
@@ -130,6 +133,7 @@ class KeptVertices:
         self.bsdf = vertex_bsdf_of(traits, record, wavelengths, active)
         self.p, self.n, self.depth = record["p"], record["n"], record["depth"]
         self.towards, self.factor, self.active = record["towards"], record["throughput"], active
+        self.first = record.get("mark")
 
     def scatter(self, towards, weighted, active):
         """The `Scattering` of light from `towards` (any length)."""
@@ -168,7 +172,14 @@ def landing_cosine(normal, scattering, plane):
 
 
 def gather_photons(
-    photon_map, vertices, radii, light_path_count, max_depth: int, weigh=None, grey: bool = False
+    photon_map,
+    vertices,
+    radii,
+    light_path_count,
+    max_depth: int,
+    weigh=None,
+    grey: bool = False,
+    marked: bool = False,
 ):
     """Radiance that photons bring to camera paths, for each radius of a list, from one visit of
     those within the largest.
@@ -187,37 +198,49 @@ def gather_photons(
     weigh : None, or the weight of a photon, ``weigh(index, f, p, back, active)``, a spectrum or a
         number: its index in the map, and what its `Scattering` says
     grey : sums the mean over channels only (fewer sums to keep for many radii)
+    marked : the photons are (`photon.write_photon`)
 
     Returns
     -------
-    For each radius a `Spectrum` (`grey`: a `Float`) of the vertices' width, throughput included.
+    For each radius a `Spectrum` (`grey`: a `Float`) of the vertices' width, throughput included; if
+    `marked` and not `grey` three, one for each of `light_classes.CLASSES`.
     """
+    split = marked and not grey
 
     def visit(index, landing, offset, distance_squared, hit, totals):
         hit &= same_surface(landing, vertices.n)
         if max_depth > 0:
             hit &= landing.depth + vertices.depth <= max_depth
-        value = _contribution(photon_map, vertices, index, landing, weigh, hit)
+        flux, towards = read_power(photon_map.power, index, hit)
+        if marked:
+            flux, delta_at_light = read_mark(flux)
+        value = _contribution(flux, towards, vertices, index, landing, weigh, hit)
         if grey:
             value = channel_mean(value * vertices.factor)
+        values = [value]
+        if split:
+            alone = (landing.depth == 1) & vertices.first
+            smooth = dr.select(alone, mi.UInt32(1), mi.UInt32(2))
+            values = by_class(class_of(smooth, delta_at_light), value)
         # The largest radius is tested again, too: without, kernels are slower by some per cent.
         inside = [hit & within_disk(offset, distance_squared, vertices.n, r) for r in radii]
-        return tuple(total + dr.select(i, value, 0) for total, i in zip(totals, inside))
+        found = [dr.select(i, value, 0) for i in inside for value in values]
+        return tuple(total + value for total, value in zip(totals, found))
 
-    zeros = tuple(mi.Float(0) if grey else mi.Spectrum(0) for _ in radii)
+    sums = [radius for radius in radii for _ in range(len(CLASSES) if split else 1)]
+    zeros = tuple(mi.Float(0) if grey else mi.Spectrum(0) for _ in sums)
     totals = for_each_photon(photon_map, vertices.p, radii[-1], vertices.active, visit, zeros)
     factor = 1 if grey else vertices.factor
     return [
         dr.select(
             vertices.active, total * factor / (dr.pi * dr.square(radius) * light_path_count), 0
         )
-        for total, radius in zip(totals, radii)
+        for total, radius in zip(totals, sums)
     ]
 
 
-def _contribution(photon_map, vertices, index, landing, weigh, active):
+def _contribution(flux, towards, vertices, index, landing, weigh, active):
     """What photons `index` bring: BSDF x flux x weight, over the cosine where they landed."""
-    flux, towards = read_power(photon_map.power, index, active)
     scattering = vertices.scatter(towards, weigh is not None, active)
     value = scattering.value
     if weigh is not None:

@@ -14,6 +14,7 @@ from ..core.packing import (
     unpack_depth,
     unpack_direction,
     unpack_normal,
+    with_mark,
 )
 from ..core.records import Layout
 
@@ -36,11 +37,16 @@ def new_photons(capacity):
 
 def write_photon(surface, power, slot, photon, active):
     """Writes photons to the places `slot`. `photon`: by name, `p`, geometric normal `n`, `towards`,
-    `flux`, `depth` in segments, and whether it is a `caustic` one."""
+    `flux`, `depth` in segments, and whether it is a `caustic` one. Where light is split into
+    classes, `delta_at_light`, too: whether what it met first scattered by a delta function; the
+    flux then has that as its mark (`packing.with_mark`)."""
     word = pack_surface(photon["n"], photon["depth"], photon["caustic"])
     surface_layout().write(surface, {"p": photon["p"], "surface": word}, slot, active)
     towards = pack_direction(photon["towards"])
-    power_layout().write(power, {"flux": photon["flux"], "towards": towards}, slot, active)
+    flux = photon["flux"]
+    if "delta_at_light" in photon:
+        flux = with_mark(flux, photon["delta_at_light"])
+    power_layout().write(power, {"flux": flux, "towards": towards}, slot, active)
 
 
 @dataclass
@@ -66,6 +72,6 @@ def landing_of(record):
 
 def read_power(power, index, active=True):
     """Flux (a `Spectrum`, for one light sub-path) of photons `index`, and direction to where they
-    came from (not normalised)."""
+    came from (not normalised). The flux may have a mark, see `write_photon`."""
     record = power_layout().read(power, index, active)
     return record["flux"], unpack_direction(record["towards"])

@@ -13,6 +13,7 @@ from ..core.recording import lanes
 from ..core.records import Layout
 from ..lights.lights import mis_power
 from ..paths.camera import trace_camera
+from ..paths.light_classes import class_of, scattered_history, start_of_camera_path
 from ..paths.setting import CameraPass, Limits, ListedPass, World
 
 LAST_VERTEX = 1 << 31
@@ -42,12 +43,15 @@ def weight_layout():
     return Layout(dict.fromkeys((*STATE, "share"), mi.Spectrum))
 
 
-def new_vertex_buffer(capacity, weighted=False):
+def new_vertex_buffer(capacity, weighted=False, split=False):
     """Room for `capacity` camera vertices, a dictionary: `words` (records of `query_layout`; unused
-    ones are zero) and, if `weighted`, `weights` (records of `weight_layout`)."""
+    ones are zero), if `weighted`, `weights` (records of `weight_layout`), and if light is `split`
+    into classes, `first`: whether the path has scattered smoothly nowhere before."""
     buffer = {"words": dr.zeros(mi.UInt32, query_layout().words * capacity)}
     if weighted:
         buffer["weights"] = weight_layout().room(capacity)
+    if split:
+        buffer["first"] = dr.zeros(mi.Bool, capacity)
     return buffer
 
 
@@ -61,6 +65,8 @@ def read_queries(vertices, first=0, count=None):
     record = layout.read(vertices["words"], index)
     if "weights" in vertices:
         record |= weight_layout().read(vertices["weights"], index)
+    if "first" in vertices:
+        record["first"] = dr.gather(mi.Bool, vertices["first"], index)
     return record
 
 
@@ -88,18 +94,20 @@ class QueryVisitor:
 
     Its state: smooth vertices left behind (the last one counts as the `bdd`-th); whether the last
     vertex scattered by a delta function; the density of the last smooth scattering; the last smooth
-    vertex; the weight of direct light there; how many times light counts that is found there; and
-    the state of `weights`.
+    vertex; the weight of direct light there; how many times light counts that is found there; the
+    state of `weights`; and with `classes` what these carry along.
     """
 
-    def __init__(self, world, limits, queries, weights, beyond):
+    def __init__(self, world, limits, queries, weights, beyond, classes):
         self.scene, self.lights, self.traits = world.scene, world.lights, world.traits
         self.hide_emitters, self.queries, self.weights = limits.hide_emitters, queries, weights
-        self.bdd, self.beyond = queries.bdd, beyond
+        self.bdd, self.beyond, self.classes = queries.bdd, beyond, classes
         self.sections = 1 if weights is None else self.bdd + 1
         self.by_light = weights is not None and weights.weighs_points_of_lights
         self.store = Store(
-            vertices=new_vertex_buffer(queries.capacity * self.sections, weights is not None),
+            vertices=new_vertex_buffer(
+                queries.capacity * self.sections, weights is not None, classes is not None
+            ),
             count=dr.zeros(mi.UInt32, self.sections),
         )
 
@@ -107,10 +115,12 @@ class QueryVisitor:
         sums = [] if self.weights is None else self.weights.init(n_paths)
         origin = dr.zeros(mi.Interaction3f)
         one = mi.Float(1)
-        return [mi.UInt32(0), mi.Bool(False), one, origin, mi.Spectrum(1), mi.Float(one), sums]
+        history = [] if self.classes is None else start_of_camera_path()
+        begun = [mi.UInt32(0), mi.Bool(False), one, origin, mi.Spectrum(1), mi.Float(one)]
+        return [*begun, sums, history]
 
     def emission(self, state, at, active):
-        vertex, behind_delta, scatter_pdf, origin, share_here, times, sums = state
+        vertex, behind_delta, scatter_pdf, origin, share_here, times, sums, history = state
         ds = mi.DirectionSample3f(self.scene, at.si, origin)
         shown = active & ((vertex == 0) | ~behind_delta)
         if self.hide_emitters:
@@ -123,13 +133,15 @@ class QueryVisitor:
             vertex == 0, mi.Spectrum(1), mis_power(scatter_pdf, light_pdf) * share_here
         )
         light = at.throughput * share * ds.emitter.eval(at.si, shown)
+        if self.classes is not None:
+            self.classes.add("met", at.path, class_of(*history), light * times, shown)
         return dr.select(shown, light * times, 0)
 
     def unfinished(self, state):
         return state[0] <= self.bdd
 
     def arrive(self, state, at, rng, active):
-        vertex, behind_delta, scatter_pdf, origin, share_here, times, sums = state
+        vertex, behind_delta, scatter_pdf, origin, share_here, times, sums, history = state
         weights, bsdf = self.weights, at.bsdf
         smooth = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
         at.ends = vertex >= self.bdd  # the path's last smooth vertex
@@ -139,16 +151,19 @@ class QueryVisitor:
             sums, share = weights.propagate(sums, at.si, bsdf, vertex, smooth)
             share_here = dr.select(smooth, share, share_here)
             at.ends |= weights.ends(bsdf, vertex, smooth)
-        state = [vertex, behind_delta, scatter_pdf, origin, share_here, times, sums]
+        state = [vertex, behind_delta, scatter_pdf, origin, share_here, times, sums, history]
         direct = mi.Spectrum(0)
         if not self.lights.dark:
             direct = self._direct(state, at, rng, smooth) * times
+            if self.classes is not None:
+                number = class_of(history[0] + 1, mi.Bool(False))
+                self.classes.add("next_event", at.path, number, direct, smooth)
         self._ask_for_photons(state, at, smooth)
         return state, direct
 
     def _direct(self, state, at, rng, smooth):
         """Radiance of direct light at smooth vertices, by next-event estimation."""
-        vertex, _, _, _, share_here, _, sums = state
+        vertex, _, _, _, share_here, _, sums, _ = state
         si, weights = at.si, self.weights
         ds, light, light_pdf = self.lights.sample_direct(si, rng, smooth)
         wo = si.to_local(ds.d)
@@ -162,7 +177,7 @@ class QueryVisitor:
 
     def _ask_for_photons(self, state, at, smooth):
         """Stores the vertices at which photons are to be gathered."""
-        vertex, _, _, _, share_here, _, sums = state
+        vertex, _, _, _, share_here, _, sums, history = state
         weights, store, queries = self.weights, self.store, self.queries
         last = (vertex == self.bdd) | (weights is not None)
         wants = smooth & (dr.max(at.throughput) > 0)
@@ -190,9 +205,11 @@ class QueryVisitor:
         if weights is not None:
             state = {**dict(zip(STATE, weights.stored(sums))), "share": share_here}
             weight_layout().write(store.vertices["weights"], state, slot, wants)
+        if self.classes is not None:
+            dr.scatter(store.vertices["first"], history[0] == 0, slot, wants)
 
     def leave(self, state, at, rng, bs, weight, delta, active):
-        vertex, _, scatter_pdf, origin, share_here, times, sums = state
+        vertex, _, scatter_pdf, origin, share_here, times, sums, history = state
         if not self.traits.has_light_surfaces:
             active &= delta | ~at.ends
         scattered = active & ~delta
@@ -207,6 +224,7 @@ class QueryVisitor:
             share_here,
             times,
             sums,
+            scattered_history(history, delta, active) if history else [],
         ]
         return state, weight, active
 
@@ -218,6 +236,7 @@ def trace_camera_paths(
     queries: Queries,
     weights=None,
     beyond=None,
+    classes=None,
 ):
     """Traces the camera paths of a pass to their `queries.bdd`-th smooth vertex.
 
@@ -235,8 +254,10 @@ def trace_camera_paths(
     of the path, of `capacity` each (a path's last vertex in the last section), and `count` has one
     entry for each.
 
-    `beyond` (one a path): what direct light counts at smooth vertices beyond the first.
+    `beyond` (one a path): what direct light counts at smooth vertices beyond the first. `classes`
+    (a `LightClasses` with the entries `met` and `next_event`): learns the radiance by class; the
+    vertex buffer then has what photons' classes need.
     """
-    visitor = QueryVisitor(world, limits, queries, weights, beyond)
+    visitor = QueryVisitor(world, limits, queries, weights, beyond, classes)
     radiance, alpha, splat = trace_camera(world, limits, camera_pass, visitor)
     return radiance, alpha, splat, visitor.store.vertices, visitor.store.count

@@ -13,10 +13,11 @@ from .photon import new_photons, write_photon
 
 
 class PhotonVisitor:
-    """Stores photons (a `LightVisitor`). Its state is that of `light_state`, if there is one."""
+    """Stores photons (a `LightVisitor`). Its state is that of `light_state`, if there is one, and
+    if they are `marked`, whether what a sub-path met first scattered by a delta function."""
 
-    def __init__(self, capacity, keep_direct, light_state):
-        self.keep_direct, self.light_state = keep_direct, light_state
+    def __init__(self, capacity, keep_direct, light_state, marked):
+        self.keep_direct, self.light_state, self.marked = keep_direct, light_state, marked
         surface, power = new_photons(capacity)
         self.store = Store(
             surface=surface,
@@ -31,13 +32,14 @@ class PhotonVisitor:
         return self.begin([])
 
     def begin(self, state):
-        return [] if self.light_state is None else self.light_state.init()
+        sums = [] if self.light_state is None else self.light_state.init()
+        return [sums, [mi.Bool(False)] if self.marked else []]
 
     def arrive(self, state, at, active):
-        store = self.store
+        store, (sums, mark) = self.store, state
         if self.light_state is not None:
             straight = active & at.first & ~at.had_delta
-            state = self.light_state.first_vertex(state, at.si, at.source, straight)
+            sums = self.light_state.first_vertex(sums, at.si, at.source, straight)
         keep = active & mi.has_flag(at.bsdf.flags(), mi.BSDFFlags.Smooth)
         keep &= at.scattered | at.had_delta | self.keep_direct
         slot = dr.scatter_inc(store.count, mi.UInt32(0), keep)
@@ -50,15 +52,18 @@ class PhotonVisitor:
             "depth": at.depth,
             "caustic": ~at.scattered,
         }
+        if self.marked:
+            photon["delta_at_light"] = mark[0]
         write_photon(store.surface, store.power, slot, photon, keep)
         if self.light_state is not None:
-            write_packets(store.mis_words, self.light_state.words(state), slot, keep)
-        return state
+            write_packets(store.mis_words, self.light_state.words(sums), slot, keep)
+        return [sums, mark]
 
     def leave(self, state, at, wo, delta, active):
-        if self.light_state is None:
-            return state
-        return self.light_state.scatter(state, at.si, at.bsdf, wo, active & ~delta)
+        sums, mark = state
+        if self.light_state is not None:
+            sums = self.light_state.scatter(sums, at.si, at.bsdf, wo, active & ~delta)
+        return [sums, [dr.select(at.first, delta, before) for before in mark]]
 
 
 def trace_light_paths(
@@ -68,6 +73,7 @@ def trace_light_paths(
     capacity: int,
     keep_direct: bool = False,
     light_state=None,
+    marked: bool = False,
 ):
     """Traces the light sub-paths of a pass and stores photons on surfaces that scatter smoothly.
 
@@ -84,9 +90,9 @@ def trace_light_paths(
     side instead.
 
     With a `light_state` (a `mis.state.LightState`) the result has a fourth array: records of its
-    `layout`.
+    `layout`. If they are to be `marked`, their flux is, see `photon.write_photon`.
     """
-    visitor = PhotonVisitor(capacity, keep_direct, light_state)
+    visitor = PhotonVisitor(capacity, keep_direct, light_state, marked)
     trace_light(world, limits, light_pass, visitor)
     store = visitor.store
     photons = store.surface, store.power, store.count

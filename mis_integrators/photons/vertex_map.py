@@ -18,10 +18,10 @@ def state_layout():
 
 def vertex_map(vertices, count, capacity: int, bounds, cell):
     """A `PhotonMap` of all kept light vertices; its mis_words are records of `state_layout`.
-    Arguments as of `build_photon_map`."""
+    Arguments as of `build_photon_map`. If the vertices are marked, so are the photons."""
     index = dr.arange(mi.UInt32, capacity)
     active = index < dr.gather(mi.UInt32, count, 0)
-    fields = ("p", "n", "depth", "towards", "throughput", *STATES)
+    fields = ("p", "n", "depth", "towards", "throughput", "mark", *STATES)
     y = read_vertices(vertices, index, active, fields)
     upright = mi.Vector3f(0, 0, 1)  # other places hold no unit vectors
     photon = {
@@ -32,6 +32,8 @@ def vertex_map(vertices, count, capacity: int, bounds, cell):
         "depth": y["depth"],
         "caustic": mi.Bool(False),
     }
+    if "mark" in y:
+        photon["delta_at_light"] = y["mark"]
     surface, power = new_photons(capacity)
     mis_words = state_layout().room(capacity)
     write_photon(surface, power, index, photon, active)

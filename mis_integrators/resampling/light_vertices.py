@@ -29,7 +29,7 @@ class LightConnection:
     `pdf_area` [1/m^2]: density per area across `d` with which the sub-path would go on to the
     point; `mis_sum`: techniques nearer to the light than this one, over the density per solid angle
     at the point with which the camera's side would make the end; `vertices`: how many the light
-    sub-path has.
+    sub-path has; `mark`: of its kept vertices, where these are marked (None elsewhere).
     """
 
     d: mi.Vector3f
@@ -39,6 +39,7 @@ class LightConnection:
     pdf_area: mi.Float
     mis_sum: mi.Float
     vertices: mi.UInt32
+    mark: mi.Bool | None = None
 
 
 class LightVertices:
@@ -99,6 +100,7 @@ class LightVertices:
             dr.select(start, pdf_area, joined.pdf_area),
             dr.select(start, dr.select(met, per, 0), joined.mis_sum),
             dr.select(start, 1, joined.vertices),
+            y["mark"] if "mark" in y else None,
         )
 
     def unblocked(self, scene, p, n, joined, active):

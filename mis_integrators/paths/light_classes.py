@@ -1,0 +1,81 @@
+"""The light of an image, split by the paths that bring it.
+
+A path scatters at vertices between an emitter and the sensor, at each smoothly or by a delta
+function (mirrors, glass, and what lets light pass straight on). Its class is a function of that
+alone, whoever has made it:
+
+- `direct`: no vertex is smooth (emitters that are seen), or a single one is, next to the emitter;
+- `caustic`: some vertex is smooth, and the one next to the emitter is not;
+- `indirect`: two or more are smooth, the one next to the emitter among them.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+CLASSES = DIRECT, INDIRECT, CAUSTIC = "direct", "indirect", "caustic"
+
+
+def class_of(smooth, delta_at_light):
+    """The place in `CLASSES` of paths that scatter smoothly at so many vertices (two stand for
+    more), and by a delta function or not at the one next to the emitter."""
+    direct, indirect, caustic = (mi.UInt32(place) for place in range(3))
+    scattered = dr.select(delta_at_light, caustic, dr.select(smooth == 1, direct, indirect))
+    return dr.select(smooth == 0, direct, scattered)
+
+
+def by_class(number, value):
+    """Values apart by class (as of `class_of`), a list: each is zero in all lists but one."""
+    return [dr.select(number == place, value, 0) for place in range(len(CLASSES))]
+
+
+def start_of_camera_path():
+    """What a camera sub-path carries for `class_of`: vertices that have scattered smoothly (two
+    stand for more), and whether the last one scattered by a delta function."""
+    return [mi.UInt32(0), mi.Bool(False)]
+
+
+def scattered_history(history, delta, active):
+    """What it carries after another vertex."""
+    smooth, was_delta = history
+    smooth = dr.select(active & ~delta, dr.minimum(smooth + 1, 2), smooth)
+    return [smooth, dr.select(active, delta, was_delta)]
+
+
+class LightClasses:
+    """Radiance of `paths` camera paths by class: `entries`, an array of all their spectra for each
+    class, one after the other, by the name of what finds it. `new`: names of entries that are yet
+    to be filled. (A plain object, as `core.packing.Store`.)"""
+
+    def __init__(self, paths, entries, new=()):
+        self.paths = paths
+        zeros = {name: dr.zeros(mi.Spectrum, len(CLASSES) * paths) for name in map(_key, new)}
+        self.entries = {**(entries or {}), **zeros}
+
+    def add(self, name, path, number, value, mask):
+        """Adds to the radiance of paths; `number` as of `class_of`."""
+        dr.scatter_reduce(
+            dr.ReduceOp.Add,
+            self.entries[_key(name)],
+            value,
+            number * self.paths + path,
+            mask,
+            dr.ReduceMode.Direct,
+        )
+
+    def radiance(self):
+        """Of each path: a list of three spectra."""
+        path = dr.arange(mi.UInt32, self.paths)
+        mine = [entry for name, entry in self.entries.items() if name.startswith(_key(""))]
+        return [
+            sum(
+                (dr.gather(mi.Spectrum, entry, place * self.paths + path) for entry in mine),
+                mi.Spectrum(0),
+            )
+            for place in range(len(CLASSES))
+        ]
+
+
+def _key(name):
+    return f"class.{name}"
