@@ -280,7 +280,7 @@ def _request(options: argparse.Namespace) -> Request:
         seed=options.seed,
         spp=0 if unbounded else options.spp,
         fine=bool(options.target_error or options.workers or options.scheduler),
-        box_filter=options.denoise,
+        denoise=options.denoise,
     )
 
 
@@ -468,7 +468,7 @@ def _write(
                 image, channels, opened.loaded.scene, opened.sensor
             )
             writing = output.denoised_path(path)
-            output.write_exr(writing, clean, names, {**metadata, "denoised": denoising.version()})
+            output.write_exr(writing, clean, names, {**metadata, "denoiser": denoising.version()})
             written += f", denoised {writing}"
             writing = writing.with_suffix(".png")
             output.write_png(writing, clean, names)

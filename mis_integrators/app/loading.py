@@ -48,14 +48,15 @@ def load(
     plugin: str | None,
     parameters: Mapping[str, Value],
     sampler: str | None = None,
-    box_filter: bool = False,
+    denoise: bool = False,
 ) -> LoadedScene:
     """Load the scene of an XML file under the active variant.
 
     ``variables`` are the values of the scene's ``$variables``. ``plugin`` replaces its integrator,
     which hands on the parameters ``INHERITED``; ``parameters`` are then set on the integrator,
     replaced or not; ``sampler`` replaces the sensors' samplers, but not their numbers of samples;
-    ``box_filter`` the films' reconstruction filters.
+    ``denoise`` suits all to a denoiser: the films' reconstruction filters become boxes, and an
+    integrator that has the parameter ``denoised`` is told, unless it is given.
     Raises one of ``SCENE_ERRORS`` (see ``one_line``).
     """
     config = mi.parser.ParserConfig(mi.variant())
@@ -78,12 +79,15 @@ def load(
         node.props = _properties(plugin, _known_to(plugin, inherited, parameters))
     for name, value in parameters.items():
         node.props[name] = value
+    if denoise:
+        _use_box_filters(state)
+        unknown = _unqueried(node.props.plugin_name(), {**_plain(node.props), "denoised": True})
+        if "denoised" not in node.props and unknown is not None and "denoised" not in unknown:
+            node.props["denoised"] = True
     name, given = node.props.plugin_name(), _plain(node.props)
 
     if sampler:
         _replace_samplers(state, sampler)
-    if box_filter:
-        _use_box_filters(state)
     scene = mi.parser.instantiate(config, state)
     for sensor in scene.sensors():
         check_film(sensor, name)
@@ -276,9 +280,17 @@ def _known_to(
 ) -> dict[str, Value]:
     """Those of the values that the integrator asks for when it is built with these parameters,
     without which it may not be built at all."""
-    props = _properties(plugin, {**values, **parameters})
+    # Where it cannot be built from these alone, building the scene says why.
+    unknown = _unqueried(plugin, {**values, **parameters}) or []
+    return {name: value for name, value in values.items() if name not in unknown}
+
+
+def _unqueried(plugin: str, values: Mapping[str, Value]) -> list[str] | None:
+    """Names of those values that an integrator does not ask for; None where it cannot be built from
+    these alone."""
+    props = _properties(plugin, values)
     try:
         mi.PluginManager.instance().create_object(props)
     except SCENE_ERRORS:
-        return dict(values)  # it cannot be built from these alone; building the scene says why
-    return {name: value for name, value in values.items() if name not in props.unqueried()}
+        return None
+    return list(props.unqueried())

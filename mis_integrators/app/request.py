@@ -32,7 +32,7 @@ class Request:
     seed: int
     spp: int | None
     fine: bool
-    box_filter: bool = False
+    denoise: bool = False
 
     def open(self, needs_views: str | None = None) -> Opened:
         """Load the scene and make the session. ``needs_views`` is an option that only integrators
@@ -56,7 +56,7 @@ class Request:
             self.variables,
             self.plugin,
             self.parameters,
-            box_filter=self.box_filter,
+            denoise=self.denoise,
         )
         sensor = _sensor(loaded.scene, self.sensor)
         spp = sensor.sampler().sample_count() if self.spp is None else self.spp
@@ -90,7 +90,7 @@ class Opened:
     def identity(self) -> dict[str, Any]:
         """What the session's sums are of, in JSON's types: see ``checkpoint.difference``."""
         given = asdict(self.request)
-        box = {"reconstruction filter": "box"} if given["box_filter"] else {}
+        box = {"reconstruction filter": "box"} if given["denoise"] else {}
         return {
             **box,
             "plugin": self.loaded.plugin,

@@ -81,6 +81,10 @@ class BDPM(IterativeIntegrator):
        - Camera paths per pixel and iteration that see emission and direct light at their first
          smooth vertex, those that gather photons among them. 0 sends more of them through pixels
          where such light is noisy, as a few trials tell. (Default: 0)
+     * - denoised
+       - |bool|
+       - Whether the image will be denoised: what is chosen automatically then minimises the error
+         that a denoiser leaves. (Default: no, i.e. |false|; ``mis-render --denoise`` sets it)
      * - camera_paths
        - |int|
        - Camera paths per pixel and iteration that gather photons. (Default: 1)
@@ -153,6 +157,7 @@ class BDPM(IterativeIntegrator):
         self.direct_paths = parameters.integer(
             "direct_paths", 0, 0, "at least 0 (0: automatic)", high=MOST_PATHS
         )
+        self.denoised = parameters.boolean("denoised", False)
 
     def settings(self):
         return {
@@ -161,6 +166,7 @@ class BDPM(IterativeIntegrator):
             "initial_radius": self.initial_radius,
             "alpha": self.alpha,
             "direct_paths": self.direct_paths,
+            "denoised": self.denoised,
             "bdd": self.bdd,
         }
 
@@ -234,6 +240,7 @@ class BDPMSession(PilotedSession):
             self.iterations_planned,
             self.seconds,
             self.reference_mean,
+            integrator.denoised,
         )
 
     def pilot_passes(self, setting, pixels):
@@ -550,7 +557,7 @@ class SubsetPasses:
 
     def gather(self, photons, vertices, radii, seed, spectral):
         """What photons bring to the camera paths, by kind and whether it is corrected at edges:
-        (radii, pixels)."""
+        (radii, groups, pixels)."""
         session, estimates = self.session, {}
         radii = [dr.opaque(mi.Float, float(radius)) for radius in radii]
         gathered = self._gather(session.scene, session._tables, photons, vertices, radii, spectral)
@@ -579,12 +586,12 @@ class SubsetPasses:
         return mean_photon_count(photon_map, read_queries(vertices), radius)
 
     def by_pixel(self, values):
-        """Means (pixels,) of values of the camera paths; those that are not finite count as
+        """Means (groups, pixels) of values of the camera paths; those that are not finite count as
         none."""
         pixels = self.pixels
         values = np.broadcast_to(np.array(values), pixels.paths)
         values = np.where(np.isfinite(values), values, 0)
-        return values.reshape(pixels.camera_paths, pixels.count).mean(axis=0)
+        return values.reshape(pixels.groups, -1, pixels.count).mean(axis=1)
 
 
 class SubsetIteration(NamedTuple):

@@ -26,7 +26,7 @@ class BDPMAuto(IterativeIntegrator):
        - |int|
        - As of :monosp:`bdpm`; 0 stands for one, for ``path`` and in media for as many as keep the
          machine busy. (Default: 0)
-     * - variance, aovs, max_depth, rr_depth, hide_emitters, sampler
+     * - denoised, variance, aovs, max_depth, rr_depth, hide_emitters, sampler
        -
        - As of :monosp:`bdpm`.
 
@@ -54,6 +54,13 @@ class BDPMAuto(IterativeIntegrator):
     """
 
     CAMERA_PATHS = 0, 0, "at least 0 (0: automatic)"
+
+    def read_parameters(self, parameters):
+        self.denoised = parameters.boolean("denoised", False)
+
+    def settings(self):
+        return {**super().settings(), "denoised": self.denoised}
+
     LAYERS = *CHANNELS, *SPLIT
 
     def check(self, scene, sensor):

@@ -12,6 +12,7 @@ from ..mis.neighbour_radiance import NeighbourRadiance
 from ..mis.optimal import OptimalWeights
 from ..photons.irradiance_cache import IrradianceCache
 from ..photons.trace import trace_light_paths
+from ..pilot.denoiser import LEFT
 from .common import MOST_LIGHT_PATHS
 from .weighted import WeightedBDPM, WeightedSession
 
@@ -48,13 +49,13 @@ class BDPMOpt(WeightedBDPM):
        - |bool|
        - Whether strategies go on beyond vertices that scatter as Lambertians do; else a path's
          first Lambertian vertex is its last strategy. It makes iterations less noisy and
-         longer. (Default: no, i.e. |false|)
+         longer. (Default: that of ``denoised``)
      * - frozen_photons
        - |int|
        - Light sub-paths of the pass from which the weights learn where light is; they do not
          contribute to the image. 0 stands for
          65536. (Default: 0)
-     * - photon_count, initial_radius, alpha, direct_paths, camera_paths, variance, aovs,
+     * - photon_count, initial_radius, alpha, direct_paths, denoised, camera_paths, variance, aovs,
          max_depth, rr_depth, hide_emitters, sampler
        -
        - As of :monosp:`bdpm`.
@@ -92,7 +93,7 @@ class BDPMOpt(WeightedBDPM):
             "first_vertex", 0, 0, "from 0 to 16", high=16
         )
         self.weights = parameters.choice("weights", "local", ("full", "local"))
-        self.mix_diffuse = parameters.boolean("mix_diffuse", False)
+        self.mix_diffuse = parameters.boolean("mix_diffuse", self.denoised)
         self.frozen_photons = parameters.integer(
             "frozen_photons", 0, 0, "at least 0 (0: 65536)", high=MOST_LIGHT_PATHS
         )
@@ -199,7 +200,7 @@ class BDPMOptSession(WeightedSession):
             merge_settings["caustic_cost"],
             integrator.strategies,
             integrator.first_vertex,
-            self.camera_paths,
+            self.camera_paths / (LEFT if integrator.denoised else 1),
             integrator.weights == "full",
             integrator.mix_diffuse,
         )

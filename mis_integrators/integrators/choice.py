@@ -21,6 +21,7 @@ from ..core.spectra import channel_mean
 from ..core.stratified_variance import contrasts, extrapolated
 from ..paths.layers import written
 from ..paths.path_length_statistics import mean_segments
+from ..pilot.denoiser import LEFT
 from ..pilot.noise import relative_weights, trimmed_mean
 from ..pilot.run import FEWEST_ITERATIONS
 from ..pilot.setting import UNPLANNED_ITERATIONS
@@ -237,6 +238,7 @@ def new_session(plugin, parameters, integrator, scene, sensor, seed, iterations,
     shared = {
         **handed_on(integrator),
         "camera_paths": integrator.initial_camera_paths,
+        "denoised": integrator.denoised,
         "aovs": written(integrator.layers),
     }
     made = mi.load_dict({"type": plugin, **shared, **parameters})
@@ -314,6 +316,7 @@ def _try_path(path, segments, pixels, mean, budget):
         variance = samples * _variance_of_samples(values, weights, samples)
     else:
         variance = trimmed_mean(weights * np.var(values, axis=0, ddof=1))
+    variance *= LEFT if path.integrator.denoised else 1
     return Trial("path", {}, path, 0.0, variance / path.camera_paths, cost * path.camera_paths)
 
 

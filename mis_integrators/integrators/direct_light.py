@@ -18,6 +18,7 @@ from ..paths.light_classes import by_class, class_of
 from ..paths.setting import ListedPass
 from ..photons.queries import Queries, trace_camera_paths
 from ..pilot.cost import USUAL_PHOTONS
+from ..pilot.denoiser import LEFT
 from ..pilot.direct_paths import (
     EXPONENTS,
     MOST_PATHS,
@@ -108,6 +109,8 @@ class DirectLight:
         """The `noise`, measured if need be."""
         if self.noise is None:
             self.noise = measure(self._trials(TRIALS), film_size(self.session.sensor)[0])
+            if self.session.integrator.denoised:
+                self.noise = self.noise.times(LEFT)
         return self.noise
 
     def _trials(self, trials):

@@ -108,7 +108,9 @@ class OptimalWeights:
     `full`: keep the recursion's integrals, else drop them (local weights). `cache`: an
     `IrradianceCache`; `neighbour_radiance`: a `NeighbourRadiance` of its cells (full weights only).
     `n`: photons per unit of irradiance in the merge disk (a spectrum of width one). `caustic_cost`:
-    what merging a caustic photon costs in units of merging another one (width one). `mix_diffuse`:
+    what merging a caustic photon costs in units of merging another one (width one). `camera_paths`:
+    N_B; where noise counts that a denoiser leaves, F + d B in place of F + B, it is N_B / d.
+    `mix_diffuse`:
     whether strategies go on beyond Lambertian vertices; else the first of these is a path's last
     strategy.
     """

@@ -56,6 +56,10 @@ class DirectNoise(NamedTuple):
     own: np.ndarray
     """Variance of a path, without them."""
 
+    def times(self, share: float) -> DirectNoise:
+        """The same with such a share of the noise."""
+        return self._replace(noise=self.noise * share, own=self.own * share)
+
 
 def measure(samples: np.ndarray, width: int) -> DirectNoise:
     """The `DirectNoise` of independent paths through each pixel, from those of the 3 x 3 pixels

@@ -6,6 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from .denoiser import variance_left
+
 FEW_DISKS = 64
 """Tuned: merge disks that found photons, fewer than which tell nothing of the noise of that
 radius."""
@@ -52,8 +54,8 @@ def photon_variance(
 
     Parameters
     ----------
-    samples : (iterations, radii, pixels)
-        Estimates of independent iterations.
+    samples : (iterations, radii, groups, pixels)
+        Estimates of independent iterations; see `denoiser.variance_left`.
     weights : (pixels,)
         See `relative_weights`.
     at_first_vertex
@@ -62,8 +64,8 @@ def photon_variance(
     alike
         Whether photons are alike, as those of a caustic; see `bounded_by_larger_disks`.
     """
-    variance = np.array([trimmed_mean(values) for values in weights * samples.var(axis=0, ddof=1)])
-    disks = np.count_nonzero(samples, axis=(0, 2)) if alike else None
+    variance = np.array([trimmed_mean(values) for values in weights * variance_left(samples)])
+    disks = np.count_nonzero(samples.mean(axis=2), axis=(0, 2)) if alike else None
     return bounded_by_larger_disks(
         radii, variance, 0.0 if at_first_vertex else variance.min(), disks
     )
@@ -95,10 +97,10 @@ def bounded_by_larger_disks(
 
 def direct_variance(direct: np.ndarray, weights: np.ndarray) -> float:
     """Relative variance, in an iteration, of light that does not come from photons; infinite where
-    one iteration tells nothing of it. `direct`: (iterations, pixels)."""
+    one iteration tells nothing of it. `direct`: (iterations, groups, pixels)."""
     if len(direct) < 2:
         return trimmed_mean(weights * np.full(direct.shape[-1], np.inf))
-    return trimmed_mean(weights * np.var(direct, axis=0, ddof=1))
+    return max(trimmed_mean(weights * variance_left(direct)), 0.0)
 
 
 def trimmed_mean(values: np.ndarray) -> float:

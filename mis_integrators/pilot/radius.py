@@ -6,7 +6,8 @@ iteration, and <.> the mean over pixels of squares relative to the pixels' radia
 (`noise.relative_weights`).
 
 Measured
-    V(R) = <Var[x(R)]>, the noise of one iteration (`noise.py`), and
+    V(R) = <Var[x(R)]>, the noise of one iteration (`noise.py`), or what a denoiser leaves of it
+    (`denoiser.py`), and
     Q(R) = <(E[x(R)] - E[x(R / 2)])^2>, the squared difference of neighbouring radii, from products
     of different iterations only, and so without bias (`bias.py`).
 Fitted
@@ -85,9 +86,9 @@ def error_by_radius(
 
     Parameters
     ----------
-    plain : (iterations, radii, pixels)
-        Estimates of independent iterations.
-    corrected : (iterations, radii, pixels) or None
+    plain : (iterations, radii, groups, pixels)
+        Estimates of independent iterations, by the groups of camera paths of `denoiser`.
+    corrected : as `plain`, or None
         The same corrected at edges.
     mean : (pixels,)
         Radiance that errors are relative to.
@@ -98,11 +99,16 @@ def error_by_radius(
     if not np.any(plain):
         return ErrorByRadius(radii, fine, {}, {})
     weights = relative_weights(mean)
-    estimates = {False: plain}
+    variance = {
+        which: photon_variance(radii, samples, weights, at_first_vertex, alike)
+        for which, samples in ((False, plain), (True, corrected))
+        if samples is not None
+    }
+    plain = plain.mean(axis=2)
     at_edges: dict[bool, np.ndarray | float] = {False: 0.0}
     best, least = plain, LEAST_BIAS
     if corrected is not None:
-        estimates[True] = corrected
+        corrected = corrected.mean(axis=2)
         added, lacking, deviation = light_lost_at_edges(plain, corrected, weights)
         wrong = {False: lacking**2 + deviation**2, True: (1 - lacking) ** 2 + deviation**2}
         at_edges = {which: between(fine, radii, added * wrong[which]) for which in wrong}
@@ -113,11 +119,8 @@ def error_by_radius(
     return ErrorByRadius(
         radii,
         fine,
-        {which: blur + at_edges[which] for which in estimates},
-        {
-            which: photon_variance(radii, samples, weights, at_first_vertex, alike)
-            for which, samples in estimates.items()
-        },
+        {which: blur + at_edges[which] for which in variance},
+        variance,
     )
 
 

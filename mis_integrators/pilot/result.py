@@ -28,9 +28,9 @@ class PilotSamples(NamedTuple):
     """By kind: photons within the ladder's largest radius of a vertex, on average."""
     gathered: dict[tuple[str, bool], np.ndarray]
     """By kind and whether they are corrected at edges: what photons bring, (iterations, radii,
-    pixels)."""
+    groups of camera paths, pixels)."""
     direct: np.ndarray
-    """Light that does not come from photons, (iterations, pixels)."""
+    """Light that does not come from photons, (iterations, groups, pixels)."""
 
 
 class Prediction(NamedTuple):
@@ -178,12 +178,12 @@ def measure(
         nothing = np.zeros(pixels.count)
         return PilotResult(setting, pixels, iterations, seconds, {}, {}, 0.0, nothing, 0.0, 0.0)
     middle = {
-        kind: samples.gathered[kind, False][:, middle_index(samples.ladder)]
+        kind: samples.gathered[kind, False][:, middle_index(samples.ladder)].mean(axis=1)
         for kind in setting.kinds
     }  # (iterations, pixels)
     mean = setting.mean
     if mean is None:
-        image = samples.direct + sum(middle.values())
+        image = samples.direct.mean(axis=1) + sum(middle.values())
         mean = shrink_to_neighbours(image, neighbourhoods(setting.width, pixels))
     weights = relative_weights(mean)
     errors = {}

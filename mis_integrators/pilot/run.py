@@ -39,10 +39,10 @@ class PilotIteration(Protocol):
 
     def gather(self, radii: np.ndarray) -> dict[tuple[str, bool], np.ndarray]:
         """What photons bring, by kind and whether the estimate is corrected at edges: mean over the
-        channels, (radii, pixels)."""
+        channels, (radii, groups of camera paths, pixels)."""
 
     def direct(self) -> np.ndarray:
-        """Light that does not come from photons: mean over the channels, (pixels,)."""
+        """Light that does not come from photons: mean over the channels, (groups, pixels)."""
 
 
 class PilotPasses(Protocol):

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from .denoiser import GROUPS
+
 PILOT_PATHS = 4096
 """Tuned: camera paths of a pilot's iteration, about."""
 MOST_CAMERA_PATHS = 16
@@ -40,6 +42,8 @@ class PilotSetting:
     """Seconds planned, if those are."""
     mean: np.ndarray | None
     """Radiance of the pilot's pixels that errors are relative to; None: the pilot's own."""
+    denoised: bool = False
+    """Whether the errors that count are those that a denoiser leaves (see `denoiser`)."""
 
     @property
     def planned_iterations(self) -> int:
@@ -61,8 +65,10 @@ class PilotPixels:
     stride: int
     count: int
     camera_paths: int
-    """Camera paths through each of them, in one iteration of the pilot: as many as in the render,
-    up to `MOST_CAMERA_PATHS`."""
+    """Camera paths through each of them, in one iteration of the pilot: in each group as many as in
+    the render, up to `MOST_CAMERA_PATHS`."""
+    groups: int = 1
+    """Of camera paths: more than one where a pilot tells shared noise from other."""
 
     @property
     def paths(self) -> int:
@@ -72,11 +78,12 @@ class PilotPixels:
 
 def pilot_pixels(setting: PilotSetting) -> PilotPixels:
     """The `PilotPixels`, spread over the film and not in columns."""
-    camera_paths = min(setting.camera_paths, MOST_CAMERA_PATHS)
+    groups = GROUPS if setting.denoised else 1
+    camera_paths = min(setting.camera_paths, MOST_CAMERA_PATHS) * groups
     stride = max(setting.pixels * camera_paths // PILOT_PATHS, 1)
     while math.gcd(stride, setting.width) > 1:
         stride += 1
-    return PilotPixels(stride, -(-setting.pixels // stride), camera_paths)
+    return PilotPixels(stride, -(-setting.pixels // stride), camera_paths, groups)
 
 
 def neighbourhoods(width: int, pixels: PilotPixels) -> np.ndarray:

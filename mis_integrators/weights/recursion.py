@@ -59,8 +59,8 @@ def at_most(x: Array, high: Array) -> Array:
 # ---------------------------------------------------------------- down: ratios
 
 
-def first_ratio(p0: Array, camera_paths: int = 1) -> Array:
-    """r_1 = N_B p_0."""
+def first_ratio(p0: Array, camera_paths: float = 1) -> Array:
+    """r_1 = N_B p_0; N_B need not be an integer."""
     return camera_paths * p0
 
 

@@ -156,8 +156,8 @@ def test_both_images_are_written(scene, tmp_path, capfd):
     header, image = read(tmp_path / "a.exr")
     header_denoised, denoised = read(tmp_path / "a.denoised.exr")
     assert (tmp_path / "a.denoised.png").stat().st_size > 0
-    assert header_denoised["denoised"].startswith("Open Image Denoise ")
-    assert "denoised" not in header and header_denoised["spp"] == header["spp"]
+    assert header_denoised["denoiser"].startswith("Open Image Denoise ")
+    assert "denoiser" not in header and header_denoised["spp"] == header["spp"]
     assert image.shape == denoised.shape and not same(image, denoised)
 
 
@@ -178,6 +178,25 @@ def test_the_film_gets_a_box_filter(scene, tmp_path):
         assert render(scene, "-o", tmp_path / "b.exr", *denoise) == 0
         assert same(read(tmp_path / "a.exr")[1], read(tmp_path / "b.exr")[1])
     assert not same(read(tmp_path / "a.exr")[1], read(tmp_path / "c.exr")[1])
+
+
+@pytest.mark.parametrize(
+    "arguments, told",
+    [
+        (["-i", "bdpm"], True),
+        (["-i", "bdpm", "-P", "denoised=false"], False),
+        (["-i", "bdpt"], None),
+        (["-i", "path"], None),
+    ],
+)
+def test_integrators_are_told(scene, tmp_path, arguments, told):
+    """Those that have the parameter `denoised`, unless it is given."""
+    rest = "-o", tmp_path / "a.exr", "--denoise"
+    assert lamplit.render(scene, *arguments, "--spp", 2, *rest) == 0
+    assert read(tmp_path / "a.exr")[0].get("denoised") == told
+    if told is not None:
+        assert lamplit.render(scene, *arguments, "--spp", 2, *rest[:2]) == 0
+        assert read(tmp_path / "a.exr")[0]["denoised"] == 0
 
 
 def test_like_denoises_again(scene, tmp_path):

@@ -906,8 +906,8 @@ def test_rare_photons_get_no_smallest_radius(rgb):
     samples = PilotSamples(
         np.array([0.01 * 2**i for i in range(7)]),
         {"indirect": 0.0},
-        {("indirect", corrected): np.zeros((4, 7, 256)) for corrected in (False, True)},
-        np.ones((4, 256)),
+        {("indirect", corrected): np.zeros((4, 7, 1, 256)) for corrected in (False, True)},
+        np.ones((4, 1, 256)),
     )
     choice = measure(setting, pilot_pixels(setting), samples, 4, 1.0).choose(100)
     assert choice.radii["indirect"] == pytest.approx(0.16)

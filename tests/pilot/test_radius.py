@@ -25,6 +25,11 @@ FIVE_SIGMA = 4.9
 """Two-sided false-alarm rate 1e-6 for a normal estimate."""
 
 
+def of_one_group(*samples):
+    """Samples (iterations, radii, pixels) as those of one group of camera paths."""
+    return [values[:, :, None] for values in samples]
+
+
 def lost_share(u):
     """Share of its area that a disk loses whose centre is u radii from a straight edge."""
     u = np.clip(u, 0, 1)
@@ -177,7 +182,7 @@ def test_choice_is_nearly_the_best(reach, corrects, curvature, most, count):
     for seed in range(12):
         plain, corrected = pilot(3, seed, reach, noise, curvature)
         chosen, way, *_ = radius.best_radius(
-            radius.error_by_radius(RADII, plain, corrected, np.ones(PIXELS)),
+            radius.error_by_radius(RADII, *of_one_group(plain, corrected), np.ones(PIXELS)),
             lambda r, corrected: count * np.ones_like(r),
         )
         ratios.append(true_error(chosen, way) / best)
@@ -188,7 +193,7 @@ def test_choice_is_nearly_the_best(reach, corrects, curvature, most, count):
 
 def test_more_iterations_mean_smaller_radii():
     plain, corrected = pilot(4, 0, curvature=0.05)
-    expected = radius.error_by_radius(RADII, plain, corrected, np.ones(PIXELS))
+    expected = radius.error_by_radius(RADII, *of_one_group(plain, corrected), np.ones(PIXELS))
     chosen = [
         radius.best_radius(expected, lambda r, way, n=n: n * np.ones_like(r))[0]
         for n in (1, 30, 1000)
@@ -219,7 +224,8 @@ def test_disks_that_met_no_photons_are_not_without_noise():
     samples = met * (RADII[-1] / RADII)[:, None] ** 2 * 1000.0
     assert not samples[:, 0].any() and samples[:, -1].any()
     choice = radius.best_radius(
-        radius.error_by_radius(RADII, samples, None, np.ones(PIXELS), alike=True), lambda *_: 100.0
+        radius.error_by_radius(RADII, *of_one_group(samples), None, np.ones(PIXELS), alike=True),
+        lambda *_: 100.0,
     )
     assert choice.radius > RADII[-1] / 2
 
