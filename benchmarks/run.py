@@ -603,6 +603,12 @@ def _compares_with_references(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--scale", type=_positive, default=1, help="film size, scene's own = 1 (default: 1)"
     )
+    command.add_argument(
+        "--denoise",
+        action="store_true",
+        help="denoise all images, too, and judge both; films get box filters, and integrators that "
+        "have the parameter denoised are told (needs mitsuba-oidn)",
+    )
     references.add_options(command)
 
 

@@ -81,6 +81,8 @@ class Method:
         own = dict(self.parameters)
         if self._samples_by_sensor:
             del own["sampler"]
+        if opened.denoise and loading.knows_of_denoisers(self.plugin, own):
+            own.setdefault("denoised", True)
         return mi.load_dict({"type": self.plugin, **opened.inherited, **own})
 
 

@@ -93,7 +93,7 @@ def are_there(opened: OpenScene, options: argparse.Namespace) -> bool:
 
 def _beside(opened: OpenScene) -> list[np.ndarray] | None:
     """The references beside the scene; ``None`` if there are none of the film's size."""
-    if not opened.path:
+    if not opened.path or opened.filtered:
         return None
     paths = _paths(opened.path.parent, opened.path.stem)
     if not all(path.exists() for path in paths):
@@ -109,7 +109,8 @@ def _method(opened: OpenScene, options: argparse.Namespace) -> Method:
 def _wanted(opened: OpenScene, options: argparse.Namespace) -> tuple[list[Path], Path, dict]:
     """Where the kept references of a scene lie, their record, and what must stand in it."""
     width, height = opened.size
-    kept = _paths(options.references, f"{opened.name}_{width}x{height}")
+    boxed = "_box" if opened.filtered else ""
+    kept = _paths(options.references, f"{opened.name}_{width}x{height}{boxed}")
     return (
         kept,
         kept[0].with_suffix(".json"),

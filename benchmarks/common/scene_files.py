@@ -30,6 +30,10 @@ class OpenScene:
     """What a scene without a file was made from: it tells it from all others."""
     title: str = ""
     """Its name."""
+    denoise: bool = False
+    """Whether images are to be denoised: films have box filters, and integrators are told."""
+    filtered: bool = False
+    """Whether its film had another filter before that."""
     of_samplers: dict[str, mi.Sensor] = field(default_factory=dict)
     """Its sensor with another sampler, once it was asked for (`sensor_with`)."""
 
@@ -49,7 +53,8 @@ class OpenScene:
         if sampler is None or self.path is None:
             return self.sensor
         if sampler not in self.of_samplers:
-            other = loading.load(self.path, {}, "path", {}, sampler).scene.sensors()[0]
+            loaded = loading.load(self.path, {}, "path", {}, sampler, self.denoise)
+            other = loaded.scene.sensors()[0]
             _resize(other, self.size)
             self.of_samplers[sampler] = other
         return self.of_samplers[sampler]
@@ -70,15 +75,20 @@ def bundled() -> list[Path]:
     return sorted(BUNDLED.glob("*.xml"))
 
 
-def open_scene(path: Path, size: tuple[int, int] | None = None) -> OpenScene:
-    """Load a scene, its film resized to ``size`` if given (the sensor keeps its field of view)."""
+def open_scene(path: Path, size: tuple[int, int] | None = None, denoise: bool = False) -> OpenScene:
+    """Load a scene, its film resized to ``size`` if given (the sensor keeps its field of view);
+    ``denoise``: see ``OpenScene``."""
     loaded = loading.load(path, {}, "path", {})
+    film = loaded.scene.sensors()[0].film()
+    filtered = denoise and not film.rfilter().is_box_filter()
+    if filtered:
+        loaded = loading.load(path, {}, "path", {}, denoise=True)
     if size:
         _resize(loaded.scene.sensors()[0], size)
     inherited = {
         name: loaded.parameters[name] for name in loading.INHERITED if name in loaded.parameters
     }
-    return OpenScene(path, loaded.scene, inherited)
+    return OpenScene(path, loaded.scene, inherited, denoise=denoise, filtered=filtered)
 
 
 def _resize(sensor: mi.Sensor, size: tuple[int, int]) -> None:
@@ -122,4 +132,5 @@ def digests(path: Path) -> dict[str, str]:
 def fingerprint(opened: OpenScene) -> str:
     """One SHA-256 for all of the scene's files, or for what it was made from."""
     content = repr(sorted(digests(opened.path).items())) if opened.path else opened.made
+    content += " with a box filter" if opened.filtered else ""
     return hashlib.sha256(content.encode()).hexdigest()

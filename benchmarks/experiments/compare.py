@@ -7,7 +7,8 @@ from dataclasses import fields
 from pathlib import Path
 
 from mis_integrators.analysis.confidence import log_ratio_error, mean_interval, ratio_interval
-from mis_integrators.analysis.metrics import Errors, decompose, efficiency, errors
+from mis_integrators.analysis.metrics import Errors, decompose, efficiency, errors, flip
+from mis_integrators.app import denoising
 
 import numpy as np
 
@@ -36,7 +37,22 @@ COLUMNS = (
 )
 
 
-TO_BETTER_PATH = {"relMSE": "relMSE / best path", "MSE": "MSE / best path"}
+DENOISED_COLUMNS = (
+    "method",
+    "iterations",
+    "seconds",
+    "denoised relMSE",
+    "denoised MSE",
+    "denoised FLIP",
+    "denoised relMSE / best path",
+    "denoised FLIP / best path",
+    "settings",
+)
+
+TO_BETTER_PATH = {
+    name: f"{name} / best path"
+    for name in ("relMSE", "MSE", "denoised relMSE", "denoised MSE", "denoised FLIP")
+}
 """Columns of ratios to the least error of `path` under any of its samplers, by the error's."""
 
 
@@ -59,6 +75,7 @@ def run(options: argparse.Namespace) -> None:
         )
         page.sections = [
             sections.summary(rows, failures, f"({measurement.asked} each, {options.seeds} seeds)"),
+            sections.denoised(rows),
             *pictures,
         ]
         page.write()
@@ -71,7 +88,9 @@ def run(options: argparse.Namespace) -> None:
 
 def measure_scene(path: Path, options: argparse.Namespace, marks: list[float]) -> Measurement:
     """The renders that the options ask for."""
-    opened = open_scene(path, scaled_size(path, options.scale))
+    if options.denoise:
+        denoising.require()
+    opened = open_scene(path, scaled_size(path, options.scale), options.denoise)
     references = find_references(opened, options, tell)
     return measure(
         opened,
@@ -95,6 +114,8 @@ def show_comparison(rows: list[Row], measurement: Measurement, options: argparse
     base = measurement.base.method.label
     title = f"{measurement.opened.name}: {much}, {options.seeds} seeds, ratios to {base}"
     show(title, shown, COLUMNS)
+    if options.denoise:
+        show(f"{title}, all denoised", rows, DENOISED_COLUMNS)
     for label, reason in measurement.failures.items():
         console.print(f"{label} cannot render {measurement.opened.name}: {reason}")
 
@@ -114,9 +135,10 @@ def compare(measurement: Measurement) -> list[Row]:
         row for row, measured in zip(rows, measurement.methods) if measured.method.plugin == "path"
     ]
     for name, column in TO_BETTER_PATH.items():
-        better = min((row[name] for row in paths), default=float("nan"))
+        better = min((row[name] for row in paths if name in row), default=float("nan"))
         for row in rows:
-            row[column] = row[name] / better if better else float("nan")
+            if name in row:
+                row[column] = row[name] / better if better else float("nan")
     return rows
 
 
@@ -130,6 +152,21 @@ def _figures(measured: Measured, measurement: Measurement) -> dict[str, list[flo
     perceived = measured.perceived(measurement.references)
     figures["flip"] = [perceived[0]] if perceived else []
     return figures
+
+
+def _denoised(measured: Measured, measurement: Measurement) -> Row:
+    """Errors of the denoised images, mean over the seeds; nothing where they are not denoised."""
+    if not measurement.opened.denoise:
+        return {}
+    pictures = [denoising.denoise(image, measurement.opened.scene) for image in measured.images]
+    judged = [errors(picture, measurement.references) for picture in pictures]
+    perceived = flip(pictures[0], measurement.references)
+    return {
+        "denoised MSE": float(np.mean([error.mse for error in judged])),
+        "denoised relMSE": float(np.mean([error.relmse for error in judged])),
+        "denoised relMSE trimmed": float(np.mean([error.relmse_trimmed for error in judged])),
+        "denoised FLIP": perceived[0] if perceived else float("nan"),
+    }
 
 
 def _row(measured: Measured, mine: dict, base: dict, measurement: Measurement) -> Row:
@@ -184,6 +221,7 @@ def _row(measured: Measured, mine: dict, base: dict, measurement: Measurement) -
         "cost ratio low": cost.low,
         "cost ratio high": cost.high,
         "cost ratio error": log_ratio_error(mine["cost"], base["cost"]),
+        **_denoised(measured, measurement),
         "settings": chosen(measured.runs[-1].settings),
         "references": measurement.references.origin,
     }

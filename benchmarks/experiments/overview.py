@@ -119,6 +119,7 @@ def write(
     links = "".join(f'<a href="#{part}">{name}</a>' for part, name in parts)
     page.sections = [
         sections.summary(rows, failures, f"{much}, {options.seeds} seeds"),
+        sections.denoised(rows),
         f"<nav>{links}</nav>",
         *scenes,
         sweeps,

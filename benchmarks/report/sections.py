@@ -79,6 +79,39 @@ Tooltips: 95 % intervals.</p>
 <tr class="total"><td>geometric mean</td><td></td><td></td>{total}</tr></table></div>"""
 
 
+def denoised(rows: Sequence[Row]) -> str:
+    """Errors of the denoised images over those of the better `path`; empty where none were."""
+    name, perceived = "denoised relMSE / best path", "denoised FLIP / best path"
+    if not any(name in row for row in rows):
+        return ""
+    labels = list(dict.fromkeys(row["method"] for row in rows))
+    style = styles_of(labels)
+    lines, ratios = [], {label: [] for label in labels}
+    for scene in dict.fromkeys(row["scene"] for row in rows):
+        mine = {row["method"]: row for row in rows if row["scene"] == scene}
+        cells = []
+        for label in labels:
+            row = mine.get(label)
+            if row is not None:
+                ratios[label].append(row[name])
+            cells.append(
+                "<td>cannot</td>"
+                if row is None
+                else f"<td>{short(row[name])} ({short(row[perceived])})</td>"
+            )
+        lines.append(f'<tr><td><a href="#{scene}">{scene}</a></td>{"".join(cells)}</tr>')
+    means = "".join(
+        f"<td>{short(float(np.exp(np.mean(np.log(values)))))}</td>" if values else "<td>-</td>"
+        for values in ratios.values()
+    )
+    head = "".join(f"<th>{chip(label, style[label])}</th>" for label in labels)
+    return f"""<p>The same images denoised, all with the same denoiser: relative mean square error
+(and FLIP), over that of the better <b>path</b> denoised. Below 1 is better.</p>
+<div class="wide"><table><tr><th>scene</th>{head}</tr>
+{"".join(lines)}
+<tr class="total"><td>geometric mean</td>{means}</tr></table></div>"""
+
+
 # --- Scenes -------------------------------------------------------------------
 
 

@@ -81,9 +81,8 @@ def load(
         node.props[name] = value
     if denoise:
         _use_box_filters(state)
-        unknown = _unqueried(node.props.plugin_name(), {**_plain(node.props), "denoised": True})
-        if "denoised" not in node.props and unknown is not None and "denoised" not in unknown:
-            node.props["denoised"] = True
+        if knows_of_denoisers(node.props.plugin_name(), _plain(node.props)):
+            node.props["denoised"] = node.props.get("denoised", True)
     name, given = node.props.plugin_name(), _plain(node.props)
 
     if sampler:
@@ -92,6 +91,12 @@ def load(
     for sensor in scene.sensors():
         check_film(sensor, name)
     return LoadedScene(scene, scene.integrator(), name, given)
+
+
+def knows_of_denoisers(plugin: str, parameters: Mapping[str, Value]) -> bool:
+    """Whether an integrator has the parameter ``denoised``."""
+    unknown = _unqueried(plugin, {"denoised": True, **parameters})
+    return unknown is not None and "denoised" not in unknown
 
 
 def parse_value(text: str) -> Value:

@@ -84,7 +84,7 @@ class BDPM(IterativeIntegrator):
      * - denoised
        - |bool|
        - Whether the image will be denoised: what is chosen automatically then minimises the error
-         that a denoiser leaves. (Default: no, i.e. |false|; ``mis-render --denoise`` sets it)
+         that a denoiser leaves. ``mis-render --denoise`` sets it. (Default: no, i.e. |false|)
      * - camera_paths
        - |int|
        - Camera paths per pixel and iteration that gather photons. (Default: 1)

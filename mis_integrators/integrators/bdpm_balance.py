@@ -27,7 +27,7 @@ class BDPMBalance(WeightedBDPM):
        - |float|
        - Exponent of the heuristic, from 1 to 8: 1 is Veach's balance heuristic, 2 his power
          heuristic. (Default: 1)
-     * - photon_count, initial_radius, alpha, direct_paths, camera_paths, variance, aovs,
+     * - photon_count, initial_radius, alpha, direct_paths, denoised, camera_paths, variance, aovs,
          max_depth, rr_depth, hide_emitters, sampler
        -
        - As of :monosp:`bdpm`.

@@ -49,7 +49,8 @@ class BDPMOpt(WeightedBDPM):
        - |bool|
        - Whether strategies go on beyond vertices that scatter as Lambertians do; else a path's
          first Lambertian vertex is its last strategy. It makes iterations less noisy and
-         longer. (Default: that of ``denoised``)
+         longer. Images that will be ``denoised`` have it unless it is given. (Default: no, i.e.
+         |false|)
      * - frozen_photons
        - |int|
        - Light sub-paths of the pass from which the weights learn where light is; they do not

@@ -501,3 +501,33 @@ def test_what_is_asked_for_is_checked_before_it_is_measured(module, capsys, argu
     with pytest.raises(SystemExit) as exit:
         module("run").main(["compare", *arguments])
     assert exit.value.code == 2 and message in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_comparisons_of_denoised_images(tmp_path, module, rgb):
+    """Denoised images have errors of their own, over those of the better `path`; integrators are
+    told; references are rendered with the box filter that the film then has."""
+    pytest.importorskip("mitsuba_oidn")
+    scene = tmp_path / "tiny.xml"
+    scene.write_text(TINY.replace("</film>", '<rfilter type="gaussian"/></film>'))
+    module("run").main(
+        [
+            *("compare", "--denoise", "--scenes", str(scene), "--spp", "4", "--seeds", "1"),
+            *("--integrators", "path", "path:sampler=multijitter", "bdpm", "bdpt"),
+            *("--reference-time", "0.2", "--references", str(tmp_path / "references")),
+            *("--out", str(tmp_path / "out")),
+        ]
+    )
+    rows = json.loads((tmp_path / "out" / "compare.json").read_text())["rows"]
+    for name in ("denoised relMSE", "denoised FLIP"):
+        better = min(row[name] for row in rows[:2])
+        for row in rows:
+            assert row[f"{name} / best path"] == pytest.approx(row[name] / better)
+    assert rows[0]["denoised relMSE"] != rows[0]["relMSE"]
+    assert "images denoised" in (tmp_path / "out" / "compare.html").read_text()
+    assert len(list((tmp_path / "references").glob("*_box*.exr"))) == 2
+    files = module("common.scene_files")
+    told = [
+        module("common.methods").parse_method(label).integrator(files.open_scene(scene, None, True))
+        for label in ("bdpm", "bdpm:denoised=false", "bdpt")
+    ]
+    assert [getattr(integrator, "denoised", None) for integrator in told] == [True, False, None]
