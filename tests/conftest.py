@@ -11,6 +11,8 @@ import mitsuba as mi
 import pytest
 
 BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
+LEFT_OUT = "extended", "full"
+"""Markers of what the default run leaves out."""
 VARIANTS = ("llvm_ad_rgb", "llvm_ad_mono", "llvm_ad_spectral", "cuda_ad_rgb")
 
 
@@ -75,8 +77,14 @@ def pytest_configure(config):
     )
     config.addinivalue_line(
         "markers",
-        "thinned(inner, n): of a product of parameters, the last of which has `inner` values, "
-        "every n-th case in diagonals; the rest is full",
+        "thinned(inner, n, m=n): of a product of parameters, the last of which has `inner` values, "
+        "every n-th case in diagonals; the rest is full. Where m is given, a multiple of n, only "
+        "every m-th diagonal is in the default run, and the others are extended",
+    )
+    config.addinivalue_line(
+        "markers",
+        "extended: more cases of the same kind, ten minutes of them; left out unless asked for, as "
+        "`make test-all` does (-m 'not full')",
     )
     config.addinivalue_line(
         "markers",
@@ -90,13 +98,15 @@ def pytest_collection_modifyitems(config, items):
     for item in items:
         thinned = item.get_closest_marker("thinned")
         if thinned:
-            inner, keep = thinned.args
+            inner, keep, *by_default = thinned.args
             row, column = divmod(places[item.function], inner)
             places[item.function] += 1
             if (row + column) % keep:
                 item.add_marker("full")
+            elif by_default and (row + column) % by_default[0]:
+                item.add_marker("extended")
     if config.option.markexpr:
         return
-    left_out = [item for item in items if item.get_closest_marker("full")]
+    left_out = [item for item in items if any(map(item.get_closest_marker, LEFT_OUT))]
     config.hook.pytest_deselected(items=left_out)
-    items[:] = [item for item in items if not item.get_closest_marker("full")]
+    items[:] = [item for item in items if not any(map(item.get_closest_marker, LEFT_OUT))]

@@ -18,6 +18,7 @@ from mis_integrators.core.sums import Iterations, Sums
 import numpy as np
 import pytest
 from lamplit import ROOT, command, read, render, run, same, write_scene
+from selection import extended
 
 pytest.importorskip(
     "distributed",
@@ -396,7 +397,7 @@ def workers_of(process) -> list:
     return found
 
 
-@pytest.mark.parametrize("end", ["time", "SIGTERM"])
+@pytest.mark.parametrize("end", ["SIGTERM", *extended("time")])
 def test_only_worker_is_stopped(scene, tmp_path, end):
     """The time limit and SIGTERM are heeded while nothing comes in: what there is is written, and
     no process stays."""

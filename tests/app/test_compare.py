@@ -12,6 +12,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from lamplit import write_scene
+from selection import extended
 
 pytest.importorskip("matplotlib")
 
@@ -102,7 +103,7 @@ def test_errors_without_flip(rgb, monkeypatch):
     assert compare.quality(flat(0.5), flat(0.5)) == "relMSE 0, MSE 0"
 
 
-@pytest.mark.parametrize("variant_name", ["llvm_ad_rgb", "llvm_ad_mono"])
+@pytest.mark.parametrize("variant_name", ["llvm_ad_rgb", *extended("llvm_ad_mono")])
 def test_reference(scene, tmp_path, capfd, variant_name):
     """The image itself as reference: it has no error, and the other one has."""
     reference = tmp_path / "reference.exr"

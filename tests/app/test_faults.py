@@ -18,6 +18,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from lamplit import ROOT, command, read, render, run, same, write_scene
+from selection import extended
 from worlds import lit_ball
 
 
@@ -38,7 +39,13 @@ def spotted(scene, tmp_path):
     return scene
 
 
-@pytest.mark.parametrize("plugin", [*_plugins.PLUGINS, "path"])
+FEW = "bdpm", "volpath_multiview", "path"
+"""Plugins whose sessions and films differ most."""
+
+
+@pytest.mark.parametrize(
+    "plugin", [*FEW, *extended(*(plugin for plugin in _plugins.PLUGINS if plugin not in FEW))]
+)
 def test_texel_that_is_no_number(spotted, tmp_path, capsys, plugin):
     """The image is there, finite, and as bright as it should be; the texture is named. Both
     renders' means have a standard deviation of about 2 %."""
@@ -113,7 +120,7 @@ def poison(monkeypatch, kind, value, iterations):
     monkeypatch.setattr(Accumulator, "add", spoiled)
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf], ids=str)
+@pytest.mark.parametrize("value", [np.nan, *extended(np.inf, -np.inf)], ids=str)
 @pytest.mark.parametrize(
     "kind, plugin, parameters",
     [
@@ -273,13 +280,12 @@ def failing(monkeypatch, plugin, error, at):
     monkeypatch.setattr(kind, "iterate", iterate)
 
 
-@pytest.mark.parametrize("plugin", ["bdpm", "path", "volpath_multiview"])
 @pytest.mark.parametrize(
-    "error, message",
+    "plugin, error, message",
     [
-        (RuntimeError("the device is gone"), "the device is gone"),
-        (MemoryError(), "not enough memory"),
-        (TypeError("a defect"), "TypeError: a defect"),
+        ("bdpm", RuntimeError("the device is gone"), "the device is gone"),
+        ("path", MemoryError(), "not enough memory"),
+        ("volpath_multiview", TypeError("a defect"), "TypeError: a defect"),
     ],
 )
 def test_error_in_the_middle_keeps_what_is_done(
@@ -488,7 +494,7 @@ def test_other_sources_are_another_render(scene, tmp_path, monkeypatch, capsys):
 
 
 def test_fingerprint_is_of_every_source(tmp_path):
-    """It changes with any byte of any module, and with a module's name."""
+    """It changes with any byte of any module or table, and with a module's name."""
     program = (
         "import sys; sys.path.insert(0, sys.argv[1])\n"
         "from mis_integrators.app import fingerprint; print(fingerprint.of_package())"
@@ -509,7 +515,10 @@ def test_fingerprint_is_of_every_source(tmp_path):
     module.write_text(module.read_text() + "\n")
     changed = fingerprint_of(tmp_path)
     module.rename(module.with_name("mis9.py"))
-    assert len({before, changed, fingerprint_of(tmp_path)}) == 3
+    renamed = fingerprint_of(tmp_path)
+    table = next((tmp_path / "mis_integrators").rglob("*.json"))
+    table.write_text(table.read_text() + "\n")
+    assert len({before, changed, renamed, fingerprint_of(tmp_path)}) == 4
 
 
 def test_texel_is_named_from_python(spotted, tmp_path, capfd):
@@ -520,8 +529,21 @@ def test_texel_is_named_from_python(spotted, tmp_path, capfd):
     assert said.count("bdpt: ") == 1 and "reflectance.data of BitmapTexture" in said
 
 
-@pytest.mark.parametrize("plugin", ["bdpm", "bdpt", "volpath_multiview", "path"])
-@pytest.mark.parametrize("size", [(1, 1), (1, 3), (3, 1)])
+@pytest.mark.parametrize(
+    "plugin, size",
+    [
+        ("bdpm", (1, 1)),
+        ("bdpt", (1, 3)),
+        ("volpath_multiview", (3, 1)),
+        ("path", (1, 1)),
+        *extended(
+            *(("bdpm", size) for size in ((1, 3), (3, 1))),
+            *(("bdpt", size) for size in ((1, 1), (3, 1))),
+            *(("volpath_multiview", size) for size in ((1, 1), (1, 3))),
+            *(("path", size) for size in ((1, 3), (3, 1))),
+        ),
+    ],
+)
 def test_films_of_few_pixels(rgb, plugin, size):
     scene = lit_ball(*size)
     session = make_session(mi.load_dict({"type": plugin}), scene, scene.sensors()[0], 0, 2)
@@ -569,7 +591,7 @@ def test_previews_of_others_stay(scene, tmp_path):
     assert (tmp_path / "a.preview.exr").read_text() == "mine"
 
 
-@pytest.mark.parametrize("plugin", ["bdpt", "bdpm", "path", "bdpm_auto"])
+@pytest.mark.parametrize("plugin", ["bdpt", "path", *extended("bdpm", "bdpm_auto")])
 def test_light_near_the_end_of_single_precision(scene, tmp_path, plugin):
     """Sums over iterations exceed it; the image does not, and it can be resumed and made again."""
     lamp = (tmp_path / "lamp.xml").read_text().replace("5, 4, 3", "1e38, 1e38, 1e38")

@@ -20,6 +20,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from lamplit import LAMP, ROOT, SCENE, command, read, render, run, same, write_scene
+from selection import extended
 from test_auto import set_price_of_path
 
 
@@ -97,12 +98,11 @@ def test_scene_that_only_mitsuba_takes_has_its_digests(tmp_path, rgb, comment):
 
 PLUGINS = {
     "bdpm_opt3": {"mix_diffuse": True, "variance": True},
-    "bdpt": {"techniques": 2},
-    "vcm": {"alpha": 0.7},
     "bdpt_ris": {"light_paths": 20},
     "volpath_multiview": {},
     "path": {},
 }
+MORE = {"bdpt": {"techniques": 2}, "vcm": {"alpha": 0.7}}
 REST = {
     "bdpm": {"bdd": 0},
     "bdpm_opt2": {"initial_radius": 0.1},
@@ -114,12 +114,13 @@ REST = {
 
 
 @pytest.mark.parametrize(
-    "plugin", [*PLUGINS, *(pytest.param(plugin, marks=pytest.mark.full) for plugin in REST)]
+    "plugin",
+    [*PLUGINS, *extended(*MORE), *(pytest.param(p, marks=pytest.mark.full) for p in REST)],
 )
 def test_resumed_session_goes_on_as_if_nothing_had_been(scene, plugin):
     """Iterations 0 to 4 in one session; the same, of which the first two pass through a checkpoint,
     and 4 comes before 2 and 3."""
-    loaded = loading.load(scene, {"size": "16"}, plugin, {**PLUGINS, **REST}[plugin])
+    loaded = loading.load(scene, {"size": "16"}, plugin, {**PLUGINS, **MORE, **REST}[plugin])
     file = scene.with_name("a.checkpoint")
 
     def session():
@@ -174,7 +175,7 @@ def test_learned_radii_are_not_learned_again(scene):
     assert session.learned == learned and len(learned["radii"]) == 2
 
 
-@pytest.mark.parametrize("plugin", ["bdpm", "path"])
+@pytest.mark.parametrize("plugin", ["path", *extended("bdpm")])
 def test_killed_process_resumes(scene, tmp_path, plugin):
     """Killed twice, the first time right after a checkpoint, the second time at some moment: the
     image is that of the undisturbed process."""
@@ -578,8 +579,8 @@ def test_relative_error_of_known_noise():
 @pytest.mark.parametrize(
     "plugin, parameters",
     [
-        ("path", {}),
         ("bdpm", {"bdd": 0, "initial_radius": 0.3}),
+        *extended(("path", {})),
         *(
             pytest.param(plugin, {}, marks=pytest.mark.full)
             for plugin in ("bdpt", "vcm", "volpath_multiview")
@@ -673,7 +674,7 @@ for count in (30, 130):
     "plugin",
     [
         "bdpm_opt3",
-        "path",
+        *extended("path"),
         *(pytest.param(p, marks=pytest.mark.full) for p in ("bdpt", "vcm", "volpath_multiview")),
     ],
 )

@@ -11,6 +11,7 @@ from mis_integrators.app import loading
 
 import mitsuba as mi
 import pytest
+from selection import extended
 
 ROOT = Path(__file__).parents[2]
 LIBRARY = """
@@ -95,13 +96,21 @@ def test_library_would_be_loaded(tmp_path, library):
     assert (tmp_path / "mark").exists()
 
 
-@pytest.mark.parametrize("folder", ["scene", "current"])
 @pytest.mark.parametrize(
-    "plugin", ["independent", "hdrfilm", "path", "sphere", "merge", "gaussian", "d65"]
+    "plugin, folder",
+    [
+        ("independent", "scene"),
+        ("path", "current"),
+        ("merge", "scene"),
+        *extended(
+            *((name, "current") for name in ("independent", "merge")),
+            *((name, "scene") for name in ("hdrfilm", "path", "sphere", "gaussian", "d65")),
+        ),
+    ],
 )
 def test_library_named_like_a_plugin_of_mitsuba(render, folder, plugin):
     """Mitsuba's own is used: of those that the scene names, and of those that Mitsuba or an
-    integrator takes by itself."""
+    integrator takes by itself. (All at once: below.)"""
     result, loaded = render(SCENE % "", [f"{folder}/plugins/{plugin}{SUFFIX}"], "-i", "bdpm_auto")
     assert result.returncode == 0 and not loaded, result.stderr
 
@@ -115,8 +124,14 @@ def test_libraries_named_like_all_plugins_of_mitsuba(render):
     assert result.returncode == 0 and not loaded, result.stderr
 
 
-@pytest.mark.parametrize("folder", ["scene", "current"])
-@pytest.mark.parametrize("plugin", ["nobodys", "bdpm", "bdpt"])
+@pytest.mark.parametrize(
+    "plugin, folder",
+    [
+        ("nobodys", "scene"),
+        ("bdpm", "current"),
+        *extended(("nobodys", "current"), ("bdpt", "scene")),
+    ],
+)
 def test_library_for_a_plugin_that_is_none_of_mitsubas(render, folder, plugin):
     """It is refused, also under the name of a plugin of this package, for which Mitsuba would load
     it."""
@@ -132,7 +147,7 @@ def test_library_for_a_plugin_that_is_none_of_mitsubas(render, folder, plugin):
 
 
 @pytest.mark.parametrize(
-    "name", ["../evil", "../../evil", "sub/evil", "evil.so", "", "év", "a b", "a\\b"]
+    "name", ["../evil", "sub/evil", "", "a b", *extended("../../evil", "evil.so", "év", "a\\b")]
 )
 def test_plugin_names_are_words(render, name):
     result, loaded = render(

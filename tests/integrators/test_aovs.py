@@ -1,6 +1,7 @@
 """The parameter `aovs`: layers besides the image."""
 
 import sys
+from itertools import product
 
 from mis_integrators import _plugins
 from mis_integrators.paths.layers import (
@@ -18,11 +19,18 @@ import numpy as np
 import pytest
 from comparing import Estimate, assert_same, block_means, differences, pictures
 from light_by_class import traced
+from selection import extended
 from worlds import bdpm, film, look, path, ptracer, tray
 
 SURFACE_PLUGINS = [plugin for plugin in _plugins.PLUGINS if plugin != "volpath_multiview"]
 ALL = ",".join(f"{kind}_1:{kind}" for kind in CHANNELS)
 """A layer of each type."""
+REPRESENTATIVES = "bdpm", "bdpm_opt3", "vcm", "bdpt_ris"
+"""Plugins that together have every strategy."""
+BY_DEFAULT = [
+    *REPRESENTATIVES,
+    *extended(*(plugin for plugin in SURFACE_PLUGINS if plugin not in REPRESENTATIVES)),
+]
 
 
 def last_line(error) -> str:
@@ -55,7 +63,7 @@ def ours(scene, aovs, seed):
 # --- What the layers show -------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("rfilter", ["box", "gaussian", "mitchell"])
+@pytest.mark.parametrize("rfilter", ["mitchell", *extended("box", "gaussian")])
 def test_layers_are_those_of_mitsuba(rgb, rfilter):
     """On surfaces that are all diffuse, under the film's filter; over 4 x 4 blocks and the whole
     image, a channel after the other. Numbers of shapes are told by another name: see below. False
@@ -184,7 +192,7 @@ def test_bounds(variant, rfilter):
 # --- Where they stand in the image ----------------------------------------------------------------
 
 
-@pytest.mark.parametrize("plugin", SURFACE_PLUGINS)
+@pytest.mark.parametrize("plugin", BY_DEFAULT)
 def test_every_plugin_has_them(rgb, plugin):
     """After all other channels, in the order of the text; computed once, and the image is that
     without them."""
@@ -209,7 +217,9 @@ def test_every_plugin_has_them(rgb, plugin):
     assert layered.settings["aovs"] == "nn:sh_normal,dd.y:depth"
 
 
-@pytest.mark.parametrize("options", [{}, {"pixel_format": "rgba"}, {"rfilter": "gaussian"}])
+@pytest.mark.parametrize(
+    "options", [{"pixel_format": "rgba"}, *extended({}, {"rfilter": "gaussian"})]
+)
 def test_films_and_crops(rgb, options):
     """As channels of the image that Mitsuba returns, with alpha, and under wide filters."""
     scene = tray("lambertian", "constant", size=24, crop_offset_x=5, crop_width=16, **options)
@@ -244,9 +254,10 @@ def test_nothing_is_made_where_nothing_is_asked_for(rgb, monkeypatch):
 # --- The split of light ---------------------------------------------------------------------------
 
 SPLIT_ALL = "d:direct,i:indirect,c:caustic"
+VARIANTS = "llvm_ad_rgb", "llvm_ad_mono", "llvm_ad_spectral", "cuda_ad_rgb"
+PAIRS = ("llvm_ad_mono", "bdpm_opt3"), ("llvm_ad_spectral", "vcm")
+WIDE = {"rfilter": "gaussian", "pixel_format": "rgba"}
 LARGE = {"max_depth": 4, "camera_paths": 8, "sampler": "independent"}
-REPRESENTATIVES = "bdpm", "bdpm_opt3", "vcm", "bdpt_ris"
-"""Plugins that together have every strategy."""
 OF = {
     "bdpm": {"initial_radius": 0.04, "photon_count": 20000},
     "bdpm_balance": {"initial_radius": 0.04, "photon_count": 20000},
@@ -279,8 +290,12 @@ def reference(integrator, scene, count=16, spp=64):
 @pytest.mark.parametrize(
     "plugin, options",
     [
-        *((plugin, {}) for plugin in SURFACE_PLUGINS),
-        *((plugin, {"rfilter": "gaussian", "pixel_format": "rgba"}) for plugin in REPRESENTATIVES),
+        *((plugin, {}) for plugin in ("bdpm", "bdpt_ris")),
+        *((plugin, WIDE) for plugin in ("bdpm_opt3", "vcm")),
+        *extended(
+            *((plugin, {}) for plugin in SURFACE_PLUGINS if plugin not in ("bdpm", "bdpt_ris")),
+            *((plugin, WIDE) for plugin in ("bdpm", "bdpt_ris")),
+        ),
     ],
 )
 def test_split_sums_to_the_image(rgb, plugin, options):
@@ -305,7 +320,14 @@ def test_split_sums_to_the_image(rgb, plugin, options):
         np.testing.assert_allclose(image[..., :3], plain[..., :3], rtol=1e-4, atol=1e-5 * scale)
 
 
-@pytest.mark.parametrize("plugin", REPRESENTATIVES)
+@pytest.mark.parametrize(
+    "variant, plugin",
+    [
+        *PAIRS,
+        *extended(*(pair for pair in product(VARIANTS, REPRESENTATIVES) if pair not in PAIRS)),
+    ],
+    indirect=["variant"],
+)
 def test_split_in_all_variants(variant, plugin):
     scene = tray("delta", "constant", size=12)
     session = mi.load_dict({"type": plugin, "aovs": SPLIT_ALL, "max_depth": 4}).session(
@@ -318,7 +340,8 @@ def test_split_in_all_variants(variant, plugin):
 
 
 @pytest.mark.parametrize(
-    "plugin", ["bdpm", "bdpm_balance", "bdpm_opt3", "bdpt", "vcm", "pcbpt", "bdpt_ris"]
+    "plugin",
+    ["bdpm_opt3", "vcm", "bdpt_ris", *extended("bdpm", "bdpm_balance", "bdpt", "pcbpt")],
 )
 def test_split_is_that_of_paths(rgb, plugin):
     """Mirrors, glass, masks, and BSDFs that are both, each in a block of its own: each class
@@ -332,7 +355,7 @@ def test_split_is_that_of_paths(rgb, plugin):
         assert_same(mine, its, *visible[k])
 
 
-@pytest.mark.parametrize("plugin", ["bdpm", "bdpm_opt3", "bdpt", "vcm", "bdpt_ris"])
+@pytest.mark.parametrize("plugin", ["bdpm", "bdpt_ris", *extended("bdpm_opt3", "bdpt", "vcm")])
 def test_split_without_delta_surfaces(rgb, plugin):
     """Nothing is a caustic, and direct light is that of two segments; so the rest is indirect, for
     the three sum to the image. False alarms: 1e-6."""
@@ -342,7 +365,7 @@ def test_split_without_delta_surfaces(rgb, plugin):
     assert_same(direct, reference(path(max_depth=2), scene), whole=0.04, block=0.2)
 
 
-@pytest.mark.parametrize("plugin", ["bdpm", "vcm"])
+@pytest.mark.parametrize("plugin", ["bdpm", *extended("vcm")])
 def test_direct_light_of_photons_alone(rgb, plugin):
     """Light that neither a camera path can meet nor next-event estimation can sample: photons that
     have scattered nowhere are no caustics. Against `ptracer`, 1e-6 false alarms."""
@@ -381,7 +404,7 @@ def lamp_in_a_box(in_view=False):
     return mi.load_dict(scene)
 
 
-@pytest.mark.parametrize("plugin", ["bdpm", "bdpm_opt2", "bdpt", "vcm", "bdpt_ris"])
+@pytest.mark.parametrize("plugin", ["vcm", *extended("bdpm", "bdpm_opt2", "bdpt", "bdpt_ris")])
 def test_light_that_leaves_through_glass(rgb, plugin):
     """What it lights is a caustic, all of it; the lamp itself, seen through glass, is direct. The
     caustic against `path`, which meets the lamp by chance; 1e-6 false alarms."""
@@ -401,8 +424,8 @@ def test_light_that_leaves_through_glass(rgb, plugin):
     "plugin, module, size",
     [
         ("bdpm", "bdpm", "CAMERA_CHUNK"),
-        ("bdpt", "bdpt", "CHUNK"),
         ("bdpt_ris", "resampled", "CHUNK"),
+        *extended(("bdpt", "bdpt", "CHUNK")),
     ],
 )
 def test_split_of_films_in_parts(rgb, monkeypatch, plugin, module, size):

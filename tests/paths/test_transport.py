@@ -805,6 +805,21 @@ def test_direct_light_is_looked_for_at_windows(sky):
     assert aimed.var() < 0.3 * own.var(), aimed.var() / own.var()
 
 
+def test_densities_of_direct_light_at_windows_are_one_in_all():
+    """The integral over all directions of the density of next-event estimation, at three places of
+    a room with a window; stratified directions, 5 standard errors."""
+    scene = room_with_window({"type": "constant"})
+    guide, n = EnvironmentGuide(scene, scene.sensors()[0]), 1 << 9
+    rng = np.random.default_rng(3)
+    u = (np.stack(np.meshgrid(range(n), range(n))).reshape(2, -1) + rng.random((2, n * n))) / n
+    towards = mi.warp.square_to_uniform_sphere(mi.Point2f(u.astype(np.float32)))
+    for place in ([1, 1, 0.5], [3, 2, 1.5], [5, 3, 1]):
+        p = mi.Point3f(place) + dr.zeros(mi.Point3f, n * n)
+        density = guide.direct_density(mi.Float(1 / (4 * np.pi)), p, towards)
+        total, error = mean_and_error(4 * np.pi * np.array(density))
+        assert error < 0.02 and abs(total - 1) < 5 * error, (place, total, error)
+
+
 @pytest.mark.parametrize("emitter", ["constant", "sunsky"])
 def test_open_skies_are_not_aimed_at(emitter):
     """Where the sky is everywhere there is nothing to aim at, and what that costs is not done."""

@@ -59,6 +59,15 @@ def test_in_front_of_a_wall(rgb, u):
     lacks(share_at(scene_with(wall={"type": "rectangle", "to_world": place}), 0.0), lost_share(u))
 
 
+def test_above_a_step(rgb):
+    """What lies deeper than half of the radius takes no photons of the disk."""
+    below = {
+        "type": "rectangle",
+        "to_world": mi.ScalarTransform4f().translate([1, 0, -0.6 * RADIUS]),
+    }
+    lacks(share_at(scene_with(below=below), 1 - 0.2 * RADIUS), lost_share(0.2))
+
+
 def test_in_a_corner(rgb):
     """An edge through the centre leaves one half, another at right angles a quarter: shares stop at
     0.4."""

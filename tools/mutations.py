@@ -1,0 +1,341 @@
+"""Forty errors that the tests must find, one change of one line each: `mutants.py` makes them.
+
+Each is really wrong: it moves a mean, a density, a law or a promise, none is the same program in
+other words. `tests` are what should find it, as pytest takes them.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+
+class Mutation(NamedTuple):
+    """A text of a file of `mis_integrators` (there once), what takes its place, and what that
+    breaks."""
+
+    file: str
+    text: str
+    replacement: str
+    breaks: str
+    tests: str
+
+    @property
+    def name(self) -> str:
+        """What the commands call it: the file and what breaks."""
+        return f"{self.file}: {self.breaks}"
+
+
+VECTORS = "tests/test_vectors.py"
+WEIGHTS = "tests/weights/test_bidirectional_weights.py"
+RESAMPLING = "tests/weights/test_resampling.py"
+SEQUENCES = "tests/core/test_sequences.py"
+TRANSPORT = "tests/paths/test_transport.py"
+RADIUS = "tests/pilot/test_radius.py"
+PATHS = "tests/pilot/test_paths_per_pixel.py"
+CACHE = "tests/resampling/test_cache_points.py"
+SHIFTS = "tests/volume/test_shifts.py"
+VIEWS = "tests/volume/test_multiview.py"
+BDPM = "tests/integrators/test_bdpm.py"
+BDPT = "tests/integrators/test_bdpt.py"
+RIS = "tests/integrators/test_bdpt_ris.py"
+BALANCE = "tests/integrators/test_balance.py"
+OPTIMAL = "tests/integrators/test_weights_in_renders.py"
+PATH = "tests/integrators/test_against_path.py"
+ANALYTIC = "tests/integrators/test_analytic.py"
+LONG = "tests/app/test_long_renders.py"
+
+MUTATIONS = [
+    # ------------------------------------------------------------------ weights
+    Mutation(
+        "weights/bidirectional.py",
+        "return d_vcm, at_most(d_vcm * reciprocal(direct), LARGEST_RATIO)",
+        "return d_vcm, at_most(d_vcm * direct, LARGEST_RATIO)",
+        "a density in place of its inverse where light sub-paths start",
+        WEIGHTS,
+    ),
+    Mutation(
+        "weights/heuristics.py",
+        "return bounded_power(ratio, beta) * (1 + total)",
+        "return bounded_power(ratio, beta) * 1 + total",
+        "running sums forget to multiply what came before",
+        VECTORS,
+    ),
+    Mutation(
+        "weights/recursion.py",
+        "return u + tau * u / at_least(rest, SMALLEST_DENOMINATOR)",
+        "return u + tau * u",
+        "the drive of the next vertex without its division",
+        VECTORS,
+    ),
+    Mutation(
+        "weights/resampling.py",
+        "x = at_most(ratio, LARGEST_RATIO) * (N / M)",
+        "x = at_most(ratio, LARGEST_RATIO) / M",
+        "several draws count as one",
+        RESAMPLING,
+    ),
+    # ------------------------------------------------------------------ mis
+    Mutation(
+        "mis/optimal.py",
+        "dr.select(node.last, final, here + deeper), direct)",
+        "dr.select(node.last, final, here), direct)",
+        "weights of deeper strategies are left out of the first one's rest",
+        f"{OPTIMAL}::test_weights_of_a_path_sum_to_one",
+    ),
+    Mutation(
+        "mis/heuristic.py",
+        "after = add_ratio(deeper, ratio(p, q), self.beta)",
+        "after = add_ratio(deeper, ratio(q, p), self.beta)",
+        "a ratio of densities upside down",
+        f"{BALANCE}::test_weights_of_a_path_sum_to_one",
+    ),
+    Mutation(
+        "mis/vertex_merging.py",
+        "theory.connection(connection.density * (1 / self.ratio), a_light",
+        "theory.connection(connection.density, a_light",
+        "joining to the sensor forgets how many light sub-paths there are",
+        f"{BDPT}::test_weights_sum_to_one",
+    ),
+    Mutation(
+        "mis/resampling.py",
+        "return [dr.select(density > 0, better * theory.reciprocal(density), 0)",
+        "return [dr.select(density > 0, theory.reciprocal(density), 0)",
+        "light sub-paths' later vertices do not know of the resampling",
+        f"{RIS}::test_weights_sum_to_one",
+    ),
+    # ------------------------------------------------------------------ paths
+    Mutation(
+        "paths/roulette.py",
+        "return dr.select(plays, throughput * dr.rcp(survival), throughput), active",
+        "return throughput, active",
+        "paths that go on do not stand for those that end",
+        f"{ANALYTIC}::test_roulette_in_sphere",
+    ),
+    Mutation(
+        "paths/light.py",
+        "return bs, delta, weight * adjoint, wo, active",
+        "return bs, delta, weight, wo, active",
+        "no adjoint factor of shading normals",
+        f"{PATH}::test_shading_normals_seen_from_the_light "
+        f"{BDPT}::test_shading_normals_seen_from_the_light",
+    ),
+    Mutation(
+        "paths/connect.py",
+        "* (leaving * dr.rcp(landing * squared))",
+        "* (leaving * dr.rcp(squared))",
+        "joined vertices keep the cosine with which light landed",
+        f"{BDPT}::test_each_technique_in_a_sphere",
+    ),
+    Mutation(
+        "paths/camera.py",
+        "active &= depth < max_depth",
+        "active &= depth <= max_depth",
+        "camera paths go one segment too far",
+        f"{ANALYTIC}::test_point_in_sphere",
+    ),
+    # ------------------------------------------------------------------ lights
+    Mutation(
+        "lights/lights.py",
+        "return dr.rcp(4 * dr.pi * dr.square(ds.dist))",
+        "return dr.rcp(2 * dr.pi * dr.square(ds.dist))",
+        "a point light is taken to shine into half of all directions",
+        f"{BALANCE}::test_emission_ratio",
+    ),
+    Mutation(
+        "lights/lights.py",
+        "flux *= dr.rcp(probability)",
+        "flux *= self.choice.count",
+        "light sub-paths are weighted as if emitters were chosen evenly",
+        f"{TRANSPORT}::test_power_decides_among_emitters "
+        f"{ANALYTIC}::test_many_emitters_at_one_place",
+    ),
+    Mutation(
+        "lights/nearby.py",
+        "return index, dr.gather(mi.Float, self._pmf, first + index)",
+        "return index, dr.gather(mi.Float, self._pmf, index)",
+        "emitters are drawn with one cell's probabilities and weighted with another's",
+        "tests/lights/test_nearby.py",
+    ),
+    Mutation(
+        "lights/environment_guide.py",
+        "mixed = (1 - AIMED_SHARE) * own_pdf + AIMED_SHARE * portals",
+        "mixed = own_pdf + AIMED_SHARE * portals",
+        "the density of direct light from windows is more than one in all",
+        f"{TRANSPORT}::test_densities_of_direct_light_at_windows_are_one_in_all",
+    ),
+    # ------------------------------------------------------------------ photons
+    Mutation(
+        "photons/gather.py",
+        "hit &= landing.depth + vertices.depth <= max_depth",
+        "hit &= landing.depth + vertices.depth < max_depth",
+        "merged paths end one segment too early",
+        f"{ANALYTIC}::test_point_in_sphere",
+    ),
+    Mutation(
+        "photons/gather.py",
+        "return (alike > 0) & (dr.square(alike)",
+        "return (alike == alike) & (dr.square(alike)",
+        "sheets back to back share their photons",
+        f"{BDPM}::test_sheets_that_let_light_through_keep_their_photons",
+    ),
+    Mutation(
+        "photons/grid.py",
+        "self.reach = radius * inverse * 1.0001",
+        "self.reach = radius * inverse * 0.9",
+        "photons in the outermost cells of a query are missed",
+        f"{TRANSPORT}::test_map_finds_what_brute_force_finds",
+    ),
+    Mutation(
+        "photons/coverage.py",
+        "& (dr.abs(dr.dot(offset, normal)) < SAME_SURFACE_OFFSET * radius)",
+        "& (dr.abs(dr.dot(offset, normal)) < radius)",
+        "surfaces far below a disk count as covering it",
+        "tests/photons",
+    ),
+    # ------------------------------------------------------------------ pilot
+    Mutation(
+        "pilot/bias.py",
+        "m * (m - 1)\n    )",
+        "m * m\n    )",
+        "products of iterations are biased",
+        RADIUS,
+    ),
+    Mutation(
+        "pilot/radius.py",
+        "predicted = bias + variance / iterations(fine, corrected)",
+        "predicted = bias + variance",
+        "the radius does not know how long a render will be",
+        RADIUS,
+    ),
+    Mutation(
+        "pilot/noise.py",
+        "return floor + np.maximum.accumulate(photons[::-1])[::-1] / radii**2",
+        "return floor + photons / radii**2",
+        "small disks are believed to be without noise",
+        RADIUS,
+    ),
+    Mutation(
+        "pilot/direct_paths.py",
+        "paths = np.clip(wanted ** (1 / (1 + exponent)), 1, MOST_PATHS)",
+        "paths = np.clip(wanted ** (1 / exponent), 1, MOST_PATHS)",
+        "noisy pixels send too many paths",
+        PATHS,
+    ),
+    # ------------------------------------------------------------------ resampling
+    Mutation(
+        "resampling/proposals.py",
+        "mean += (1 - share) * dr.maximum(upper - lower, 0)",
+        "mean += dr.maximum(upper - lower, 0)",
+        "probabilities of draws sum to more than one",
+        f"{CACHE}::test_draws_have_their_probability",
+    ),
+    Mutation(
+        "resampling/light_vertices.py",
+        'leaving * (y["d_vcm"] + back * y["d_vc"]),',
+        'leaving * y["d_vcm"],',
+        "techniques farther along the light sub-path are left out of the weights",
+        f"{RIS}::test_weights_sum_to_one "
+        f"{RIS}::test_guessed_weight_is_the_weight_where_nothing_is_guessed",
+    ),
+    Mutation(
+        "resampling/light_vertices.py",
+        "+ dr.gather(mi.UInt32, lengths, last) - before",
+        "- before",
+        "the last light sub-path's vertices are never drawn",
+        f"{RIS}::test_point_in_sphere {RIS}::test_one_dominant_sub_path",
+    ),
+    Mutation(
+        "resampling/cache_points.py",
+        "return 2 * axis + dr.select(component < 0, mi.UInt32(1), mi.UInt32(0))",
+        "return 2 * axis",
+        "both sides of a wall share their cache points",
+        CACHE,
+    ),
+    # ------------------------------------------------------------------ volume
+    Mutation(
+        "volume/shifts.py",
+        "_log(C) + 0 * tau,",
+        "0 * tau,",
+        "a stretch by majorant optical depth without its derivative",
+        SHIFTS,
+    ),
+    Mutation(
+        "volume/media.py",
+        "value[faint] = dr.select(survives, 2 * value, 0)",
+        "value[faint] = dr.select(survives, value, 0)",
+        "roulette on the way to a light loses half of what is faint",
+        f"{VIEWS}::test_transmittance {VIEWS}::test_little_light",
+    ),
+    Mutation(
+        "volume/suffixes.py",
+        "dr.select(on_delta_light, 1, mis_power(light_pdf, light_scatter_pdf))",
+        "dr.select(on_delta_light, 1, mis_power(light_scatter_pdf, light_pdf))",
+        "the two ways to a light have each other's weights",
+        f"{VIEWS}::test_one_view_is_volpath",
+    ),
+    Mutation(
+        "volume/lines.py",
+        "density = dr.select(on_surface, density * dr.abs(dr.dot(surface.n, d)), density)",
+        "density = dr.select(on_surface, density, density)",
+        "views share surfaces without the cosine at which they see them",
+        f"{VIEWS}::test_views_on_both_sides_of_a_surface {VIEWS}::test_surfaces",
+    ),
+    # ------------------------------------------------------------------ core
+    Mutation(
+        "core/sequences.py",
+        "(2, 0x33333333),",
+        "(2, 0x0F0F0F0F),",
+        "the second coordinate of the sequences is no Sobol' coordinate",
+        SEQUENCES,
+    ),
+    Mutation(
+        "core/packing.py",
+        "return (word >> (2 * _SURFACE_NORMAL_BITS)) & MAX_DEPTH",
+        "return (word >> (2 * _SURFACE_NORMAL_BITS)) & (MAX_DEPTH >> 1)",
+        "depths from 256 on are read back too small",
+        f"{TRANSPORT}::test_surface_round_trip",
+    ),
+    Mutation(
+        "core/stratified_variance.py",
+        "return sum(counts.values()) - 2 * pairs / half",
+        "return sum(counts.values()) - pairs / half",
+        "the law of stratified variance counts covariances once",
+        "tests/core/test_stratified_variance.py",
+    ),
+    Mutation(
+        "core/film.py",
+        'return sums["square"] - 2 * mean * sums["cross"] + mean',
+        'return sums["square"] - mean * sums["cross"] + mean',
+        "the variance of a weighted mean forgets half of the covariance",
+        f"tests/core/test_variance_of_renders.py {BDPM}::test_variance_is_that_of_the_mean",
+    ),
+    # ------------------------------------------------------------------ app
+    Mutation(
+        "app/checkpoint.py",
+        "if hashlib.sha256(body).digest() != digest:",
+        "if len(digest) != _DIGEST_BYTES:",
+        "a damaged checkpoint is not found out",
+        f"{LONG}::test_damage_is_found",
+    ),
+    Mutation(
+        "app/target_error.py",
+        "(np.square(mean) + level**2)",
+        "(np.square(mean) + level)",
+        "the relative error hangs on the unit of light",
+        f"{LONG}::test_relative_error_of_known_noise",
+    ),
+    Mutation(
+        "app/fingerprint.py",
+        'for pattern in ("*.py", "*.json")',
+        'for pattern in ("*.py",)',
+        "tables that change do not make another render",
+        "tests/app/test_faults.py::test_fingerprint_is_of_every_source",
+    ),
+    Mutation(
+        "app/render_loop.py",
+        "if self.requested or not self.have_result:",
+        "if not self.have_result:",
+        "a second interrupt does not stop at once",
+        "tests/app/test_cli.py::test_second_interrupt_stops_at_once",
+    ),
+]
