@@ -417,27 +417,22 @@ def test_any_value_that_was_learned(sessions, name, value):
 # --- Checkpoints --------------------------------------------------------------
 
 
-@pytest.fixture
-def kept(scene, tmp_path):
+@pytest.fixture(scope="module")
+def rendered(tmp_path_factory):
     """The checkpoint of a finished render."""
-    assert (
-        render(
-            scene,
-            "-i",
-            "bdpm",
-            "-o",
-            tmp_path / "a.exr",
-            "-D",
-            "size=8",
-            "--spp",
-            2,
-            "--checkpoint",
-            100,
-            "--quiet",
-        )
-        == 0
-    )
-    return tmp_path / "a.checkpoint"
+    folder = tmp_path_factory.mktemp("kept")
+    mi.set_variant("llvm_ad_rgb")
+    options = "-i", "bdpm", "-D", "size=8", "--spp", 2, "--checkpoint", 100, "--quiet"
+    assert render(write_scene(folder), *options, "-o", folder / "a.exr") == 0
+    return (folder / "a.checkpoint").read_bytes()
+
+
+@pytest.fixture
+def kept(rendered, tmp_path):
+    """A copy of it, beside the same scene in another folder."""
+    copy = tmp_path / "a.checkpoint"
+    copy.write_bytes(rendered)
+    return copy
 
 
 def resume(scene, kept) -> int:

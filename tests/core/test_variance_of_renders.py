@@ -8,6 +8,7 @@ import mis_integrators  # noqa: F401  before mitsuba: it chooses the LLVM
 import mitsuba as mi
 import numpy as np
 import pytest
+from selection import extended
 
 SCENES = Path(__file__).parents[2] / "scenes"
 SEEDS = 24
@@ -58,9 +59,11 @@ def blocks(image):
 @pytest.mark.parametrize(
     "name, width, height, radius, rfilter, counts",
     [
-        ("cornell_area", 32, 32, 0.17, "box", (16, 64)),
         ("cornell_area", 32, 32, 0.17, "gaussian", (16,)),
-        ("caustics", 32, 24, 0.2, "box", (16,)),
+        *extended(
+            ("cornell_area", 32, 32, 0.17, "box", (16, 64)),
+            ("caustics", 32, 24, 0.2, "box", (16,)),
+        ),
     ],
 )
 def test_variance_channels_tell_the_variance(rgb, name, width, height, radius, rfilter, counts):
@@ -70,7 +73,7 @@ def test_variance_channels_tell_the_variance(rgb, name, width, height, radius, r
     caustics; so 25 % are four to eight standard deviations away for the former (false alarms below
     1e-4 a case) and 2.7 for the latter (4e-3). A block's has about 10 %: a factor 2 is beyond
     chance. What took iterations for independent would find 1.4 to 1.7 for the whole image, and be
-    off by more than two in an eighth of the blocks of the first case.
+    off by more than two in an eighth of the blocks of the second case.
 
     Lamps are hidden: the edge of a bright, axis-aligned shape falls on the same place of all pixels
     in a row, and the variance after 2 n iterations cannot be told from n: the area of a pixel that

@@ -5,14 +5,16 @@ Each comparison sees an error of 1 % in the image and of 3 % in each 16 x 16 blo
 BSDF; 8 % where mirrors and glass are about or rough glass stands under a point light, 3 % in the
 full product) with a probability of 0.95, at a false-alarm rate of 1e-6 (`comparing`). The merge
 radius is a tenth of the spheres'; `test_bias_is_below_resolution` shows that what it blurs is not
-seen. The default run covers every pair of (emitter, family of BSDFs), the depths bdd, sensors,
-variants and filters in turn; `-m full` adds the full product of emitters, families and bdd.
+seen. The rows cover every pair of (emitter, family of BSDFs), the depths bdd, sensors, variants and
+filters in turn; those of `BY_DEFAULT` are in the default run, with each family, sensor and variant,
+the others are extended. `-m full` adds the full product of emitters, families and bdd.
 """
 
 import mitsuba as mi
 import numpy as np
 import pytest
 from comparing import SessionBatches, agree, assert_same, collect_until
+from selection import extended
 from worlds import (
     EMITTERS,
     POINT_LIKE,
@@ -33,7 +35,7 @@ RGB, MONO, SPECTRAL = "llvm_ad_rgb", "llvm_ad_mono", "llvm_ad_spectral"
 PERSPECTIVE, LENS, ORTHO = "perspective", "thinlens", "orthographic"
 
 # emitter, family, bdd, sensor, variant, filter
-DEFAULT = [
+ROWS = [
     ("rectangle", "mixed0", 0, PERSPECTIVE, RGB, "box"),
     ("sphere", "mixed1", 1, LENS, RGB, "box"),
     ("disk", "mixed2", 2, ORTHO, MONO, "tent"),
@@ -56,6 +58,12 @@ DEFAULT = [
     ("several", "smooth2", 0, LENS, RGB, "lanczos"),
     ("envmap rotated", "smooth1", 1, PERSPECTIVE, MONO, "box"),
 ]
+BY_DEFAULT = [
+    ("disk", "mixed2", 2, ORTHO, MONO, "tent"),
+    ("constant", "mixed0", 1, ORTHO, SPECTRAL, "box"),
+    ("directionalarea", "smooth1", 0, PERSPECTIVE, RGB, "box"),
+    ("several", "smooth2", 0, LENS, RGB, "lanczos"),
+]
 
 
 def oracle(emitter, depth=4):
@@ -65,8 +73,8 @@ def oracle(emitter, depth=4):
 
 @pytest.mark.parametrize(
     "emitter, family, bdd, sensor, variant_name, rfilter",
-    DEFAULT,
-    ids=["-".join(map(str, row)).replace(" ", "_") for row in DEFAULT],
+    BY_DEFAULT + extended(*(row for row in ROWS if row not in BY_DEFAULT)),
+    ids=lambda value: str(value).replace(" ", "_"),
 )
 def test_agrees(emitter, family, bdd, sensor, variant_name, rfilter):
     mi.set_variant(variant_name)
@@ -80,7 +88,7 @@ def test_agrees(emitter, family, bdd, sensor, variant_name, rfilter):
     )
 
 
-def test_default_run_covers_all_pairs():
+def test_rows_cover_all_pairs():
     """Every emitter meets each of the families that its oracle can judge, every bdd each family,
     sensor and variant."""
     rows = [
@@ -95,7 +103,7 @@ def test_default_run_covers_all_pairs():
             s,
             v,
         )
-        for e, f, b, s, v, _ in DEFAULT
+        for e, f, b, s, v, _ in ROWS
     ]
     meets = {(e, name) for e, f, *_ in rows for name in f.split()}
     families = ("lambertian", "rough", "delta")
@@ -205,7 +213,8 @@ def caustic_scene(emitter):
 
 
 @pytest.mark.parametrize(
-    "emitter, bdd", [("point", 0), ("directional", 1), ("projector", 2), ("directionalarea", 1)]
+    "emitter, bdd",
+    [("directionalarea", 1), *extended(("point", 0), ("directional", 1), ("projector", 2))],
 )
 def test_caustics_against_ptracer(rgb, emitter, bdd):
     """Light that reaches a floor by mirror and glass: `ptracer` connects the floor to the camera (2
@@ -223,7 +232,7 @@ def test_caustics_against_ptracer(rgb, emitter, bdd):
 # --- Shading normals ----------------------------------------------------------
 
 
-@pytest.mark.thinned(2, 2)
+@pytest.mark.thinned(2, 2, 4)
 @pytest.mark.parametrize("bdd", [0, 1])
 @pytest.mark.parametrize("tilt", [-0.5, 0.5])
 def test_shading_normals_seen_from_the_light(rgb, bdd, tilt):
@@ -270,7 +279,7 @@ def test_shading_normals_seen_from_the_light(rgb, bdd, tilt):
 # --- Light whose texture coordinates overlap ----------------------------------
 
 
-@pytest.mark.parametrize("bdd", [0, 1])
+@pytest.mark.parametrize("bdd", [0, *extended(1)])
 def test_textured_cube_light(rgb, bdd):
     """A cube's faces share their texture coordinates; there `path` is wrong, and BSDF sampling
     alone (`direct`) is the oracle."""
@@ -307,7 +316,7 @@ def test_textured_cube_light(rgb, bdd):
 
 @pytest.mark.parametrize(
     "family, emitter",
-    [("mixed0", "rectangle"), pytest.param("smooth1", "point", marks=pytest.mark.full)],
+    [*extended(("mixed0", "rectangle")), pytest.param("smooth1", "point", marks=pytest.mark.full)],
 )
 def test_bias_is_below_resolution(rgb, family, emitter):
     """At twice the radius, four times the bias: if even that is not seen against half the radius,

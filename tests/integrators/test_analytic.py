@@ -10,9 +10,11 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from comparing import Estimate, SessionBatches, assert_same, collect_until
+from selection import extended
 from worlds import diffuse, film, grey, look
 
-BDD = pytest.mark.parametrize("bdd", [0, 1, 2, 3])
+EACH = pytest.mark.parametrize("bdd", [0, 1, 2, 3])
+BDD = pytest.mark.parametrize("bdd", [0, 2, *extended(1, 3)])
 
 
 def T():
@@ -81,8 +83,8 @@ def series(first, ratio, count):
 # --- Point light in the middle of a diffuse sphere ----------------------------
 
 
-@pytest.mark.thinned(4, 2)
-@BDD
+@pytest.mark.thinned(4, 2, 4)
+@EACH
 @pytest.mark.parametrize("max_depth", [-1, 2, 3, 4, 5])
 def test_point_in_sphere(rgb, bdd, max_depth):
     """Irradiance I/r^2 everywhere; each bounce hands on rho of it: L = rho I / pi (1 + rho + rho^2
@@ -153,7 +155,8 @@ def test_many_emitters_at_one_place(rgb, bdd):
     )
 
 
-@BDD
+@pytest.mark.thinned(4, 1, 4)
+@EACH
 @pytest.mark.parametrize("rr_depth", [1, 50])
 def test_roulette_in_sphere(rgb, bdd, rr_depth):
     """Roulette from the first bounce on, or never, leaves the mean alone (albedo 0.8)."""
@@ -166,8 +169,8 @@ def test_roulette_in_sphere(rgb, bdd, rr_depth):
 # --- Furnaces -----------------------------------------------------------------
 
 
-@pytest.mark.thinned(4, 2)
-@BDD
+@pytest.mark.thinned(4, 2, 4)
+@EACH
 @pytest.mark.parametrize("max_depth", [-1, 1, 2, 3, 4])
 def test_furnace_of_emitting_sphere(rgb, bdd, max_depth):
     """Walls of albedo rho that emit L: L (1 + rho + rho^2 + ...), one term a segment.
@@ -183,8 +186,8 @@ def test_furnace_of_emitting_sphere(rgb, bdd, max_depth):
     )
 
 
-@pytest.mark.thinned(4, 2)
-@BDD
+@pytest.mark.thinned(4, 2, 4)
+@EACH
 @pytest.mark.parametrize(
     "material", ["diffuse", "conductor", "dielectric", "thindielectric", "mask", "null", "blend"]
 )
@@ -377,7 +380,7 @@ def test_light_through_mask(rgb, bdd):
 # --- What is not there --------------------------------------------------------
 
 
-@pytest.mark.parametrize("bdd", [0, 1])
+@pytest.mark.parametrize("bdd", [1, *extended(0)])
 def test_index_matched_pane(rgb, bdd):
     """A pane without refraction is no obstacle: all direct light comes by way of caustic
     photons."""

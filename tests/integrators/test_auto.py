@@ -18,6 +18,7 @@ from comparing import Estimate, PathBatches, agree, assert_same, block_means, co
 from foggy import even, view, volpath
 from foggy import grid as smoke
 from foggy import world as foggy_world
+from selection import extended
 from test_against_path import MONO, RGB, SPECTRAL, caustic_scene
 from test_bdpm import box_scene, glossy_box, last_words
 from worlds import diffuse, film, look, path, tray
@@ -60,7 +61,7 @@ class Unidirectional:
     "variant_name, kind, rfilter",
     [
         (RGB, "perspective", "gaussian"),
-        (MONO, "thinlens", "box"),
+        *extended((MONO, "thinlens", "box")),
         pytest.param(SPECTRAL, "orthographic", "tent", marks=pytest.mark.full),
     ],
 )
@@ -93,7 +94,7 @@ class Renders:
         return Estimate.of(self.batches)
 
 
-@pytest.mark.parametrize("sampler", ("sobol", "independent"))
+@pytest.mark.parametrize("sampler", ["sobol", *extended("independent")])
 def test_mean_of_whole_renders(rgb, sampler):
     """A few iterations together, with whatever their random numbers share, have the mean of `path`
     (false-alarm rate 1e-6; an error of 1 % of the whole image or of 8 % of a block is seen)."""
@@ -124,7 +125,7 @@ def test_sequences_lower_the_variance_of_path(rgb):
     assert lit.sum() > 500 and np.median(sobol[lit] / independent[lit]) < 0.7
 
 
-@pytest.mark.parametrize("sampler", ("sobol", "independent"))
+@pytest.mark.parametrize("sampler", ["sobol", *extended("independent")])
 def test_path_in_parts(rgb, monkeypatch, sampler):
     """Large films are traced in parts, and iterations in any order: it makes no difference. (What
     atomic additions on the film round differs.)"""
@@ -244,7 +245,7 @@ def test_no_light(rgb):
     assert session.image().max() == 0 and decided(scene).image().max() > 0
 
 
-@pytest.mark.parametrize("emitter", ["point", "directional"])
+@pytest.mark.parametrize("emitter", ["point", *extended("directional")])
 def test_path_is_not_chosen_where_it_is_blind(rgb, emitter):
     """However cheap `path` were: caustics of lights without extent it cannot see."""
     settings = decided(caustic_scene(emitter)).settings
@@ -359,7 +360,7 @@ def test_a_short_render_does_not_spend_its_time_on_trials(rgb, seconds, tried):
     assert "bdpm bdd=0" in session.decision.errors
 
 
-@pytest.mark.parametrize("sampler", ["independent", "sobol"])
+@pytest.mark.parametrize("sampler", ["sobol", *extended("independent")])
 def test_prediction_is_checked(rgb, sampler):
     """The error that is predicted for `path` is what twelve renders have: within a factor of two,
     the pilot's pixels being few."""
@@ -386,7 +387,7 @@ def test_prediction_is_checked(rgb, sampler):
 # --- The image ----------------------------------------------------------------
 
 
-@pytest.mark.parametrize("variant_name", [RGB, MONO])
+@pytest.mark.parametrize("variant_name", [RGB, *extended(MONO)])
 def test_image_is_that_of_the_integrator_chosen(variant_name):
     mi.set_variant(variant_name)
     scene = glossy_box()

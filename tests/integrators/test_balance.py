@@ -21,6 +21,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from comparing import PathBatches, SessionBatches, agree, assert_same, collect_until
+from selection import extended
 from test_against_path import MONO, RGB, SPECTRAL
 from worlds import RADIUS, T, diffuse, film, has_delta, look, path, ptracer, tray
 
@@ -213,7 +214,7 @@ class JointPaths:
         return brought[0] / brought[1]
 
 
-@pytest.mark.thinned(4, 2)
+@pytest.mark.thinned(4, 2, 4)
 @pytest.mark.parametrize("beta", [1, 2])
 @pytest.mark.parametrize("strategies", [2, 3])
 @pytest.mark.parametrize("bsdf", ["diffuse", "rough"])
@@ -259,6 +260,7 @@ def pdf_of(si, bsdf, arriving, leaving, mode):
     return np.array(bsdf.pdf(mi.BSDFContext(mode), view, leaving) / dr.abs(leaving.z))
 
 
+@pytest.mark.thinned(4, 1, 4)
 @pytest.mark.parametrize("beta", [1, 2])
 @pytest.mark.parametrize("bsdf", ["diffuse", "rough"])
 @pytest.mark.parametrize("light", ["point", "area"])
@@ -364,8 +366,7 @@ def test_emission_ratio(rgb, emitter):
 RENDERS = [
     (RGB, "smooth0", "rectangle", 3, 1.0),
     (MONO, "mixed0", "envmap", 2, 2.0),
-    (SPECTRAL, "lambertian", "spot", 4, 1.0),
-    (RGB, "lambertian", "sphere", 6, 1.5),
+    *extended((SPECTRAL, "lambertian", "spot", 4, 1.0), (RGB, "lambertian", "sphere", 6, 1.5)),
 ]
 MORE_RENDERS = [
     pytest.param(RGB, family, emitter, strategies, beta, marks=pytest.mark.full)
@@ -424,7 +425,7 @@ def storeys(emitter, pane):
 
 
 @pytest.mark.parametrize(
-    "emitter, pane, beta", [("area", True, 1.0), ("directionalarea", False, 2.0)]
+    "emitter, pane, beta", [("area", True, 1.0), *extended(("directionalarea", False, 2.0))]
 )
 def test_caustic_photons_have_the_weight_of_direct_light(rgb, emitter, pane, beta):
     """Light that next-event estimation cannot make, with photons of their own radius, against
@@ -440,7 +441,10 @@ def test_caustic_photons_have_the_weight_of_direct_light(rgb, emitter, pane, bet
 
 @pytest.mark.parametrize(
     "strategies, beta",
-    [(2, 1.0), *(pytest.param(*pair, marks=pytest.mark.full) for pair in ((1, 1.0), (3, 2.0)))],
+    [
+        *extended((2, 1.0)),
+        *(pytest.param(*pair, marks=pytest.mark.full) for pair in ((1, 1.0), (3, 2.0))),
+    ],
 )
 def test_agrees_with_one_strategy(rgb, strategies, beta):
     scene = tray("lambertian", "rectangle")

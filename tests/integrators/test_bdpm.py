@@ -28,6 +28,7 @@ from comparing import (
     pictures,
     smallest_visible,
 )
+from selection import extended
 from worlds import T, bdpm, diffuse, film, grey, lit_ball, look, path, sensor, tray
 
 
@@ -110,7 +111,7 @@ def last_words(error):
 # --- Strategies and bias ------------------------------------------------------
 
 
-@pytest.mark.parametrize("first, second", [(0, 1), (1, 2), (2, 3)])
+@pytest.mark.parametrize("first, second", [(0, 1), *extended((1, 2), (2, 3))])
 def test_strategies_agree(rgb, first, second):
     scene = glossy_box(size=48)
     a, b = (
@@ -319,8 +320,9 @@ def test_variance_needs_two_iterations(rgb):
 # --- Film ---------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("rfilter", ["box", "gaussian"])
-@pytest.mark.parametrize("bdd", [0, 1])
+@pytest.mark.parametrize(
+    "rfilter, bdd", [("gaussian", 1), *extended(("box", 0), ("box", 1), ("gaussian", 0))]
+)
 def test_crop_is_the_cropped_window(rgb, rfilter, bdd):
     window = {"crop_offset_x": 8, "crop_offset_y": 16, "crop_width": 16, "crop_height": 8}
     crop = box_scene(32, rfilter, window)
@@ -344,8 +346,17 @@ def test_crop_is_the_cropped_window(rgb, rfilter, bdd):
 
 
 @pytest.mark.thinned(5, 2)
-@pytest.mark.parametrize("rfilter", ["gaussian", "tent", "mitchell", "lanczos", "catmullrom"])
-@pytest.mark.parametrize("border", [False, True])
+@pytest.mark.parametrize(
+    "rfilter, border",
+    [
+        ("mitchell", True),
+        *extended(
+            ("mitchell", False),
+            *((rfilter, False) for rfilter in ("gaussian", "tent", "lanczos", "catmullrom")),
+            *((rfilter, True) for rfilter in ("gaussian", "tent", "lanczos", "catmullrom")),
+        ),
+    ],
+)
 def test_reconstruction_filters(rgb, rfilter, border):
     """Means of border rows and columns and of the whole agree with `path`, whatever the filter and
     its border."""
@@ -412,8 +423,7 @@ def test_alpha_channel_is_that_of_path(rgb):
         )
 
 
-@pytest.mark.parametrize("hide", [False, True])
-@pytest.mark.parametrize("bdd", [0, 1])
+@pytest.mark.parametrize("hide, bdd", [(True, 0), *extended((False, 0), (False, 1), (True, 1))])
 def test_hidden_emitters(rgb, hide, bdd):
     """A lamp and a sky in view."""
     scene = mi.load_dict(
@@ -463,7 +473,8 @@ def test_light_that_meets_nothing(rgb):
 
 
 @pytest.mark.parametrize(
-    "max_depth", [0, 1, 2, 3, *(pytest.param(depth, marks=pytest.mark.full) for depth in (4, 5))]
+    "max_depth",
+    [0, *extended(1, 2, 3), *(pytest.param(depth, marks=pytest.mark.full) for depth in (4, 5))],
 )
 def test_max_depth(rgb, max_depth):
     """Whole paths are cut at the same length as `path` cuts them, for all bdd (1.5 % of the whole
@@ -481,7 +492,7 @@ def test_max_depth(rgb, max_depth):
         assert_same(*collect_until(side, oracle, whole=0.015), whole=0.015)
 
 
-@pytest.mark.parametrize("bdd", [0, 1])
+@pytest.mark.parametrize("bdd", [1, *extended(0)])
 def test_direct_light_of_directionalarea(rgb, bdd):
     """Next-event estimation cannot make it, so photons do, at max_depth = 2 as well: L = rho / pi M
     cos(theta)."""
@@ -511,8 +522,9 @@ def test_direct_light_of_directionalarea(rgb, bdd):
 
 
 @pytest.mark.thinned(2, 2)
-@pytest.mark.parametrize("bdd", [0, 2])
-@pytest.mark.parametrize("rr_depth", [1, 2, 50])
+@pytest.mark.parametrize(
+    "rr_depth, bdd", [(1, 2), *extended((1, 0), (2, 0), (2, 2), (50, 0), (50, 2))]
+)
 def test_roulette_leaves_the_mean(rgb, bdd, rr_depth):
     agree(
         bdpm(bdd=bdd, rr_depth=rr_depth, max_depth=-1),
@@ -521,7 +533,7 @@ def test_roulette_leaves_the_mean(rgb, bdd, rr_depth):
     )
 
 
-@pytest.mark.parametrize("camera_paths, photon_count", [(2, 50000), (7, 3000), (16, 0)])
+@pytest.mark.parametrize("camera_paths, photon_count", [(7, 3000), *extended((2, 50000), (16, 0))])
 def test_numbers_of_paths_leave_the_mean(rgb, camera_paths, photon_count):
     agree(
         bdpm(bdd=0, camera_paths=camera_paths, photon_count=photon_count),
@@ -561,8 +573,19 @@ def test_rounding_up_is_said_once(rgb):
         assert not [text for text in lines if "rounded up" in text]
 
 
-@pytest.mark.parametrize("plugin", ("bdpm", "bdpt", "bdpm_auto", "volpath_multiview"))
-@pytest.mark.parametrize("sampler", ("independent", "multijitter"))
+@pytest.mark.parametrize(
+    "plugin, sampler",
+    [
+        ("bdpm", "multijitter"),
+        ("volpath_multiview", "multijitter"),
+        ("bdpm", "independent"),
+        *extended(
+            ("bdpt", "multijitter"),
+            ("bdpm_auto", "multijitter"),
+            *((plugin, "independent") for plugin in ("bdpt", "bdpm_auto", "volpath_multiview")),
+        ),
+    ],
+)
 def test_samplers_that_are_not_used_are_named_once(rgb, plugin, sampler):
     """By `mi.render`, and for `mis-render` in the remarks of the session."""
     scene = lit_ball(4, 4, sampler={"type": sampler, "sample_count": 4})
@@ -593,7 +616,7 @@ def with_capacity(scene, photons=None, vertices=None, **parameters):
     return session.image()
 
 
-@pytest.mark.parametrize("bdd", [0, 1])
+@pytest.mark.parametrize("bdd", [1, *extended(0)])
 def test_photons_that_overflow_are_not_lost(rgb, bdd):
     scene = glossy_box()
     np.testing.assert_allclose(
@@ -656,7 +679,7 @@ def test_vertices_that_overflow_in_the_pilot_are_not_lost(rgb, monkeypatch):
         assert radii[1][kind] == pytest.approx(radius, rel=0.05)
 
 
-@pytest.mark.parametrize("chunk", [333, 1024])
+@pytest.mark.parametrize("chunk", [333, *extended(1024)])
 def test_camera_pass_in_parts(rgb, monkeypatch, chunk):
     scene = glossy_box()
     whole = with_capacity(scene)
@@ -704,6 +727,7 @@ def lit_from_one_side(thickness=0.0):
     )
 
 
+@pytest.mark.thinned(4, 1, 3)
 @pytest.mark.parametrize("thickness", [0.0, None, 1e-4, 0.01])
 @pytest.mark.parametrize("bdd", [0, 1])
 def test_no_light_leaks_through_a_wall(rgb, thickness, bdd):
@@ -776,7 +800,7 @@ def test_sheets_that_let_light_through_keep_their_photons(rgb):
     agree(bdpm(bdd=0, max_depth=5, initial_radius=0.05), path(max_depth=5), scene, blocks=2)
 
 
-@pytest.mark.parametrize("bdd", [0, 1])
+@pytest.mark.parametrize("bdd", [1, *extended(0)])
 def test_merged_shapes(rgb, bdd):
     """Mitsuba merges shapes that share a BSDF into one mesh: photons must be found there too."""
     scene = mi.load_dict(
@@ -800,7 +824,7 @@ def test_merged_shapes(rgb, bdd):
     agree(bdpm(bdd=bdd, max_depth=4, initial_radius=0.1), path(max_depth=4), scene, blocks=2)
 
 
-@pytest.mark.parametrize("lamps", [1, 2])
+@pytest.mark.parametrize("lamps", [2, *extended(1)])
 def test_shapes_without_points_to_sample(rgb, tmp_path, lamps):
     """Instances and curves have no points on them to give, and are not asked for any: they are no
     lamps. (`path` 2 % and 5 %.)"""
@@ -873,7 +897,7 @@ def test_a_camera_that_sees_one_point(rgb):
     assert a.session.radii["indirect"] > 0.03
 
 
-@pytest.mark.parametrize("plugin", ["bdpm", "bdpt"])
+@pytest.mark.parametrize("plugin", ["bdpm", *extended("bdpt")])
 def test_irradiance_meter(rgb, plugin):
     """A sensor of another kind, on a surface, under a lamp and a sky (5 % of its one value)."""
     scene = box_scene(
@@ -916,11 +940,16 @@ def test_rare_photons_get_no_smallest_radius(rgb):
 # --- Camera paths of an iteration ---------------------------------------------
 
 
-@pytest.mark.parametrize("camera_paths", [2, 8])
 @pytest.mark.parametrize(
-    "plugin, given",
-    [("bdpm", {"bdd": 0}), ("bdpm", {"bdd": 1}), ("bdpm_opt2", {})],
-    ids=["bdd0", "bdd1", "opt2"],
+    "plugin, given, camera_paths",
+    [
+        ("bdpm", {"bdd": 0}, 8),
+        *extended(
+            ("bdpm", {"bdd": 0}, 2),
+            *(("bdpm", {"bdd": 1}, paths) for paths in (2, 8)),
+            *(("bdpm_opt2", {}, paths) for paths in (2, 8)),
+        ),
+    ],
 )
 def test_noise_of_several_camera_paths_is_foreseen(rgb, plugin, given, camera_paths):
     """The pilot has as many: within a factor 1.3 of twelve renders. (Its law is that of independent
@@ -1163,7 +1192,7 @@ def test_variants_in_turn():
     assert images[1].mean() > 0
 
 
-@pytest.mark.parametrize("max_depth", [1, 2, 3])
+@pytest.mark.parametrize("max_depth", [1, *extended(2, 3)])
 def test_alpha_at_the_last_depth(rgb, max_depth):
     """What a path meets at its very last segment covers the background too, as in `path`: opaque,
     half transparent, or through a pane. (Standard error of a corner's mean 0.002; five of them.)"""
@@ -1241,7 +1270,7 @@ def kernels(integrator, scene, seed):
     return kernels_of(lambda: [session.iterate() for _ in range(2)])
 
 
-@pytest.mark.parametrize("plugin", ["bdpm", "bdpm_opt2"])
+@pytest.mark.parametrize("plugin", ["bdpm_opt2", *extended("bdpm")])
 def test_no_seed_has_kernels_of_its_own(rgb, plugin):
     """Numbers that depend on chance are not literals: seconds of compiling would come again with
     each seed."""

@@ -42,6 +42,7 @@ from comparing import (
     differences,
     pictures,
 )
+from selection import extended
 from test_against_path import MONO, RGB, SPECTRAL, caustic_scene
 from test_analytic import block_average, floor_from_above, inside_sphere, point_irradiance, series
 from test_bdpm import box_scene, glossy_box, last_words
@@ -487,7 +488,8 @@ def test_each_technique_in_an_emitting_sphere(rgb):
 
 
 @pytest.mark.parametrize(
-    "kind, rfilter", [("orthographic", "box"), ("thinlens", "gaussian"), ("perspective", "tent")]
+    "kind, rfilter",
+    [("orthographic", "box"), ("thinlens", "gaussian"), *extended(("perspective", "tent"))],
 )
 def test_light_tracing_to_each_sensor(rgb, kind, rfilter):
     """A floor in the even part of a spot light, seen straight from above through a crop window:
@@ -552,18 +554,20 @@ def test_pyramid_adds_up(rgb):
 # --- Images -------------------------------------------------------------------
 
 # emitter, family, sensor, variant, filter
-DEFAULT = [
+ROWS = [
     ("rectangle", "lambertian", "perspective", SPECTRAL, "box"),
-    ("envmap rotated", "mixed2", "thinlens", RGB, "gaussian"),
     ("several", "mixed1", "orthographic", RGB, "box"),
-    ("textured", "smooth0", "perspective", MONO, "tent"),
+    *extended(
+        ("envmap rotated", "mixed2", "thinlens", RGB, "gaussian"),
+        ("textured", "smooth0", "perspective", MONO, "tent"),
+    ),
 ]
 
 
 @pytest.mark.parametrize(
     "emitter, family, sensor, variant_name, rfilter",
-    DEFAULT,
-    ids=["-".join(row).replace(" ", "_") for row in DEFAULT],
+    ROWS,
+    ids=lambda value: value.replace(" ", "_"),
 )
 def test_agrees(emitter, family, sensor, variant_name, rfilter):
     mi.set_variant(variant_name)
@@ -683,7 +687,7 @@ def test_shading_normals_seen_from_the_light(rgb, tilt):
 # --- Film ---------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("rfilter, border", [("gaussian", False), ("mitchell", True)])
+@pytest.mark.parametrize("rfilter, border", [("mitchell", True), *extended(("gaussian", False))])
 def test_filters_and_crops(rgb, rfilter, border):
     """Means of the outermost rows and columns of a crop window and of the whole agree with `path`,
     whatever the filter and its border."""
@@ -753,7 +757,7 @@ def lamp_scene():
     )
 
 
-@pytest.mark.parametrize("hide", [False, True])
+@pytest.mark.parametrize("hide", [True, *extended(False)])
 def test_hidden_emitters_and_alpha(rgb, hide):
     scene = lamp_scene()
     agree(bdpt(hide_emitters=hide), path(hide_emitters=hide, rr_depth=50), scene, block=0.04)
@@ -766,7 +770,11 @@ def test_hidden_emitters_and_alpha(rgb, hide):
 
 @pytest.mark.parametrize(
     "name, max_depth",
-    [("bdpt", 1), ("bdpt", 2), ("vcm", 1), ("pcbpt", 1), ("bdpt_ris", 1), ("bdpt_ris", 2)],
+    [
+        ("bdpt", 1),
+        ("bdpt_ris", 2),
+        *extended(("bdpt", 2), ("vcm", 1), ("pcbpt", 1), ("bdpt_ris", 1)),
+    ],
 )
 def test_alpha_at_the_last_depth(rgb, name, max_depth):
     """What a path meets at its very last segment covers the background too, as in `path`, if it is
@@ -814,6 +822,7 @@ def test_alpha_at_the_last_depth(rgb, name, max_depth):
     np.testing.assert_allclose(mine, truth, atol=0.03)
 
 
+@pytest.mark.extended
 def test_max_depth(rgb):
     """Means of the image and of its quarters, to 2 %; what each depth adds is more."""
     scene = lamp_scene()

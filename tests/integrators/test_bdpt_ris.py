@@ -42,6 +42,7 @@ from comparing import (
     kernels_of,
     pictures,
 )
+from selection import extended
 from test_against_path import MONO, RGB, SPECTRAL, caustic_scene
 from test_analytic import inside_sphere, series
 from test_bdpm import box_scene, glossy_box, last_words
@@ -340,11 +341,10 @@ def assert_value(integrator, scene, value, whole=0.01):
     "name, parameters",
     [
         ("bdpt_ris", {}),
-        ("pcbpt", {}),
-        ("bdpt_ris", {"light_paths": 1}),
         ("bdpt_ris", {"resamples": 4, "target": "f_y_f_yz", "light_paths": 30}),
+        *extended(("pcbpt", {}), ("bdpt_ris", {"light_paths": 1})),
     ],
-    ids=["aware", "unaware", "one_light_path", "four_draws"],
+    ids=["aware", "four_draws", "unaware", "one_light_path"],
 )
 def test_point_in_sphere(rgb, name, parameters):
     """A point light in the middle of a diffuse sphere: L = rho I / pi (1 + rho + rho^2 + ...), here
@@ -358,7 +358,7 @@ def test_point_in_sphere(rgb, name, parameters):
     )
 
 
-@pytest.mark.parametrize("name", ["bdpt_ris", "pcbpt"])
+@pytest.mark.parametrize("name", ["pcbpt", *extended("bdpt_ris")])
 def test_emitting_sphere(rgb, name):
     """A furnace: walls of albedo rho that emit L, any length of paths: L / (1 - rho)."""
     scene = inside_sphere({}, diffuse(0.5), {"type": "area", "radiance": 0.7})
@@ -377,13 +377,15 @@ ROWS = [
         marks=pytest.mark.full,
     ),
     ("pcbpt", "several", "smooth1", "orthographic", MONO, {}),
-    (
-        "bdpt_ris",
-        "textured",
-        "smooth0",
-        "perspective",
-        MONO,
-        {"resamples": 4, "target": "f_y_f_yz"},
+    *extended(
+        (
+            "bdpt_ris",
+            "textured",
+            "smooth0",
+            "perspective",
+            MONO,
+            {"resamples": 4, "target": "f_y_f_yz"},
+        )
     ),
 ]
 
@@ -429,7 +431,7 @@ def test_agrees_full(rgb, emitter, family, name):
     agree(plugin(name), oracle(rr_depth=50), tray(family, emitter), block=0.05, most=8192)
 
 
-@pytest.mark.parametrize("emitter", ["directionalarea"])
+@pytest.mark.parametrize("emitter", extended("directionalarea"))
 def test_caustics_against_ptracer(rgb, emitter):
     """Light that reaches a floor by mirror and glass: only joining to the sensor makes it, and the
     emitter has no start to be joined with."""
@@ -519,7 +521,9 @@ def test_one_dominant_sub_path(rgb):
     )
 
 
-@pytest.mark.parametrize("parameters", [{}, {"max_depth": 0}, {"max_depth": 1}, {"max_depth": 2}])
+@pytest.mark.parametrize(
+    "parameters", [{}, {"max_depth": 2}, *extended({"max_depth": 0}, {"max_depth": 1})]
+)
 def test_dark_and_short(rgb, parameters):
     """A scene without light is black; depths 0, 1 and 2 show what `path` shows."""
     floor = {
@@ -578,7 +582,7 @@ def test_same_seed_same_image(rgb):
     )
 
 
-@pytest.mark.parametrize("light_paths", [30, 300])
+@pytest.mark.parametrize("light_paths", [30, *extended(300)])
 def test_iterations_in_any_order(rgb, light_paths):
     """What the first iteration's light sub-paths tell of Q is known to all others, and not to
     itself, whoever renders which first: workers of a cluster, or a render that goes on."""
@@ -705,7 +709,7 @@ def test_no_light_tracing_is_the_default(rgb):
     assert plugin("pcbpt").settings()["light_tracing"] == 1
 
 
-@pytest.mark.parametrize("ratio", [0.125, 8])
+@pytest.mark.parametrize("ratio", [8, *extended(0.125)])
 def test_any_light_tracing_is_unbiased(rgb, monkeypatch, ratio):
     """Fewer light sub-paths than camera paths, and so many that they are traced in several rounds,
     of a film in parts."""
@@ -723,7 +727,7 @@ def test_any_light_tracing_is_unbiased(rgb, monkeypatch, ratio):
     agree(integrator, path(rr_depth=50), scene, blocks=2, whole=0.02, block=0.05, most=600)
 
 
-@pytest.mark.parametrize("name", ["bdpt", "vcm", "bdpt_ris"])
+@pytest.mark.parametrize("name", ["bdpt_ris", *extended("bdpt", "vcm")])
 def test_kernels_know_neither_seed_nor_room(rgb, name):
     """Another seed, with other cache points and a grid of other cells about them, and buffers of
     other sizes, one of which grows: no path kernel is compiled anew. (Merging knows the size of its

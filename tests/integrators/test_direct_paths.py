@@ -4,6 +4,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from comparing import SessionBatches, assert_same, collect_until
+from selection import extended
 from worlds import tray
 
 RADIUS = 0.3
@@ -18,13 +19,15 @@ def integrator(plugin="bdpm", **parameters):
 @pytest.mark.parametrize(
     "material, count, parameters",
     [
-        ("lambertian", 5, {"bdd": 0}),
-        ("lambertian", 0, {"bdd": 1}),
         ("lambertian", 5, {"bdd": 0, "camera_paths": 2}),
-        ("rough", 0, {"bdd": 0, "camera_paths": 2}),
-        ("rough", 0, {"bdd": 0, "film": "gaussian"}),
-        ("rough", 5, {"bdd": 1}),
         ("rough", 0, {"plugin": "bdpm_opt2"}),
+        *extended(
+            ("lambertian", 5, {"bdd": 0}),
+            ("lambertian", 0, {"bdd": 1}),
+            ("rough", 0, {"bdd": 0, "camera_paths": 2}),
+            ("rough", 0, {"bdd": 0, "film": "gaussian"}),
+            ("rough", 5, {"bdd": 1}),
+        ),
     ],
 )
 def test_same_means(rgb, material, count, parameters):

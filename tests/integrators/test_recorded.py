@@ -4,11 +4,13 @@ more slowly."""
 import drjit as dr
 import mitsuba as mi
 import pytest
+from selection import extended
 from test_bdpm import glossy_box
 
 
 @pytest.mark.parametrize(
-    "plugin", ["bdpm", "bdpm_opt3", "bdpm_balance", "bdpt", "vcm", "pcbpt", "bdpt_ris"]
+    "plugin",
+    ["bdpm_opt3", "vcm", "bdpt_ris", *extended("bdpm", "bdpm_balance", "bdpt", "pcbpt")],
 )
 def test_passes_are_recorded(rgb, plugin, monkeypatch):
     said = []

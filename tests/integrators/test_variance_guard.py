@@ -25,6 +25,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from comparing import pictures
+from selection import extended
 
 ROOT = Path(__file__).parents[2]
 RECORD = Path(__file__).with_name("variance_guard.json")
@@ -62,7 +63,7 @@ def iterations(scene, method, radius, mixture):
     return np.array([picture[..., :3] for picture in pictures(session, ITERATIONS)])
 
 
-@pytest.fixture(scope="module", params=SCENES)
+@pytest.fixture(scope="module", params=["cornell_glossy", *extended("cornell_point")])
 def measured(request):
     """Of a scene: its name, the mean relative variance of each method and group, and the maps and
     pictures."""

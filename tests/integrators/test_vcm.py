@@ -5,6 +5,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from comparing import Estimate, SessionBatches, agree, assert_same, collect_until
+from selection import extended
 from test_analytic import inside_sphere, series
 from test_bdpm import box_scene, glossy_box
 from worlds import T, diffuse, film, look, path, tray
@@ -52,7 +53,7 @@ def test_agrees_full(variant_name, emitter, family):
 @pytest.mark.parametrize(
     "max_depth, parameters",
     [
-        (2, {"photon_count": 3000}),
+        *extended((2, {"photon_count": 3000})),
         pytest.param(-1, {}, marks=pytest.mark.full),
         (3, {"photon_count": 9000, "alpha": 0.7}),
     ],

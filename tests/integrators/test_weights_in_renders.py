@@ -20,6 +20,7 @@ from comparing import (
     differences,
     t_quantile,
 )
+from selection import extended
 from test_against_path import LENS, MONO, ORTHO, PERSPECTIVE, RGB, SPECTRAL, oracle
 from worlds import EMITTERS, RADIUS, T, colour, has_delta, look, sensor, tray
 
@@ -210,11 +211,16 @@ ROWS = [
 
 
 SLOW = ("sphere", "disk", "cube", "envmap rotated", "several", "sunsky", "point")
+BY_DEFAULT = ("rectangle", "cylinder", "constant")
+MARKS = {
+    **{emitter: [pytest.mark.extended] for emitter in EMITTERS if emitter not in BY_DEFAULT},
+    **{emitter: [pytest.mark.full] for emitter in SLOW},
+}
 
 
 @pytest.mark.parametrize(
     "emitter, family, parameters, sensor, variant_name, rfilter",
-    [pytest.param(*row, marks=[pytest.mark.full] if row[0] in SLOW else []) for row in ROWS],
+    [pytest.param(*row, marks=MARKS.get(row[0], [])) for row in ROWS],
     ids=[f"{e}-{f}-{'-'.join(map(str, p.values()))}".replace(" ", "_") for e, f, p, *_ in ROWS],
 )
 def test_agrees(emitter, family, parameters, sensor, variant_name, rfilter):
@@ -462,7 +468,7 @@ def test_predicted_optimum(rgb):
 
 
 @pytest.mark.parametrize(
-    "number", [pytest.param(n, marks=[pytest.mark.full] if n > 1 else []) for n in range(20)]
+    "number", [0, *extended(1), *(pytest.param(n, marks=pytest.mark.full) for n in range(2, 20))]
 )
 def test_other_weights_are_worse(rgb, monkeypatch, number):
     """Weights that differ from the optimal ones by 20 % (RMS over the two kinds of paths, in a
@@ -507,7 +513,7 @@ HARD = {
 }
 
 
-@pytest.mark.thinned(2, 2)
+@pytest.mark.thinned(2, 2, 4)
 @pytest.mark.parametrize(
     "plugin",
     [{"type": "bdpm_opt3"}, {"type": "bdpm_opt", "weights": "full", "mix_diffuse": True}],
@@ -623,7 +629,7 @@ def test_bad_parameter(rgb, name, value, allowed):
         mi.load_dict({"type": "bdpm_opt", name: value})
 
 
-@pytest.mark.parametrize("kind", ["local", "full"])
+@pytest.mark.parametrize("kind", ["full", *extended("local")])
 def test_darkness_and_no_indirect_light(rgb, kind):
     scene = {
         "type": "scene",
@@ -656,9 +662,8 @@ def test_darkness_and_no_indirect_light(rgb, kind):
 @pytest.mark.parametrize(
     "parameters",
     [
-        {},
         {"initial_radius": 0.05, "mix_diffuse": True, "weights": "full"},
-        {"initial_radius": 0.05},
+        *extended({}, {"initial_radius": 0.05}),
     ],
 )
 def test_light_that_meets_nothing_smooth(rgb, parameters):

@@ -40,6 +40,7 @@ from foggy import (
     volpath,
     world,
 )
+from selection import extended
 from worlds import bitmap, diffuse, film, grey, path, waves
 
 STRETCHES = ("majorant_optical_depth", "raw_depth", "primary_sample")
@@ -156,7 +157,12 @@ def test_transmittance(rgb, scale):
 # --- Several views ------------------------------------------------------------
 
 
-@pytest.mark.parametrize("shift", SHIFTS)
+BY_DEFAULT = "majorant_optical_depth", "primary_sample", "raw_depth_copy"
+
+
+@pytest.mark.parametrize(
+    "shift", [*BY_DEFAULT, *extended(*(shift for shift in SHIFTS if shift not in BY_DEFAULT))]
+)
 def test_shifts(rgb, shift):
     batches, _ = views_agree(multiview(shift=shift), reference(0.6), cloud(g=0.6), block=0.05)
     shares = {
@@ -169,7 +175,7 @@ def test_shifts(rgb, shift):
         assert shares["lost"] > 0.005
 
 
-@pytest.mark.parametrize("weights", ["power", "mwis"])
+@pytest.mark.parametrize("weights", ["power", *extended("mwis")])
 def test_weights(rgb, weights):
     """MWIS is consistent only: its bias is far below the resolution at the 32 samples a pixel used
     here. The phase function has a lobe: under power weights the direction of the suffix must be
@@ -261,7 +267,7 @@ def surfaces(sensor, **objects):
     )
 
 
-@pytest.mark.parametrize("hide_emitters", [False, True])
+@pytest.mark.parametrize("hide_emitters", [False, *extended(True)])
 def test_surfaces(rgb, hide_emitters):
     """Without media `path` is the oracle. A lamp stands before the second view, so hiding it shows;
     `path` itself (3.9.1) misplaces what is behind a hidden lamp, `volpath` does not."""
@@ -488,7 +494,7 @@ def test_views_on_both_sides_of_a_surface(rgb):
     "rfilter, options",
     [
         ("gaussian", {"crop_offset_x": 4, "crop_width": 8, "crop_offset_y": 2, "crop_height": 8}),
-        ("mitchell", {"sample_border": True}),
+        *extended(("mitchell", {"sample_border": True})),
     ],
 )
 def test_films(rgb, rfilter, options):
@@ -544,7 +550,7 @@ def test_films(rgb, rfilter, options):
         assert smallest_visible(a, b)[0] < 0.05 and np.median(smallest_visible(a, b)) < 0.25
 
 
-@pytest.mark.parametrize("sampler", ["independent", "sobol"])
+@pytest.mark.parametrize("sampler", ["sobol", *extended("independent")])
 def test_variance(rgb, sampler):
     """The variance channels against the variance of independent renders. Between iterations that
     share a sequence they see noise that the mean does not have: they tell too much, never too
@@ -633,7 +639,7 @@ def test_seeds_and_parts(rgb, monkeypatch):
     assert np.abs(images[0] - images[2]).mean() > 0.01 * images[0].mean()
 
 
-@pytest.mark.parametrize("sampler", ["sobol", "independent"])
+@pytest.mark.parametrize("sampler", ["sobol", *extended("independent")])
 def test_order_of_iterations(rgb, sampler):
     """An iteration is the same whatever was rendered before."""
     images = []
