@@ -1,5 +1,7 @@
 # make render   set everything up, then render a bundled scene into out/
-# make test     set everything up, then run the tests
+# make test     set everything up, then run the tests (ten minutes at most on two cores)
+# make test-all the same with all extended cases (half an hour; what continuous integration runs)
+# make mutants  set everything up, then see how many of forty errors the tests find (a quarter of an hour)
 # make bench    set everything up, then compare all methods on all bundled scenes: out/bench/index.html (half an hour to three quarters)
 # make lint     set everything up, then check style, layout and type hints
 # make gallery  set everything up, then render the pictures of docs/ (minutes)
@@ -9,7 +11,7 @@ PYTHON ?= python3
 VENV := .venv
 SETUP := tools/setup.sh
 
-.PHONY: render test lint bench gallery docs clean
+.PHONY: render test test-all mutants lint bench gallery docs clean
 .DELETE_ON_ERROR:
 
 render: $(VENV)/installed
@@ -18,6 +20,12 @@ render: $(VENV)/installed
 
 test: $(VENV)/installed-test
 	$(VENV)/bin/python -m pytest -n 2
+
+test-all: $(VENV)/installed-test
+	$(VENV)/bin/python -m pytest -n 2 -m "not full"
+
+mutants: $(VENV)/installed-test
+	$(VENV)/bin/python tools/mutants.py
 
 lint: $(VENV)/installed-test
 	$(VENV)/bin/python -m ruff check
