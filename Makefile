@@ -19,10 +19,10 @@ render: $(VENV)/installed
 	$(VENV)/bin/mis-render scenes/cornell_glossy.xml -i bdpm_opt3 -o out/cornell_glossy.exr
 
 test: $(VENV)/installed-test
-	$(VENV)/bin/python -m pytest -n 2
+	$(VENV)/bin/python -m pytest -n 2 --dist worksteal
 
 test-all: $(VENV)/installed-test
-	$(VENV)/bin/python -m pytest -n 2 -m "not full"
+	$(VENV)/bin/python -m pytest -n 2 --dist worksteal -m "not full"
 
 mutants: $(VENV)/installed-test
 	$(VENV)/bin/python tools/mutants.py

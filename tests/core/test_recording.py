@@ -7,6 +7,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from selection import extended
 
 
 @pytest.fixture
@@ -41,13 +42,17 @@ def ask(count):
     return launch
 
 
-def test_replays_have_all_their_lanes(scene):
-    """Of every size that is a multiple of 64 up to 4096, as the data of a virtual call have: Dr.Jit
-    would take some of them for the size of that."""
+MULTIPLES = range(64, 4097, 64)
+
+
+@pytest.mark.parametrize("counts", [(64, 192, 768, 3072), *extended(MULTIPLES)], ids=len)
+def test_replays_have_all_their_lanes(scene, counts):
+    """Of sizes that are multiples of 64, as the data of a virtual call have: Dr.Jit 1.5 would take
+    these four, and others that are multiples of 192, for the size of that."""
     shapes, weights = scene.shapes_dr(), mi.Float([1, 2, 3, 4, 5])
     dr.eval(shapes, weights)
     short = []
-    for count in range(64, 4097, 64):
+    for count in counts:
         recorded = frozen(ask(count))
         first, again = (np.array(recorded(shapes, weights)) for _ in range(2))
         assert first.shape == (count,) and np.all(first > 0)
