@@ -254,10 +254,12 @@ def test_finished_render_is_extended(scene, tmp_path, capsys):
     [
         (["-i", "bdpm", "-P", "bdd=0", "-D", "size=16"], None),
         (["-i", "bdpm_auto", "-P", "max_depth=4"], 1e-6),
-        (["-i", "bdpm_auto", "-P", "max_depth=4"], 1e6),
-        (["-i", "bdpm_opt2", "-P", "mix_diffuse=true"], None),
-        (["-i", "volpath_multiview"], None),
         (["-i", "path"], None),
+        *extended(
+            (["-i", "bdpm_auto", "-P", "max_depth=4"], 1e6),
+            (["-i", "bdpm_opt2", "-P", "mix_diffuse=true"], None),
+            (["-i", "volpath_multiview"], None),
+        ),
     ],
 )
 def test_image_is_rendered_again_from_itself(scene, tmp_path, monkeypatch, arguments, price):

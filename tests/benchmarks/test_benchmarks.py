@@ -503,6 +503,7 @@ def test_what_is_asked_for_is_checked_before_it_is_measured(module, capsys, argu
     assert exit.value.code == 2 and message in capsys.readouterr().err.splitlines()[-1]
 
 
+@pytest.mark.extended
 def test_comparisons_of_denoised_images(tmp_path, module, rgb):
     """Denoised images have errors of their own, over those of the better `path`; integrators are
     told; references are rendered with the box filter that the film then has."""

@@ -18,6 +18,7 @@ import numpy as np
 import OpenEXR
 import pytest
 from lamplit import read, render, write_scene
+from selection import extended
 
 NAN = float("nan")
 GOOD = {
@@ -363,7 +364,12 @@ def sessions(scene):
     return make
 
 
-@pytest.mark.parametrize("plugin", LEARNED)
+SOME = "bdpm_auto", "bdpt_ris", "path"
+
+
+@pytest.mark.parametrize(
+    "plugin", [*SOME, *extended(*(plugin for plugin in LEARNED if plugin not in SOME))]
+)
 def test_what_no_session_can_have_learned(scene, sessions, tmp_path, capsys, plugin):
     """By the session itself, by an image, and by a checkpoint."""
     for learned in [*LEARNED[plugin], [1], "text", 3, None, [], 0]:

@@ -9,3 +9,16 @@ def extended(*rows):
         pytest.param(*(row if isinstance(row, tuple) else (row,)), marks=pytest.mark.extended)
         for row in rows
     ]
+
+
+LIKE_OTHERS = "disk", "cylinder", "cube", "constant", "envmap"
+"""Emitters (of `worlds.EMITTERS`) of kinds that others there have, too."""
+
+
+def one_of_each_kind(emitters):
+    """Emitters, those that are like others marked as ``extended``."""
+    emitters = list(emitters)
+    return [
+        *(emitter for emitter in emitters if emitter not in LIKE_OTHERS),
+        *extended(*(emitter for emitter in emitters if emitter in LIKE_OTHERS)),
+    ]

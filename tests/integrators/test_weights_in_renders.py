@@ -211,7 +211,7 @@ ROWS = [
 
 
 SLOW = ("sphere", "disk", "cube", "envmap rotated", "several", "sunsky", "point")
-BY_DEFAULT = ("rectangle", "cylinder", "constant")
+BY_DEFAULT = ("rectangle", "constant")
 MARKS = {
     **{emitter: [pytest.mark.extended] for emitter in EMITTERS if emitter not in BY_DEFAULT},
     **{emitter: [pytest.mark.full] for emitter in SLOW},
@@ -513,7 +513,7 @@ HARD = {
 }
 
 
-@pytest.mark.thinned(2, 2, 4)
+@pytest.mark.thinned(2, 2, 6)
 @pytest.mark.parametrize(
     "plugin",
     [{"type": "bdpm_opt3"}, {"type": "bdpm_opt", "weights": "full", "mix_diffuse": True}],

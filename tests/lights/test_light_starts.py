@@ -10,6 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from selection import one_of_each_kind
 from worlds import EMITTERS, tray
 
 COUNT = 4096
@@ -25,7 +26,7 @@ def spread(x):
 
 
 @pytest.mark.parametrize(
-    "emitter", [e for e in EMITTERS if e not in ("projector", "directionalarea")]
+    "emitter", one_of_each_kind(e for e in EMITTERS if e not in ("projector", "directionalarea"))
 )
 def test_flux_is_light_over_densities(rgb, emitter):
     """The flux of a light sub-path is the light at its first vertex over the densities of its start

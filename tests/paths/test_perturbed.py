@@ -35,6 +35,7 @@ def lit_surface(tilt, inner, angle):
     return si, mi.BSDFPtr(scene.shapes()[0].bsdf()), scene
 
 
+@pytest.mark.thinned(3, 1, 3)
 @pytest.mark.parametrize("angle", [-60, 10, 70])
 @pytest.mark.parametrize("inner", [MATT, SHINY], ids=["matt", "shiny"])
 def test_flux_and_density(rgb, inner, angle):
