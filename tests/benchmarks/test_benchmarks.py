@@ -310,6 +310,7 @@ def test_convergence_of_samplers(module, tmp_path):
     assert (tmp_path / "sampling.png").stat().st_size > 1000
 
 
+@pytest.mark.extended
 def test_page_of_one_small_scene(module, tmp_path):
     """The whole way, small: every part of the page is there, everything it shows is embedded, and
     it names what cannot be rendered."""

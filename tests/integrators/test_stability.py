@@ -87,7 +87,7 @@ POINTS = {
     # Several at once.
     "corner": {"lamp": 1e-3, "dim": 4e-6, "gap": 0.01, "frozen_photons": 64},
 }
-DEFAULT = ("roughness 1",)
+EXTENDED = ("roughness 1",)
 
 
 @pytest.fixture(scope="module")
@@ -202,7 +202,11 @@ def measure(rooms, methods, changes, count, multiple=1):
 @pytest.mark.parametrize(
     "point",
     [
-        pytest.param(p, marks=[] if p in DEFAULT else [pytest.mark.full], id=p.replace(" ", "_"))
+        pytest.param(
+            p,
+            marks=pytest.mark.extended if p in EXTENDED else pytest.mark.full,
+            id=p.replace(" ", "_"),
+        )
         for p in POINTS
     ],
 )

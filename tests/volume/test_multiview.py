@@ -184,6 +184,7 @@ def test_weights(rgb, weights):
     views_agree(multiview(weights=weights), reference(0.6), cloud(g=0.6), block=0.05)
 
 
+@pytest.mark.extended
 def test_few_samples(rgb):
     """Two samples a pixel, on finer films: MIS is as right as ever, the mean of its other half
     included; MWIS is visibly biased."""
@@ -280,6 +281,7 @@ def test_surfaces(rgb, hide_emitters):
     )
 
 
+@pytest.mark.extended
 def test_views_without_overlap(rgb):
     """Two views back to back: nothing can be shared, and what comes out is plain path tracing,
     noise included."""
@@ -372,6 +374,7 @@ def test_thick_media(rgb, shift):
     )
 
 
+@pytest.mark.extended
 def test_majorants_far_above_the_density(rgb):
     """Thirty times: how many null interactions paths have then tells views apart, unless some are
     added; with them, sharing pays."""
@@ -400,6 +403,7 @@ def test_majorants_far_above_the_density(rgb):
     assert spread[True] < 0.75 * spread[False]
 
 
+@pytest.mark.extended
 def test_huge_density_ratios(rgb):
     """Forward-peaked smoke and a polished ball, seen by views that differ by orders of magnitude in
     what they think of each other's paths: no fireflies. On the mean samples are hardly worse than
