@@ -340,11 +340,13 @@ class JointPaths:
     "bsdf, light, sensor, length, beta, eta",
     [
         ("diffuse", "area", "perspective", 3, 1, 2.0),
-        ("rough", "area", "thinlens", 3, 2, 0.0),
         ("plastic", "point", "orthographic", 3, 1, 3.0),
-        ("plastic", "sphere", "perspective", 4, 1, 0.0),
         ("bump", "spot", "perspective", 2, 2, 0.0),
         ("rough", "constant", "perspective", 2, 1, 1.0),
+        *extended(
+            ("rough", "area", "thinlens", 3, 2, 0.0),
+            ("plastic", "sphere", "perspective", 4, 1, 0.0),
+        ),
     ],
 )
 def test_weights_sum_to_one(rgb, bsdf, light, sensor, length, beta, eta):
