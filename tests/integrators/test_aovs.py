@@ -350,7 +350,7 @@ def of_paths():
 
 @pytest.mark.parametrize(
     "plugin",
-    ["bdpm_opt3", "bdpt_ris", *extended("bdpm", "bdpm_balance", "bdpt", "vcm", "pcbpt")],
+    ["bdpm_opt3", *extended("bdpm", "bdpm_balance", "bdpt", "vcm", "pcbpt", "bdpt_ris")],
 )
 def test_split_is_that_of_paths(rgb, of_paths, plugin):
     """Mirrors, glass, masks, and BSDFs that are both, each in a block of its own: each class
@@ -361,7 +361,7 @@ def test_split_is_that_of_paths(rgb, of_paths, plugin):
         assert_same(mine, of_paths[k], *visible[k])
 
 
-@pytest.mark.parametrize("plugin", ["vcm", *extended("bdpm", "bdpm_opt3", "bdpt", "bdpt_ris")])
+@pytest.mark.parametrize("plugin", extended("bdpm", "bdpm_opt3", "bdpt", "vcm", "bdpt_ris"))
 def test_split_without_delta_surfaces(rgb, plugin):
     """Nothing is a caustic, and direct light is that of two segments; so the rest is indirect, for
     the three sum to the image. False alarms: 1e-6."""
@@ -562,6 +562,7 @@ def test_command_writes_them_and_reads_them_back(scene_file, tmp_path):
     assert lamplit.same(lamplit.read(tmp_path / "b.exr")[1], image)
 
 
+@pytest.mark.extended
 def test_command_resumes_with_them(scene_file, tmp_path):
     """A render in two parts is the whole one, and the layers are no sums of iterations."""
     whole = rendered(scene_file, tmp_path / "a.exr", *AOVS)[1]
@@ -579,6 +580,7 @@ def test_command_denoises_colours_alone(scene_file, tmp_path):
     assert not lamplit.same(denoised[..., :3], image[..., :3])
 
 
+@pytest.mark.extended
 def test_workers_have_them(scene_file, tmp_path):
     pytest.importorskip("distributed")
     _, alone = rendered(scene_file, tmp_path / "a.exr", *AOVS)
