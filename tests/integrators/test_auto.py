@@ -350,7 +350,7 @@ def test_rough_glass_is_for_three_strategies(rgb, material, first):
     }
 
 
-@pytest.mark.parametrize("seconds, tried", [(0.5, False), (1000.0, True)])
+@pytest.mark.parametrize("seconds, tried", [(0.5, False), *extended((1000.0, True))])
 def test_a_short_render_does_not_spend_its_time_on_trials(rgb, seconds, tried):
     """What a trial takes is mostly set-up, which the clock knows and the costs of events do not."""
     session = auto().session(glossy_box())

@@ -773,9 +773,8 @@ def test_hidden_emitters_and_alpha(rgb, hide):
 @pytest.mark.parametrize(
     "name, max_depth",
     [
-        ("bdpt", 1),
         ("bdpt_ris", 2),
-        *extended(("bdpt", 2), ("vcm", 1), ("pcbpt", 1), ("bdpt_ris", 1)),
+        *extended(("bdpt", 1), ("bdpt", 2), ("vcm", 1), ("pcbpt", 1), ("bdpt_ris", 1)),
     ],
 )
 def test_alpha_at_the_last_depth(rgb, name, max_depth):

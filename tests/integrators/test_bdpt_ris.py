@@ -279,10 +279,12 @@ class ResampledPaths(JointPaths):
     "name, bsdf, light, sensor, length, parameters",
     [
         ("bdpt_ris", "rough", "area", "thinlens", 3, {"resamples": 4}),
-        ("bdpt_ris", "plastic", "point", "orthographic", 3, {"light_paths": 1}),
-        ("bdpt_ris", "plastic", "sphere", "perspective", 3, {"cache_neighbors": 1}),
         ("bdpt_ris", "bump", "constant", "perspective", 2, {}),
         ("pcbpt", "plastic", "area", "perspective", 3, {"light_tracing": 4}),
+        *extended(
+            ("bdpt_ris", "plastic", "point", "orthographic", 3, {"light_paths": 1}),
+            ("bdpt_ris", "plastic", "sphere", "perspective", 3, {"cache_neighbors": 1}),
+        ),
     ],
 )
 def test_weights_sum_to_one(rgb, name, bsdf, light, sensor, length, parameters):
