@@ -13,6 +13,7 @@ The exit code is 1 where an error has survived or ran out of time, 2 where no ve
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
 import shutil
 import signal
@@ -56,7 +57,9 @@ def copied(root: Path, copy: Path) -> None:
             shutil.copy2(root / name, copy / name)
 
 
-def run_tests(copy: Path, tests: Sequence[str], selection: str, limit: float) -> tuple[str, str]:
+def run_tests(
+    copy: Path, tests: Sequence[str], selection: str, limit: float | None
+) -> tuple[str, str]:
     """Runs tests in a copy until the first fails: the verdict, and what pytest wrote."""
     command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider"]
     process = subprocess.Popen(
@@ -71,8 +74,11 @@ def run_tests(copy: Path, tests: Sequence[str], selection: str, limit: float) ->
     try:
         output, _ = process.communicate(timeout=limit)
     except subprocess.TimeoutExpired:
-        os.killpg(process.pid, signal.SIGKILL)
-        return LATE, process.communicate()[0]
+        return LATE, ""
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
     if process.returncode not in VERDICTS:
         raise NoVerdict(f"pytest ended with exit code {process.returncode}:\n{output}")
     return VERDICTS[process.returncode], output
@@ -112,7 +118,7 @@ def check_tests(mutations: Sequence[Mutation], root: Path, selection: str, whole
     tests = [] if whole else sorted({name for m in mutations for name in m.tests.split()})
     with tempfile.TemporaryDirectory(prefix="mutants-") as folder:
         copied(root, Path(folder))
-        verdict, output = run_tests(Path(folder), [*tests, "-n", "2"], selection, float("inf"))
+        verdict, output = run_tests(Path(folder), [*tests, "-n", "2"], selection, None)
     if verdict != SURVIVED:
         raise NoVerdict(f"the tests fail without any error in the sources:\n{output[-4000:]}")
 

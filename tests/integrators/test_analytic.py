@@ -99,6 +99,7 @@ def test_point_in_sphere(rgb, bdd, max_depth):
     )
 
 
+@pytest.mark.extended
 def test_point_in_sphere_in_every_variant(variant):
     """As above; one set of wavelengths an iteration leaves the hue of spectral images to chance, so
     a narrow sensor is used there."""

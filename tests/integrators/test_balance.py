@@ -214,7 +214,7 @@ class JointPaths:
         return brought[0] / brought[1]
 
 
-@pytest.mark.thinned(4, 2, 4)
+@pytest.mark.thinned(4, 2, 6)
 @pytest.mark.parametrize("beta", [1, 2])
 @pytest.mark.parametrize("strategies", [2, 3])
 @pytest.mark.parametrize("bsdf", ["diffuse", "rough"])

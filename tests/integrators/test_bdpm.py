@@ -1136,7 +1136,6 @@ def test_missing_sensor(rgb):
 # --- Variants -----------------------------------------------------------------
 
 
-@pytest.mark.extended
 def test_every_variant_renders(variant):
     """Mono and spectral agree with `path` of the same variant (the grey world's mean; hue of few
     wavelengths is chance)."""

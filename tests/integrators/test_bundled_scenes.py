@@ -19,7 +19,7 @@ SCENES = sorted(path.stem for path in (Path(__file__).parents[2] / "scenes").glo
 BLUR, WHOLE, QUARTER = 0.003, 0.01, 0.04
 BEYOND_PATH = ("caustics", "sds")
 """Scenes whose light `path` finds by luck alone."""
-BY_DEFAULT = (("cornell_point", "bdpm_opt"),)
+EXTENDED = (("cornell_point", "bdpm_opt"),)
 
 
 def small(scene):
@@ -48,7 +48,9 @@ def assert_alike(mine, reference, whole=WHOLE, quarter=QUARTER):
     "scene, plugin",
     [
         pytest.param(
-            scene, plugin, marks=[] if (scene, plugin) in BY_DEFAULT else [pytest.mark.full]
+            scene,
+            plugin,
+            marks=pytest.mark.extended if (scene, plugin) in EXTENDED else pytest.mark.full,
         )
         for scene in SCENES
         for plugin in ("bdpm_opt", "bdpm_balance")

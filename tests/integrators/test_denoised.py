@@ -42,6 +42,7 @@ def relative_variance(values):
 OPT2 = {"type": "bdpm_opt2", "mix_diffuse": True, "direct_paths": 16}
 
 
+@pytest.mark.extended
 def test_means_stay(scene):
     """Of 64 blocks, by weights for a denoiser and by others, with a radius that blurs little (5.3
     standard errors of t with 46 degrees: 3e-6 a block, 2e-4 in all; 10 % are seen)."""

@@ -310,6 +310,7 @@ def test_views_without_overlap(rgb):
 # --- What can go wrong --------------------------------------------------------
 
 
+@pytest.mark.extended
 def test_hostile_views(rgb):
     """Zero-density pockets and a majorant many times the density; one view inside a medium, one
     whose near plane cuts off pivots of the others, one that sees half of them; forward-peaked phase
