@@ -351,7 +351,8 @@ def test_emission_ratio(rgb, emitter):
     index = dr.gather(
         mi.UInt32, lights.numbers, dr.reinterpret_array(mi.UInt32, ds.emitter), active
     )
-    weighed = dr.select(delta, sampled * dr.rcp(lights.choice.probability(index)), evaluated)
+    chosen = lights.nearby.probability(si.p, index) if lights.nearby else mi.Float(1)
+    weighed = dr.select(delta, sampled * dr.rcp(chosen), evaluated)
     used = np.array(active) & np.ones(4096, bool)
     assert used.sum() > 500
     expected, found = (
