@@ -150,6 +150,7 @@ def strategies_agree(emitter, first, second, whole=0.01, block=0.03, most=1024):
     assert_same(*collect_until(a, b, whole, block, most=most), whole, block)
 
 
+@pytest.mark.extended
 @pytest.mark.thinned(3, 3)
 @pytest.mark.parametrize(
     "emitter, first, second", [("spot", 0, 1), ("directional", 1, 2), ("projector", 0, 3)]

@@ -290,10 +290,9 @@ def reference(integrator, scene, count=16, spp=64):
 @pytest.mark.parametrize(
     "plugin, options",
     [
-        ("vcm", {}),
         ("bdpm_opt3", WIDE),
         *extended(
-            *((plugin, {}) for plugin in SURFACE_PLUGINS if plugin != "vcm"),
+            *((plugin, {}) for plugin in SURFACE_PLUGINS),
             *((plugin, WIDE) for plugin in REPRESENTATIVES if plugin != "bdpm_opt3"),
         ),
     ],

@@ -295,6 +295,7 @@ def test_a_path_of_given_time_keeps_the_processor_busy(rgb, monkeypatch, seconds
     assert trial.variance * samples == pytest.approx(single.variance, rel=0.3)
 
 
+@pytest.mark.extended
 def test_longer_renders_try_more(rgb):
     """The pilot keeps to its share of the time."""
     scene = glossy_box()
@@ -305,7 +306,7 @@ def test_longer_renders_try_more(rgb):
     assert short <= 2 < long
 
 
-@pytest.mark.parametrize("spp, tried", [(24, {"bdpm_opt2"}), (4, set())])
+@pytest.mark.parametrize("spp, tried", [(24, {"bdpm_opt2"}), *extended((4, set()))])
 def test_weights_are_worth_more_time(rgb, spp, tried):
     """One mixture is tried beyond the pilot's usual share, if there is some time left."""
     metal = {

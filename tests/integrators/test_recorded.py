@@ -10,7 +10,7 @@ from test_bdpm import glossy_box
 
 @pytest.mark.parametrize(
     "plugin",
-    ["bdpm_opt3", "vcm", "bdpt_ris", *extended("bdpm", "bdpm_balance", "bdpt", "pcbpt")],
+    ["bdpm_opt3", "bdpt_ris", *extended("bdpm", "bdpm_balance", "bdpt", "vcm", "pcbpt")],
 )
 def test_passes_are_recorded(rgb, plugin, monkeypatch):
     said = []

@@ -361,6 +361,7 @@ def test_ladders_reach_what_they_promise(rooms):
     )
 
 
+@pytest.mark.extended
 def test_size_changes_nothing(rooms):
     """The same seed, the same picture, ten thousand times as large: rounding sends single paths
     elsewhere, no more."""

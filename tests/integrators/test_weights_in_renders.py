@@ -335,6 +335,7 @@ def glossy_room(alpha=0.12, albedo=0.6, size=1.0, **entries):
     )
 
 
+@pytest.mark.extended
 def test_weights_lower_the_noise(rgb):
     """Under optimal weights a glossy room is less noisy than by the better of its two strategies,
     beyond the error of the measurement (one-sided, false-alarm rate 1e-3)."""

@@ -157,7 +157,7 @@ def test_transmittance(rgb, scale):
 # --- Several views ------------------------------------------------------------
 
 
-BY_DEFAULT = "majorant_optical_depth", "primary_sample", "raw_depth_copy"
+BY_DEFAULT = "majorant_optical_depth", "raw_depth_copy"
 
 
 @pytest.mark.parametrize(
