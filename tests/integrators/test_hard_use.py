@@ -107,6 +107,7 @@ def check_random_scenes(plugins, whole, **options):
     return seen
 
 
+@pytest.mark.extended
 def test_random_scenes(rgb):
     """The same few every time, until another version of hypothesis draws others: of four, none
     shows an error of a tenth once in sixteen versions."""
