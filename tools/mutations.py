@@ -40,7 +40,6 @@ BDPT = "tests/integrators/test_bdpt.py"
 RIS = "tests/integrators/test_bdpt_ris.py"
 BALANCE = "tests/integrators/test_balance.py"
 OPTIMAL = "tests/integrators/test_weights_in_renders.py"
-PATH = "tests/integrators/test_against_path.py"
 ANALYTIC = "tests/integrators/test_analytic.py"
 LONG = "tests/app/test_long_renders.py"
 
@@ -116,7 +115,6 @@ MUTATIONS = [
         "return bs, delta, weight * adjoint, wo, active",
         "return bs, delta, weight, wo, active",
         "no adjoint factor of shading normals",
-        f"{PATH}::test_shading_normals_seen_from_the_light "
         f"{BDPT}::test_shading_normals_seen_from_the_light",
     ),
     Mutation(

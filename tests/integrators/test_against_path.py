@@ -233,7 +233,8 @@ def test_caustics_against_ptracer(rgb, emitter, bdd):
 # --- Shading normals ----------------------------------------------------------
 
 
-@pytest.mark.thinned(2, 2, 4)
+@pytest.mark.extended
+@pytest.mark.thinned(2, 2)
 @pytest.mark.parametrize("bdd", [0, 1])
 @pytest.mark.parametrize("tilt", [-0.5, 0.5])
 def test_shading_normals_seen_from_the_light(rgb, bdd, tilt):

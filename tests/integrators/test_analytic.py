@@ -187,7 +187,7 @@ def test_furnace_of_emitting_sphere(rgb, bdd, max_depth):
     )
 
 
-@pytest.mark.thinned(4, 2, 4)
+@pytest.mark.thinned(4, 2, 8)
 @EACH
 @pytest.mark.parametrize(
     "material", ["diffuse", "conductor", "dielectric", "thindielectric", "mask", "null", "blend"]

@@ -255,6 +255,7 @@ def test_seeds_and_iterations_are_uncorrelated(rgb):
     np.testing.assert_allclose(images[3], images[4], rtol=1e-3, atol=1e-6)
 
 
+@pytest.mark.extended
 def test_error_falls_with_iterations(rgb):
     """Variance of block means over seeds: with 4 times the iterations, a quarter (within a factor
     of 2.5)."""
@@ -379,6 +380,7 @@ def test_reconstruction_filters(rgb, rfilter, border):
         assert np.sqrt(means[0].error2.max()) < 0.02 * means[0].mean.max()
 
 
+@pytest.mark.extended
 def test_alpha_channel_is_that_of_path(rgb):
     for hide in (False, True):
         scene = mi.load_dict(

@@ -42,6 +42,7 @@ def test_same_means(rgb, material, count, parameters):
     assert_same(*collect_until(*sides, **POWER), **POWER)
 
 
+@pytest.mark.extended
 def test_light_behind_mirrors_and_holes(rgb):
     """Paths that pass delta surfaces first see direct light at their first smooth vertex, too."""
     scene = tray("delta", "rectangle")
