@@ -8,7 +8,7 @@ import mitsuba as mi
 from ..core.random import next_1d_and_2d
 from ..lights.lights import mis_power
 from ..paths.roulette import russian_roulette
-from .media import collision, section, transmittance
+from ..paths.media import collision, section, transmittance
 
 
 def scattering_interaction(medium, p, wi, time, wavelengths):
