@@ -309,15 +309,15 @@ class BDPTSession(IterativeSession):
         )
         value = joined.value * (self.pixel_paths / self.light_path_count)
         share = self.weights(spectral).seen_by_sensor(joined, y)
-        channels = list(colour_channels(value * share, spectral["matrix"]))
+        channels = list(colour_channels(value * share, spectral["sensor_matrix"]))
         if self.integrator.splits_light:
             smooth = dr.select(y["depth"] == 1, mi.UInt32(1), mi.UInt32(2))
             for light in by_class(class_of(smooth, y["mark"]), value * share):
-                channels.extend(colour_channels(light, spectral["matrix"]))
+                channels.extend(colour_channels(light, spectral["sensor_matrix"]))
         if self.integrator.techniques:
             value = value * share if self.integrator.technique_weights else value
             channels += sensor_images(
-                self.integrator.techniques, y["depth"], value, spectral["matrix"]
+                self.integrator.techniques, y["depth"], value, spectral["sensor_matrix"]
             )
         return splat_channels(sensor.film(), joined.film, channels, joined.active)
 
