@@ -63,10 +63,11 @@ def most_frequent(found):
     return int(values[counts.argmax()])
 
 
-def medium_outside(scene, sensor, plugin):
-    """The registry number of the medium that fills what no boundary encloses: the sensor's, where
-    it is outside of all; else none. Raises `UnsupportedScene` where the sensor is inside of a
-    boundary and names another medium than that has."""
+def media_beyond_boundaries(scene, sensor, plugin):
+    """The registry numbers of the media around points whose walks end `OUTSIDE` and `UNDECIDED`
+    (opaque walls all around), a dictionary: the sensor's, where it stands at such a point, too;
+    else none. Raises `UnsupportedScene` where the sensor is inside of a boundary and names another
+    medium than that has."""
     rng = streams(dr.arange(mi.UInt32, WALKS), mi.UInt32(0x73656E73))
     ray, _ = sensor.sample_ray_differential(0, 0.5, next_2d(rng), next_2d(rng))
     ray = mi.Ray3f(ray)
@@ -77,20 +78,20 @@ def medium_outside(scene, sensor, plugin):
             f"{plugin}: the sensor stands in {_words(met)}, says the boundary that its rays meet "
             f"first, but it names {_words(named)}; a sensor in a medium needs a reference to it"
         )
-    return named if met == OUTSIDE else 0
+    return {place: named if met == place else 0 for place in (OUTSIDE, UNDECIDED)}
 
 
 def _words(number):
     return "no medium" if number == 0 else "a medium"
 
 
-def media_at_emitters(lights, outside):
-    """The registry number of the medium around each of the `lights.emitters`, a list. `outside`:
-    of the one outside of all boundaries."""
+def media_at_emitters(lights, beyond):
+    """The registry number of the medium around each of the `lights.emitters`, a list. `beyond`: as
+    of `media_beyond_boundaries`; what an emitter says of itself counts where walks tell nothing."""
     numbers = []
     for index, (emitter, kind) in enumerate(zip(lights.emitters, lights.kinds)):
         if kind in ("environment", "directional"):
-            numbers.append(outside)
+            numbers.append(beyond[OUTSIDE])
             continue
         shape = emitter.get_shape()
         if shape is not None and shape.is_medium_transition():
@@ -101,7 +102,7 @@ def media_at_emitters(lights, outside):
         ray = mi.Ray3f(ray)
         dr.eval(ray)
         met = most_frequent(surrounding_media(lights.scene, ray))
-        if met == UNDECIDED:
+        if met == UNDECIDED and emitter.get_medium() is not None:
             met = number_of(emitter.get_medium())
-        numbers.append(outside if met == OUTSIDE else met)
+        numbers.append(beyond.get(met, met))
     return numbers

@@ -19,7 +19,7 @@ from ..core.packing import from_numpy
 from ..core.random import next_1d_and_2d, next_2d, next_floats, streams
 from ..core.spectra import channel_mean
 from ..core.traits import UnsupportedScene, lookup, registry_table
-from .emitter_media import media_at_emitters, medium_outside
+from .emitter_media import media_at_emitters, media_beyond_boundaries
 from .environment_guide import AIMED_SHARE, EnvironmentGuide, direction_cell, infinite_emitters
 from .nearby import NearbyChoice
 
@@ -155,7 +155,8 @@ class Lights:
 
     def find_media(self, sensor, plugin):
         """Finds the media in which emitters stand, for `medium_at`."""
-        found = media_at_emitters(self, medium_outside(self.scene, sensor, plugin))
+        beyond = media_beyond_boundaries(self.scene, sensor, plugin)
+        found = media_at_emitters(self, beyond)
         self._media = from_numpy(mi.UInt32, found or [0])
 
     def medium_at(self, emitter):

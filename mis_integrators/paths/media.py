@@ -169,8 +169,8 @@ def fly(scene, traits, ray, medium, draws, active):
         met = flying & ~collided & hit.is_valid()
         surface = hit.compute_surface_interaction(ray, traits.boundary_flags, met)
         bsdf = surface.bsdf()
-        crosses = met & ~hit.shape.is_emitter() & (
-            (bsdf.flags() & scattering) == int(mi.BSDFFlags.Null)
+        crosses = (
+            met & ~hit.shape.is_emitter() & ((bsdf.flags() & scattering) == int(mi.BSDFFlags.Null))
         )
         weight[crosses] = weight * bsdf.eval_null_transmission(surface, crosses)
         medium[crosses & surface.is_medium_transition()] = surface.target_medium(ray.d)
@@ -182,7 +182,6 @@ def fly(scene, traits, ray, medium, draws, active):
     hit.t = dr.select(scatters, passed, hit.t)
     hit.shape = dr.select(scatters, dr.zeros(mi.ShapePtr), hit.shape)
     return hit, ray, medium, scatters, weight
-
 
 
 def begin_flights(traits, medium):

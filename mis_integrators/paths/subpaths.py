@@ -21,9 +21,9 @@ from ..core.records import Layout
 from .camera import trace_camera, within_crop
 from .light import trace_light
 from .light_classes import class_of, scattered_history, start_of_camera_path
+from .media import direct_light
 from .sensor import Lens
 from .setting import CameraPass, LightPass, Limits, World
-from .media import direct_light
 from .vertex import Sides, VertexBSDF, facing, scattered_mean
 
 Array = Any

@@ -7,8 +7,8 @@ import mitsuba as mi
 
 from ..core.random import next_1d_and_2d
 from ..lights.lights import mis_power
-from ..paths.roulette import russian_roulette
 from ..paths.media import collision, section, transmittance
+from ..paths.roulette import russian_roulette
 
 
 def scattering_interaction(medium, p, wi, time, wavelengths):

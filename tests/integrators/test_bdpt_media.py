@@ -5,11 +5,24 @@ Comparisons of renders: false-alarm rate 1e-6 each; an error of 2 % of the whole
 a quarter is seen with a probability of 0.95, where a test says nothing else (`comparing`).
 """
 
+from mis_integrators import _plugins
+from mis_integrators.mis.vertex_merging import ConnectionWeights
+
 import mitsuba as mi
 import numpy as np
 import pytest
-from comparing import agree
+from comparing import (
+    Estimate,
+    SessionBatches,
+    agree,
+    assert_same,
+    block_means,
+    collect_until,
+    differences,
+)
 from foggy import container, even, floor, grid, lamp, pockets, view, volpath
+from test_bdpm import last_words
+from test_bdpt import JointPaths, pyramid, technique_estimates
 from worlds import T, diffuse, grey, look
 
 FOG = {"type": "ref", "id": "fog"}
@@ -92,7 +105,8 @@ SCENES = {
     ),
     "nested": lambda: fog_scene(homogeneous(), ball=ball({"type": "null"}, **inner())),
     "rough glass": lambda: fog_scene(
-        homogeneous(), ball=ball({"type": "roughdielectric", "alpha": 0.4, "int_ior": 1.2}, **inner())
+        homogeneous(),
+        ball=ball({"type": "roughdielectric", "alpha": 0.4, "int_ior": 1.2}, **inner()),
     ),
     "mask": lambda: fog_scene(
         homogeneous(),
@@ -103,9 +117,6 @@ SCENES = {
     ),
     "thin glass": lambda: fog_scene(homogeneous(), ball=ball({"type": "thindielectric"})),
     "plastic": lambda: fog_scene(homogeneous(), ball=ball({"type": "plastic"}, exterior=FOG)),
-    "point within": lambda: fog_scene(
-        homogeneous(2.0), point={"type": "point", "position": [0.2, 0.3, -0.1], "intensity": 1.0}
-    ),
     "lamp within": lambda: fog_scene(
         homogeneous(), small=ball(diffuse(), 0.2, emitter={"type": "area", "radiance": 5.0})
     ),
@@ -128,3 +139,200 @@ def test_agrees_with_volpath(rgb, name):
         spp=512,
         most=600,
     )
+
+
+@pytest.mark.parametrize("variant_name", ["llvm_ad_spectral", "llvm_ad_mono"])
+def test_agrees_in_other_variants(variant_name):
+    """Wavelengths have extinctions of their own; one free flight serves all of a path's."""
+    mi.set_variant(variant_name)
+    medium, sensor = grid(even, scale=3.0, g=0.3), view((0, 0.7, 4.2))
+    if mi.is_spectral:
+        slope = {"type": "spectrum", "value": [(360, 2.0), (830, 0.5)]}
+        medium = homogeneous() | {"sigma_t": slope}
+        # One iteration has one set of wavelengths; a narrow response takes their noise away.
+        sensor["srf"] = {"type": "spectrum", "value": [(554, 0.0), (555, 1.0), (556, 0.0)]}
+    scene = fog_scene(medium, sensor, ball=ball({"type": "plastic"}, exterior=FOG))
+    agree(bdpt(), volpath(max_depth=6), scene, 2, whole=0.02, block=0.06, spp=512, most=600)
+
+
+@pytest.mark.parametrize("max_depth", [1, 2, 3])
+def test_depth_is_that_of_volpath(rgb, max_depth):
+    """Boundaries do not count, half transparent ones included; what each depth adds is more than
+    what is compared."""
+    scene = fog_scene(
+        homogeneous(),
+        ball=ball({"type": "mask", "opacity": 0.4, "nested": diffuse()}, **inner()),
+        sky={"type": "constant", "radiance": grey(0.4)},
+    )
+    agree(
+        bdpt(max_depth=max_depth),
+        volpath(max_depth=max_depth),
+        scene,
+        2,
+        whole=0.02,
+        block=0.05,
+        spp=512,
+        most=600,
+    )
+
+
+# --- Closed forms -------------------------------------------------------------
+
+
+NEAR_CLIP = 0.5
+
+
+def single_scattering(sigma_t, albedo, g, light, pixels, half_width, distance):
+    """Radiance (pixels, pixels) of light that a point of intensity one sends into an infinite
+    medium and that scatters once, for a pinhole at z = `distance` that looks down and sees
+    +-`half_width` in the plane z = 0: the integral along the ray of
+    sigma_s exp(-sigma_t (t + d)) p(cos) / d^2, by the midpoint rule. As Mitsuba's rays, it begins
+    at the near clipping plane."""
+    fine = 4
+    edge = ((np.arange(pixels * fine) + 0.5) / (pixels * fine) * 2 - 1) * half_width
+    x, y = np.meshgrid(edge, -edge)
+    direction = np.stack([x, y, np.full_like(x, -distance)], axis=-1)
+    direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
+    near = NEAR_CLIP / -direction[..., 2:]
+    radiance, step = np.zeros(x.shape), 0.01
+    for t in np.arange(step / 2, 25, step):
+        p = np.array([0, 0, distance]) + (near + t) * direction
+        away = p - np.array(light)
+        d = np.linalg.norm(away, axis=-1)
+        cosine = -np.sum(away / d[..., None] * direction, axis=-1)
+        phase = (1 - g * g) / (4 * np.pi * (1 + g * g - 2 * g * cosine) ** 1.5)
+        radiance += step * sigma_t * albedo * np.exp(-sigma_t * (t + d)) * phase / d**2
+    return radiance.reshape(pixels, fine, pixels, fine).mean(axis=(1, 3))
+
+
+@pytest.mark.parametrize("albedo, g", [(0.5, 0.0), (1.0, 0.5), (1.0, -0.5)])
+def test_single_scattering_in_closed_form(rgb, albedo, g):
+    """An infinite medium without any shape: next-event estimation and joining to the sensor, each
+    alone, and both."""
+    sigma_t, distance, half_width, at = 0.7, 2.0, 0.5, (1.5, 0.3, 0.4)
+    medium = homogeneous(sigma_t, albedo, hg(g))
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "fog": {**medium, "id": "fog"},
+            "light": {"type": "point", "position": list(at), "intensity": 1.0},
+            "sensor": {
+                **view((0, 0, distance), fov=np.degrees(2 * np.arctan(half_width / distance))),
+                "to_world": look((0, 0, distance), (0, 0, 0), (0, 1, 0)),
+                "medium": FOG,
+                "near_clip": NEAR_CLIP,
+            },
+        }
+    )
+    picture = single_scattering(sigma_t, albedo, g, at, 16, half_width, distance)
+    exact = Estimate.exact(np.repeat(block_means(picture[:, :, None], 2), 3, axis=1))
+    batches = SessionBatches(bdpt(max_depth=2), scene, 2)
+    batches.add(2)
+    assert_same(*collect_until(batches, exact, 0.01, 0.02), 0.01, 0.02, slack=1e-3)
+    alone = technique_estimates(scene, pyramid(2, camera_paths=64), 48, 2)
+    for technique in ((1, 2), (2, 1)):
+        assert not differences(alone[technique], exact, slack=1e-3), technique
+        assert 6 * np.sqrt(alone[technique].error2[0].max()) < 0.25 * exact.mean[0, 0]
+    assert alone[0, 3].mean.max() == 0
+
+
+def cloud(albedo, sky=1.0, size=16, sigma_t=1.5):
+    """A sphere of a medium under an even sky, which fills the view."""
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "cloud": ball({"type": "null"}, 1.0, interior=homogeneous(sigma_t, albedo, hg(0.3))),
+            "sky": {"type": "constant", "radiance": grey(sky)},
+            "sensor": view((0, 0, 4), fov=20.0, size=size),
+        }
+    )
+
+
+def test_furnace(rgb):
+    """A medium that absorbs nothing cannot be told from an even sky."""
+    batches = SessionBatches(bdpt(max_depth=-1, rr_depth=100), cloud(1.0), 2)
+    batches.add(2)
+    exact = Estimate.exact(np.ones((5, 3)))
+    assert_same(*collect_until(batches, exact, 0.005, 0.01), 0.005, 0.01, slack=1e-4)
+
+
+def test_each_technique_alone(rgb):
+    """Paths of two and three segments bring the same whether they meet the sky, find it by
+    next-event estimation, or come from there to the sensor. (Joining two vertices of a medium has
+    no finite variance alone.)"""
+    estimates = technique_estimates(cloud(0.8), pyramid(3, camera_paths=64), 48)
+    for k in (2, 3):
+        first = estimates[1, k]
+        for other in ((0, k + 1), (k, 1)):
+            assert not differences(estimates[other], first), other
+            assert 6 * np.sqrt(estimates[other].error2[0].max()) < 0.05 * first.mean[0].max()
+
+
+# --- Weights ------------------------------------------------------------------
+
+
+def foggy_room(light, sensor="perspective"):
+    """A room whose walls let nothing through, full of fog; a glass ball, and one of another
+    medium."""
+    lamps = {
+        "point": {"type": "point", "position": [0.3, 0.2, 0.7], "intensity": 1.0},
+        "area": {
+            "type": "rectangle",
+            "to_world": look((0.2, -0.1, 0.8), (0, 0, 0)) @ T().scale(0.3),
+            "emitter": {"type": "area"},
+        },
+    }
+    eye = {**view((0, -0.9, -0.3), (0.1, 0, 0), size=8, fov=70.0, kind=sensor), "medium": FOG}
+    if sensor == "thinlens":
+        eye.update(aperture_radius=0.05, focus_distance=1.0)
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "fog": {**homogeneous(1.0, 0.9, hg(0.5)), "id": "fog"},
+            "walls": {"type": "cube", "bsdf": {"type": "twosided", "bsdf": diffuse(0.7)}},
+            "cloud": ball({"type": "null"}, 0.3, center=[-0.5, 0.3, 0], **inner(5.0)),
+            "glass": ball({"type": "dielectric"}, 0.3, center=[0.5, 0.3, 0], exterior=FOG),
+            "lamp": lamps[light],
+            "sensor": eye,
+        }
+    )
+
+
+@pytest.mark.parametrize(
+    "light, sensor, length, beta",
+    [("area", "perspective", 3, 1), ("point", "thinlens", 3, 2), ("area", "perspective", 4, 1)],
+)
+def test_weights_sum_to_one(rgb, light, sensor, length, beta):
+    """Each technique's weight for the same joint path through the fog, from its own code."""
+    paths = JointPaths(foggy_room(light, sensor), length)
+    by_technique = paths.weights(ConnectionWeights(paths.lights, beta, 0.7, media=True))
+    total = sum(by_technique.values())
+    assert len(total) > 100
+    assert np.mean(np.abs(total - 1) < 2e-3) > 0.995, np.sort(np.abs(total - 1))[-20:]
+    used = {s for s, w in by_technique.items() if w.max() > 1e-3}
+    assert used == set(by_technique) - ({0} if light == "point" else set())
+
+
+# --- What is refused ----------------------------------------------------------
+
+REFUSING = sorted(set(_plugins.PLUGINS) - {"bdpt", "bdpm_auto", "volpath_multiview"})
+
+
+@pytest.mark.parametrize("plugin", REFUSING)
+def test_other_plugins_refuse_media(rgb, plugin):
+    with pytest.raises(Exception) as error:
+        mi.render(fog_scene(homogeneous()), integrator=mi.load_dict({"type": plugin}), spp=2)
+    assert last_words(error.value).startswith(f"{plugin}: participating media")
+
+
+def test_hidden_emitters_are_refused(rgb):
+    with pytest.raises(Exception) as error:
+        mi.render(fog_scene(homogeneous()), integrator=bdpt(hide_emitters=True), spp=2)
+    assert 'bdpt: parameter "hide_emitters"' in last_words(error.value)
+
+
+def test_a_sensor_must_name_its_medium(rgb):
+    """Camera paths would start in no medium, and light that goes to the sensor would end in one."""
+    with pytest.raises(Exception) as error:
+        mi.render(fog_scene(homogeneous(), view(*WITHIN)), integrator=bdpt(), spp=16)
+    assert "bdpt: the sensor stands in a medium" in last_words(error.value)
