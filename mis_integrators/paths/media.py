@@ -23,7 +23,7 @@ FAINT = 0.05
 
 
 FLIGHT = 1 << 16
-"""Where a path's numbers for free flights are drawn (`PathNumbers.at`): beyond those of vertices."""
+"""Where paths draw their numbers for free flights (`PathNumbers.at`): beyond those of vertices."""
 FLIGHT_SALT, SHADOW_SALT = 0x666C7900, 0x73686164
 
 

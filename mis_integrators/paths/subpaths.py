@@ -78,8 +78,9 @@ class Kept:
 def new_vertices(traits, capacity, states=STATES, marked=False):
     """Room for `capacity` vertices, a dictionary: `words` (records of `vertex_layout`), `parent`
     (the place of the vertex before, or `NO_PARENT`), and where surfaces are not all Lambertian
-    `hit` (records of `hit_record`), from which the surface interaction is made again; with media also
-    `media` (records of `media_record`). Only the places below the count are valid.
+    `hit` (records of `hit_record`), from which the surface interaction is made again;
+    with media also `media` (records of `media_record`). Only the places below the count are
+    valid.
 
     If they are `marked`, for the classes of light, also `mark`: of light sub-paths whether what
     they met first scattered by a delta function, of camera sub-paths whether they have scattered

@@ -17,9 +17,9 @@ from ..lights.environment_guide import infinite_emitters
 
 
 class VolumeTraits(MediaTraits):
-    """Attributes: those of `MediaTraits`, `has_infinite_lights`, `has_delta` (specular reflection or
-    refraction), `has_mixed` (smooth and specular parts in one BSDF), `has_masks` (BSDFs that ignore
-    the component mask), `shares` (see `density_share`, by the media's registry numbers)."""
+    """Attributes: those of `MediaTraits`, `has_infinite_lights`, `has_delta` (specular reflection
+    or refraction), `has_mixed` (smooth and specular parts in one BSDF), `has_masks` (BSDFs that
+    ignore the component mask), `shares` (see `density_share`, by the media's registry numbers)."""
 
     def __init__(self, scene, sensors):
         super().__init__(scene, sensors)

@@ -127,9 +127,9 @@ def room(bsdf, light, sensor="perspective"):
 
 
 class JointPaths:
-    """Random paths from the sensor through `length` vertices, on surfaces and in media, to a point of
-    a light, some of them scattering by delta functions, and the weights that each technique's own
-    code gives them."""
+    """Random paths from the sensor through `length` vertices, on surfaces and in media, to a point
+    of a light, some of them scattering by delta functions, and the weights that each technique's
+    own code gives them."""
 
     COUNT = 2000
 
