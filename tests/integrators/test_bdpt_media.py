@@ -6,8 +6,21 @@ a quarter is seen with a probability of 0.95, where a test says nothing else (`c
 """
 
 from mis_integrators import _plugins
+from mis_integrators.core.sequences import SampleSequence
+from mis_integrators.core.traits import SceneTraits
+from mis_integrators.lights.lights import Lights
 from mis_integrators.mis.vertex_merging import ConnectionWeights
+from mis_integrators.paths.setting import CameraPass, LightPass, Limits, World
+from mis_integrators.paths.subpaths import (
+    NO_PARENT,
+    read_vertices,
+    trace_camera_subpaths,
+    trace_light_subpaths,
+    vertex_bsdf_of,
+)
+from mis_integrators.paths.vertex import facing, in_medium
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -61,18 +74,17 @@ def blended():
 
 
 def fog_scene(medium, sensor=None, **objects):
-    """A cube of fog above a floor, under a lamp."""
-    return mi.load_dict(
-        {
-            "type": "scene",
-            "fog": {**medium, "id": "fog"},
-            "cube": container(FOG),
-            "floor": floor(),
-            "lamp": lamp(),
-            "sensor": sensor or view((0, 0.7, 4.2)),
-            **objects,
-        }
-    )
+    """A cube of fog above a floor, under a lamp (`None` leaves one of them out)."""
+    scene = {
+        "type": "scene",
+        "fog": {**medium, "id": "fog"},
+        "cube": container(FOG),
+        "floor": floor(),
+        "lamp": lamp(),
+        "sensor": sensor or view((0, 0.7, 4.2)),
+        **objects,
+    }
+    return mi.load_dict({name: thing for name, thing in scene.items() if thing is not None})
 
 
 def ball(bsdf, radius=0.5, **extra):
@@ -171,6 +183,32 @@ def test_depth_is_that_of_volpath(rgb, max_depth):
         2,
         whole=0.02,
         block=0.05,
+        spp=512,
+        most=600,
+    )
+
+
+@pytest.mark.parametrize(
+    "max_depth, opacity, radius, fov", [(2, 0.3, 0.9, 20.0), (4, 0.03, 0.5, 40.0)]
+)
+def test_half_transparent_surfaces(rgb, max_depth, opacity, radius, fov):
+    """All that is seen, and most light, comes through a mask: paths that pass it go on as if it
+    were not there, and their weights with them."""
+    mask = {"type": "mask", "opacity": opacity, "nested": {"type": "twosided", "nested": diffuse()}}
+    scene = fog_scene(
+        homogeneous(1.5, 0.95),
+        view((0, 0.3, 4.2), fov=fov),
+        floor=None,
+        curtain=ball(mask, radius, exterior=FOG, interior=FOG),
+        sky={"type": "constant", "radiance": grey(0.4)},
+    )
+    agree(
+        bdpt(max_depth=max_depth),
+        volpath(max_depth=max_depth),
+        scene,
+        2,
+        whole=0.01,
+        block=0.02,
         spp=512,
         most=600,
     )
@@ -311,6 +349,46 @@ def test_weights_sum_to_one(rgb, light, sensor, length, beta):
     assert np.mean(np.abs(total - 1) < 2e-3) > 0.995, np.sort(np.abs(total - 1))[-20:]
     used = {s for s, w in by_technique.items() if w.max() > 1e-3}
     assert used == set(by_technique) - ({0} if light == "point" else set())
+
+
+@pytest.mark.parametrize("kind", ["camera", "light"])
+def test_states_behind_half_transparent_surfaces(rgb, kind):
+    """Kept vertices carry what the hooks say of the vertices before them (of those in the fog), as
+    if the masks between them were not there."""
+    # Reflections leave no vertex, but count.
+    mask = {"type": "mask", "opacity": 0.1, "nested": {"type": "conductor"}}
+    spheres = {f"mask{i}": ball(mask, 0.3 * i, exterior=FOG, interior=FOG) for i in (1, 2, 3)}
+    scene = fog_scene(homogeneous(1.5, 0.95, hg(0.4)), floor=None, **spheres)
+    sensor = scene.sensors()[0]
+    traits, lights = SceneTraits(scene, sensor), Lights(scene)
+    lights.find_media(sensor, "bdpt")
+    world, limits, capacity = World(scene, lights, traits), Limits(8, 50), 20000
+    weights = ConnectionWeights(lights, 2, 1.3, media=True)
+    sequence = SampleSequence(mi.UInt32(3), mi.UInt32(0), 1, False)
+    if kind == "light":
+        light_pass = LightPass(sequence, 2000, [])
+        vertices, found, _ = trace_light_subpaths(world, limits, light_pass, weights, capacity)
+    else:
+        camera_pass = CameraPass(sensor, None, sequence, mi.UInt32(0), 256, 4, 0.5)
+        traced = trace_camera_subpaths(world, limits, camera_pass, weights, capacity)
+        vertices, found = traced[-2:]
+    found = int(found[0])
+    here = read_vertices(vertices, dr.arange(mi.UInt32, found), True)
+    later = here["parent"] != NO_PARENT
+    before = read_vertices(vertices, here["parent"], later)
+    later &= in_medium(before["n"])
+    d = -here["towards"]
+    sides = (before["towards"], d) if kind == "camera" else (d, before["towards"])
+    _, p_camera, p_light = vertex_bsdf_of(traits, before, [], later).f_and_pdfs(*sides, later)
+    forward, back = (p_camera, p_light) if kind == "camera" else (p_light, p_camera)
+    left = weights.scatter([before["d_vcm"], before["d_vc"]], forward, back, mi.Bool(False))
+    squared = dr.squared_norm(here["p"] - before["p"])
+    near, far = weights.propagate(left, forward * facing(traits, here["n"], d) / squared)
+    mask = np.array(later) & (np.array(here["depth"]) == np.array(before["depth"]) + 1)
+    assert mask.sum() > 100
+    for mine, expected in ((here["d_vcm"], near), (here["d_vc"], far)):
+        ratio = np.array(mine)[mask] / np.array(expected)[mask]
+        assert np.mean(np.abs(ratio - 1) < 5e-3) > 0.98, np.sort(ratio)
 
 
 # --- What is refused ----------------------------------------------------------
