@@ -176,9 +176,8 @@ class MediaTraits:
 
     Attributes: `media` (a list of all), `has_grids` (media that are not homogeneous),
     `has_null_media` (media in which collisions may be null: grids, and media whose extinction
-    depends on the channel), `has_flakes` (phase functions that are not symmetric),
-    `has_null_vertices` (BSDFs that scatter and let part of the light pass straight on),
-    `boundary_flags` (what must be known of surfaces that only let light pass).
+    depends on the channel), `has_null_vertices` (BSDFs that scatter and let part of the light pass
+    straight on), `boundary_flags` (what must be known of surfaces that only let light pass).
     """
 
     def __init__(self, scene, sensors):
@@ -191,9 +190,6 @@ class MediaTraits:
         self.media = all_media(scene, sensors)
         self.has_grids = any(not m.is_homogeneous() for m in self.media)
         self.has_null_media = self.has_grids or any(_is_coloured(m) for m in self.media)
-        self.has_flakes = any(
-            m.phase_function().flags() & mi.PhaseFunctionFlags.Microflake for m in self.media
-        )
 
 
 def all_media(scene, sensors=()):
@@ -225,6 +221,17 @@ def has_media(scene, sensor=None):
     return bool(all_media(scene, [sensor] if sensor else [])) or any(
         s.is_medium_transition() for s in scene.shapes()
     )
+
+
+def check_media(scene, sensor, plugin):
+    """Raises `UnsupportedScene` for media whose phase function is not symmetric (of flakes)."""
+    for medium in all_media(scene, [sensor]):
+        phase = medium.phase_function()
+        if phase.flags() & mi.PhaseFunctionFlags.Microflake:
+            raise UnsupportedScene(
+                f"{plugin}: phase function {phase.class_name()} is not supported, for its media "
+                'scatter unlike in different directions; use "volpath"'
+            )
 
 
 def check_film(sensor, plugin):

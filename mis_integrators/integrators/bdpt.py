@@ -18,7 +18,7 @@ from ..core.film import (
 from ..core.packing import rounded_up
 from ..core.random import next_2d, vertex_streams
 from ..core.recording import lanes, recorder
-from ..core.traits import SceneTraits, UnsupportedScene, check_scene, has_media
+from ..core.traits import SceneTraits, UnsupportedScene, check_media, check_scene, has_media
 from ..lights.lights import Lights
 from ..mis.vertex_merging import ConnectionWeights
 from ..paths.camera import with_gaps
@@ -96,8 +96,10 @@ class BDPT(IterativeIntegrator):
     orthographic sensors. All techniques that could have made a path share it by Veach's heuristic
     (1997, chapter 10).
 
-    Unbiased, without any parameter to choose. Participating media, polarised variants, gradients
-    and the film ``specfilm`` are refused by name.
+    Unbiased, without any parameter to choose. In participating media all techniques work as on
+    surfaces, and boundaries with the BSDF ``null`` do not count as segments, as in ``volpath``;
+    media of flakes and ``hide_emitters`` are refused there. Polarised variants, gradients and the
+    film ``specfilm`` are refused by name.
 
     .. tabs::
         .. code-tab:: xml
@@ -147,6 +149,7 @@ class BDPT(IterativeIntegrator):
 
     def check(self, scene, sensor):
         check_scene(scene, sensor, self.plugin, self.MEDIA)
+        check_media(scene, sensor, self.plugin)
         if self.hide_emitters and has_media(scene, sensor):
             raise UnsupportedScene(
                 f'{self.plugin}: parameter "hide_emitters" is not supported in scenes with '

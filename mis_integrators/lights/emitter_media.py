@@ -18,6 +18,9 @@ WALKS = 64
 """Random walks from an emitter, or from the sensor."""
 LONGEST_WALK = 32
 """Segments of a walk at most. Those that have met no boundary by then tell nothing."""
+LARGEST_DOUBT = 0.1
+"""Share of an emitter's walks that may find another medium than most do, through gaps between
+shapes."""
 UNDECIDED, OUTSIDE = -1, -2
 """Stand for walks that tell nothing, and for those that have left the scene."""
 
@@ -55,12 +58,13 @@ def number_of(medium):
 
 
 def most_frequent(found):
-    """Of what walks have found, that which most of those have that tell something."""
+    """Of what walks have found, that which most of those have that tell something, and their share
+    of these."""
     told = found[found != UNDECIDED]
     if not len(told):
-        return UNDECIDED
+        return UNDECIDED, 1.0
     values, counts = np.unique(told, return_counts=True)
-    return int(values[counts.argmax()])
+    return int(values[counts.argmax()]), counts.max() / len(told)
 
 
 def media_beyond_boundaries(scene, sensor, plugin):
@@ -72,7 +76,7 @@ def media_beyond_boundaries(scene, sensor, plugin):
     ray, _ = sensor.sample_ray_differential(0, 0.5, next_2d(rng), next_2d(rng))
     ray = mi.Ray3f(ray)
     dr.eval(ray)
-    named, met = number_of(sensor.get_medium()), most_frequent(surrounding_media(scene, ray))
+    named, (met, _) = number_of(sensor.get_medium()), most_frequent(surrounding_media(scene, ray))
     if met >= 0 and met != named:
         raise UnsupportedScene(
             f"{plugin}: the sensor stands in {_words(met)}, says the boundary that its rays meet "
@@ -85,9 +89,10 @@ def _words(number):
     return "no medium" if number == 0 else "a medium"
 
 
-def media_at_emitters(lights, beyond):
+def media_at_emitters(lights, beyond, plugin):
     """The registry number of the medium around each of the `lights.emitters`, a list. `beyond`: as
-    of `media_beyond_boundaries`; what an emitter says of itself counts where walks tell nothing."""
+    of `media_beyond_boundaries`; what an emitter says of itself counts where walks tell nothing.
+    Raises `UnsupportedScene` for emitters that stand in several media."""
     numbers = []
     for index, (emitter, kind) in enumerate(zip(lights.emitters, lights.kinds)):
         if kind in ("environment", "directional"):
@@ -101,7 +106,13 @@ def media_at_emitters(lights, beyond):
         ray, _ = emitter.sample_ray(0, 0.5, next_2d(rng), next_2d(rng))
         ray = mi.Ray3f(ray)
         dr.eval(ray)
-        met = most_frequent(surrounding_media(lights.scene, ray))
+        found = surrounding_media(lights.scene, ray)
+        met, share = most_frequent(np.where(found == OUTSIDE, beyond[OUTSIDE], found))
+        if share < 1 - LARGEST_DOUBT:
+            raise UnsupportedScene(
+                f"{plugin}: emitter {emitter.class_name()} ({emitter.id()}) stands in several media; "
+                "split it at their boundary"
+            )
         if met == UNDECIDED and emitter.get_medium() is not None:
             met = number_of(emitter.get_medium())
         numbers.append(beyond.get(met, met))

@@ -156,7 +156,7 @@ class Lights:
     def find_media(self, sensor, plugin):
         """Finds the media in which emitters stand, for `medium_at`."""
         beyond = media_beyond_boundaries(self.scene, sensor, plugin)
-        found = media_at_emitters(self, beyond)
+        found = media_at_emitters(self, beyond, plugin)
         self._media = from_numpy(mi.UInt32, found or [0])
 
     def medium_at(self, emitter):

@@ -240,25 +240,15 @@ def medium_behind(si, medium, wo, active):
 # --- Vertices ---------------------------------------------------------------------------------
 
 
-def phase_f_and_pdfs(traits, sides, to_camera, to_light, active):
+def phase_f_and_pdfs(sides, to_camera, to_light, active):
     """The phase function [1/sr] at vertices in media (`vertex.Sides`), and the densities with which
-    a camera path goes on to the light's side, and a light sub-path to the camera's.
-
-    Where phase functions are not symmetric (media of flakes), each side multiplies with that of its
-    own direction: its extinction has the other factor."""
+    a camera path goes on to the light's side, and a light sub-path to the camera's. Phase functions
+    are symmetric here (media of flakes are refused), in their densities, too."""
     medium = dr.select(active, sides.above, dr.zeros(mi.MediumPtr))
     phase, context = medium.phase_function(), mi.PhaseFunctionContext(None)
-
-    def eval_pdf(wi, wo):
-        mei = point_in(medium, sides.p, mi.Float(0), sides.wavelengths, wi)
-        return phase.eval_pdf(context, mei, wo, active)
-
-    value, p_camera = eval_pdf(to_camera, to_light)
-    if not traits.has_flakes:
-        return value, p_camera, p_camera
-    value_light, p_light = eval_pdf(to_light, to_camera)
-    of_light = dr.dot(sides.towards, to_light) > dr.dot(sides.towards, to_camera)
-    return dr.select(of_light, value_light, value), p_camera, p_light
+    mei = point_in(medium, sides.p, mi.Float(0), sides.wavelengths, to_camera)
+    value, pdf = phase.eval_pdf(context, mei, to_light, active)
+    return value, pdf, pdf
 
 
 def direct_light(scene, traits, lights, ref, sides, draws, active):

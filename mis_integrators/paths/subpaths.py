@@ -191,7 +191,7 @@ def vertex_bsdf_of(traits, record, wavelengths, active):
 
 def sides_of(record, wavelengths):
     """The `Sides` of kept vertices."""
-    return Sides(record["above"], record["below"], record["p"], record["towards"], wavelengths)
+    return Sides(record["above"], record["below"], record["p"], wavelengths)
 
 
 def smooth_at(at, active):

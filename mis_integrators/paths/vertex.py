@@ -41,12 +41,10 @@ def facing(traits, n, d):
 
 class Sides:
     """Media on both sides of vertices: `above`, where the geometric normal points to, and `below`;
-    of vertices in media both are the medium. `p`: the vertices; `towards`: the side from which they
-    were described."""
+    of vertices in media both are the medium. `p`: the vertices."""
 
-    def __init__(self, above, below, p, towards, wavelengths):
-        self.above, self.below, self.p, self.towards = above, below, p, towards
-        self.wavelengths = wavelengths
+    def __init__(self, above, below, p, wavelengths):
+        self.above, self.below, self.p, self.wavelengths = above, below, p, wavelengths
 
     @classmethod
     def at(cls, si, medium):
@@ -54,7 +52,7 @@ class Sides:
         transition = si.is_medium_transition()
         above = dr.select(transition, si.target_medium(mi.Vector3f(si.n)), medium)
         below = dr.select(transition, si.target_medium(-mi.Vector3f(si.n)), medium)
-        return cls(above, below, si.p, si.to_world(si.wi), si.wavelengths)
+        return cls(above, below, si.p, si.wavelengths)
 
     def medium(self, n, d):
         """The medium into which a ray in direction `d` leaves vertices with normals `n`."""
@@ -145,7 +143,7 @@ class VertexBSDF:
         if traits.has_media:
             inside = active & in_medium(self.n)
             phase, phase_camera, phase_light = phase_f_and_pdfs(
-                traits, self.sides, to_camera, to_light, inside
+                self.sides, to_camera, to_light, inside
             )
             value = dr.select(inside, phase, value)
             p_camera = dr.select(inside, phase_camera, p_camera)

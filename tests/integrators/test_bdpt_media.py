@@ -409,6 +409,14 @@ def test_hidden_emitters_are_refused(rgb):
     assert 'bdpt: parameter "hide_emitters"' in last_words(error.value)
 
 
+def test_flakes_are_refused(rgb):
+    flakes = np.broadcast_to(np.float32([0.9, 0.1, 0.2, 0, 0, 0]), (2, 2, 2, 6))
+    phase = {"type": "sggx", "S": {"type": "gridvolume", "grid": mi.VolumeGrid(flakes.copy())}}
+    with pytest.raises(Exception) as error:
+        mi.render(fog_scene(homogeneous(phase=phase)), integrator=bdpt(), spp=16)
+    assert "bdpt: phase function SGGX" in last_words(error.value)
+
+
 def test_a_sensor_must_name_its_medium(rgb):
     """Camera paths would start in no medium, and light that goes to the sensor would end in one."""
     with pytest.raises(Exception) as error:

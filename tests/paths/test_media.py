@@ -5,7 +5,7 @@ Statistical tests: false-alarm rate 1e-6 each.
 
 from mis_integrators.core.random import streams
 from mis_integrators.core.sequences import SampleSequence
-from mis_integrators.core.traits import SceneTraits
+from mis_integrators.core.traits import SceneTraits, UnsupportedScene
 from mis_integrators.lights.lights import Lights
 from mis_integrators.paths.media import fly, transmitted
 from mis_integrators.paths.vertex import Sides
@@ -42,7 +42,7 @@ def kept(scene, o, d, distance):
     traits = SceneTraits(scene)
     p = dr.zeros(mi.Point3f, COUNT) + mi.Point3f(*o)
     d, none = mi.Vector3f(*d), dr.zeros(mi.MediumPtr, COUNT)
-    sides = Sides(none, none, p, d, [])
+    sides = Sides(none, none, p, [])
     rng = streams(dr.arange(mi.UInt32, COUNT), mi.UInt32(3))
     n = dr.zeros(mi.Vector3f, COUNT)
     return np.array(transmitted(scene, traits, p, n, sides, d, mi.Float(distance), [], rng, True))
@@ -151,3 +151,10 @@ def test_emitters_find_their_medium(rgb, lamp, inside):
     lights.find_media(scene.sensors()[0], "bdpt")
     found = lights.medium_at(mi.EmitterPtr(scene.emitters()[0]))
     assert bool(np.array(found != None)[0]) == inside  # noqa: E711 (array comparison)
+
+
+def test_emitters_in_several_media_are_refused(rgb):
+    """A lamp that a boundary cuts in two halves."""
+    scene = fog_scene(homogeneous(), lamp={**LAMP, "center": [0, 1, 0]})
+    with pytest.raises(UnsupportedScene, match="AreaLight .* stands in several media"):
+        Lights(scene, "bdpt").find_media(scene.sensors()[0], "bdpt")
