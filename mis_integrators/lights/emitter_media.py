@@ -110,8 +110,8 @@ def media_at_emitters(lights, beyond, plugin):
         met, share = most_frequent(np.where(found == OUTSIDE, beyond[OUTSIDE], found))
         if share < 1 - LARGEST_DOUBT:
             raise UnsupportedScene(
-                f"{plugin}: emitter {emitter.class_name()} ({emitter.id()}) stands in several media; "
-                "split it at their boundary"
+                f"{plugin}: emitter {emitter.class_name()} ({emitter.id()}) stands in several "
+                "media; split it at their boundary"
             )
         if met == UNDECIDED and emitter.get_medium() is not None:
             met = number_of(emitter.get_medium())

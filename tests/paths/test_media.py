@@ -156,5 +156,5 @@ def test_emitters_find_their_medium(rgb, lamp, inside):
 def test_emitters_in_several_media_are_refused(rgb):
     """A lamp that a boundary cuts in two halves."""
     scene = fog_scene(homogeneous(), lamp={**LAMP, "center": [0, 1, 0]})
-    with pytest.raises(UnsupportedScene, match="AreaLight .* stands in several media"):
+    with pytest.raises(UnsupportedScene, match=r"AreaLight .* stands in several media"):
         Lights(scene, "bdpt").find_media(scene.sensors()[0], "bdpt")
