@@ -116,6 +116,9 @@ SCENES = {
         view(*WITHIN, medium=FOG, kind="thinlens", aperture_radius=0.05, focus_distance=1.0),
     ),
     "nested": lambda: fog_scene(homogeneous(), ball=ball({"type": "null"}, **inner())),
+    "glass": lambda: fog_scene(
+        homogeneous(), ball=ball({"type": "dielectric", "int_ior": 1.3}, **inner())
+    ),
     "rough glass": lambda: fog_scene(
         homogeneous(),
         ball=ball({"type": "roughdielectric", "alpha": 0.4, "int_ior": 1.2}, **inner()),
