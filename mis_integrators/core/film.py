@@ -27,10 +27,17 @@ def colour_matrix(wavelengths):
 def shared_wavelengths(sensor, number):
     """The wavelengths that all sub-paths of an iteration share, the sample that makes them (from
     `number`, 32 random bits), and their conversion to colour: a dictionary of opaque arrays
-    `sample`, `wavelengths`, `matrix`."""
+    `sample`, `wavelengths`, `matrix`, and `sensor_matrix`, for light that has no camera ray: the
+    weight of one holds the response over the density of its wavelengths, too."""
     sample = dr.opaque(mi.Float, number / 2**32)
-    wavelengths, _ = sensor.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), sample)
-    spectral = {"sample": sample, "wavelengths": wavelengths, "matrix": colour_matrix(wavelengths)}
+    wavelengths, weight = sensor.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), sample)
+    matrix = colour_matrix(wavelengths)
+    spectral = {
+        "sample": sample,
+        "wavelengths": wavelengths,
+        "matrix": matrix,
+        "sensor_matrix": [column * weight[i] for i, column in enumerate(matrix)],
+    }
     dr.make_opaque(spectral)
     return spectral
 

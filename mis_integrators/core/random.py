@@ -36,6 +36,12 @@ def vertex_streams(path, number, seed):
     return streams(path, seed + number * mi.UInt32(0x9E3779B9))
 
 
+def own_stream(draws, salt):
+    """A generator of its own for each path at the vertex of `draws` (a `VertexNumbers`), for what
+    takes a number of draws that is not known; `salt`: an integer, one for each purpose."""
+    return streams(*draws.words(salt))
+
+
 def next_floats(rng, dimensions, active=True):
     """So many uniform numbers in [0, 1); of a `VertexNumbers`, stratified together."""
     if isinstance(rng, VertexNumbers):

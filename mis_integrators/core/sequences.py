@@ -176,3 +176,7 @@ class VertexNumbers:
     def next_float32(self, active=True):
         """One number; `active` changes nothing (the interface of `mi.PCG32`)."""
         return self.next_floats(1)[0]
+
+    def words(self, salt):
+        """Two words that no other path at no other vertex has, and no other `salt` there."""
+        return self._path.index, hash_bits(self._key + mi.UInt32(salt))

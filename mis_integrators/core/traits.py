@@ -138,10 +138,11 @@ class SceneTraits:
     somewhere), `has_mixed` (BSDFs with both a smooth and a delta part), `has_rough` (smooth
     scattering that is not Lambertian), `has_rough_glass` (rough refraction), `has_lambertian`,
     `has_perturbed` (bump or normal maps), `has_light_surfaces` (emitters that a ray can meet: area
-    lights, environments), `lambertian`, `perturbed` (registry tables for BSDF pointers).
+    lights, environments), `lambertian`, `perturbed` (registry tables for BSDF pointers),
+    `has_media`, and with media those of `MediaTraits`.
     """
 
-    def __init__(self, scene):
+    def __init__(self, scene, sensor=None):
         self.bounds = scene_bounds(scene)
         flag = mi.BSDFFlags
         bsdfs = used_bsdfs(scene)
@@ -165,6 +166,45 @@ class SceneTraits:
         self.lambertian = registry_table(bsdfs, mi.BSDFPtr, lambertian, mi.Bool)
         delta = mi.EmitterFlags.DeltaPosition | mi.EmitterFlags.DeltaDirection
         self.has_light_surfaces = any(not (e.flags() & delta) for e in scene.emitters())
+        self.has_media = has_media(scene, sensor)
+        if self.has_media:
+            self.__dict__.update(MediaTraits(scene, [sensor] if sensor else []).__dict__)
+
+
+class MediaTraits:
+    """What a scene with media needs besides.
+
+    Attributes: `media` (a list of all), `has_grids` (media that are not homogeneous),
+    `has_null_media` (media in which collisions may be null: grids, and media whose extinction
+    depends on the channel), `has_null_vertices` (BSDFs that scatter and let part of the light pass
+    straight on), `boundary_flags` (what must be known of surfaces that only let light pass).
+    """
+
+    def __init__(self, scene, sensors):
+        flag = mi.BSDFFlags
+        others = (int(flag.Delta) | int(flag.Smooth)) & ~int(flag.Null)
+        flags = [int(bsdf.flags()) for bsdf in used_bsdfs(scene)]
+        self.has_null_vertices = any(f & int(flag.Null) and f & others for f in flags)
+        # Where all boundaries are plain, neither textures nor shading frames matter there.
+        self.boundary_flags = mi.RayFlags.All if self.has_null_vertices else mi.RayFlags.Minimal
+        self.media = all_media(scene, sensors)
+        self.has_grids = any(not m.is_homogeneous() for m in self.media)
+        self.has_null_media = self.has_grids or any(_is_coloured(m) for m in self.media)
+
+
+def all_media(scene, sensors=()):
+    """The media of a scene and its `sensors`, each once."""
+    found = [o for root in (scene, *sensors) for o in scene_objects(root)]
+    found += [sensor.get_medium() for sensor in sensors]
+    return list({o.ptr: o for o in found if isinstance(o, mi.Medium)}.values())
+
+
+def _is_coloured(medium):
+    """Whether a homogeneous medium's extinction depends on the channel or wavelength."""
+    if mi.is_spectral:
+        return True
+    _, _, sigma_t = medium.get_scattering_coefficients(dr.zeros(mi.MediumInteraction3f))
+    return bool((dr.max(sigma_t) > dr.min(sigma_t))[0])
 
 
 def check_variant(scene, plugin):
@@ -176,11 +216,22 @@ def check_variant(scene, plugin):
         )
 
 
-def has_media(scene):
-    """Whether there are participating media in the scene."""
-    return any(isinstance(o, mi.Medium) for o in scene_objects(scene)) or any(
+def has_media(scene, sensor=None):
+    """Whether there are participating media in the scene, or around the `sensor`."""
+    return bool(all_media(scene, [sensor] if sensor else [])) or any(
         s.is_medium_transition() for s in scene.shapes()
     )
+
+
+def check_media(scene, sensor, plugin):
+    """Raises `UnsupportedScene` for media whose phase function is not symmetric (of flakes)."""
+    for medium in all_media(scene, [sensor]):
+        phase = medium.phase_function()
+        if phase.flags() & mi.PhaseFunctionFlags.Microflake:
+            raise UnsupportedScene(
+                f"{plugin}: phase function {phase.class_name()} is not supported, for its media "
+                'scatter unlike in different directions; use "volpath"'
+            )
 
 
 def check_film(sensor, plugin):
@@ -196,19 +247,19 @@ def check_film(sensor, plugin):
         )
 
 
-def check_scene(scene, sensor, plugin):
+def check_scene(scene, sensor, plugin, media=False):
     """Raises `UnsupportedScene` for what the surface integrators cannot render, before any
-    sampling."""
+    sampling. `media`: this one can render participating media."""
     if mi.is_polarized:
         raise UnsupportedScene(
             f"{plugin}: polarised variants are not supported (active: {mi.variant()}); use an "
             "unpolarised "
             'one such as "llvm_ad_rgb"'
         )
-    if has_media(scene):
+    if not media and has_media(scene, sensor):
         raise UnsupportedScene(
             f"{plugin}: participating media are not supported by this surface integrator; use "
-            '"volpath"'
+            '"bdpt" or "volpath"'
         )
     check_emitters(scene, plugin)
     if mi.has_flag(sensor.film().flags(), mi.FilmFlags.Special):

@@ -64,7 +64,7 @@ class BDPMAuto(IterativeIntegrator):
     LAYERS = *CHANNELS, *SPLIT
 
     def check(self, scene, sensor):
-        if has_media(scene):
+        if has_media(scene, sensor):
             check_volume_scene(scene, self.plugin)
             if self.layers:
                 raise UnsupportedScene(
@@ -75,7 +75,7 @@ class BDPMAuto(IterativeIntegrator):
             check_scene(scene, sensor, self.plugin)
 
     def new_session(self, scene, sensor, seed, iterations):
-        if has_media(scene):
+        if has_media(scene, sensor):
             volumetric = mi.load_dict({"type": "volpath_multiview", **handed_on(self)})
             return volumetric.session(
                 scene, sensor, seed, (iterations or 0) * self.initial_camera_paths

@@ -18,11 +18,11 @@ from ..core.film import (
 from ..core.packing import rounded_up
 from ..core.random import next_2d, vertex_streams
 from ..core.recording import lanes, recorder
-from ..core.traits import SceneTraits
+from ..core.traits import SceneTraits, UnsupportedScene, check_media, check_scene, has_media
 from ..lights.lights import Lights
 from ..mis.vertex_merging import ConnectionWeights
 from ..paths.camera import with_gaps
-from ..paths.connect import by_path, join, join_sensor, list_pairs, visible
+from ..paths.connect import by_path, join, join_sensor, kept_between, list_pairs, visible
 from ..paths.layers import CHANNELS, SPLIT
 from ..paths.light_classes import LightClasses, by_class, class_of
 from ..paths.sensor import Lens
@@ -96,8 +96,10 @@ class BDPT(IterativeIntegrator):
     orthographic sensors. All techniques that could have made a path share it by Veach's heuristic
     (1997, chapter 10).
 
-    Unbiased, without any parameter to choose. Participating media, polarised variants, gradients
-    and the film ``specfilm`` are refused by name.
+    Unbiased, without any parameter to choose. In participating media all techniques work as on
+    surfaces, and boundaries with the BSDF ``null`` do not count as segments, as in ``volpath``;
+    media of flakes and ``hide_emitters`` are refused there. Polarised variants, gradients and the
+    film ``specfilm`` are refused by name.
 
     .. tabs::
         .. code-tab:: xml
@@ -142,6 +144,18 @@ class BDPT(IterativeIntegrator):
             "technique_weights": self.technique_weights,
         }
 
+    MEDIA = True
+    """Whether participating media are supported."""
+
+    def check(self, scene, sensor):
+        check_scene(scene, sensor, self.plugin, self.MEDIA)
+        check_media(scene, sensor, self.plugin)
+        if self.hide_emitters and has_media(scene, sensor):
+            raise UnsupportedScene(
+                f'{self.plugin}: parameter "hide_emitters" is not supported in scenes with '
+                'participating media; use "volpath"'
+            )
+
     def new_session(self, scene, sensor, seed, iterations):
         return BDPTSession(self, scene, sensor, seed, iterations)
 
@@ -162,8 +176,10 @@ class BDPTSession(IterativeSession):
 
     def __init__(self, integrator, scene, sensor, seed, iterations):
         super().__init__(integrator, scene, sensor, seed, iterations)
-        self.traits = SceneTraits(scene)
+        self.traits = SceneTraits(scene, sensor)
         self.lights = Lights.seen_by(scene, sensor, integrator.plugin)
+        if self.traits.has_media:
+            self.lights.find_media(sensor, integrator.plugin)
         self.world = World(scene, self.lights, self.traits)
         self.split_paths(CHUNK)
         self.light_chunk = self.light_count()
@@ -198,7 +214,8 @@ class BDPTSession(IterativeSession):
         """The weights of an iteration."""
         integrator = self.integrator
         beta = int(integrator.beta) if integrator.beta == int(integrator.beta) else integrator.beta
-        return ConnectionWeights(self.lights, beta, self.light_path_count / self.pixel_paths)
+        ratio = self.light_path_count / self.pixel_paths
+        return ConnectionWeights(self.lights, beta, ratio, media=self.traits.has_media)
 
     # ------------------------------------------------------------------ passes
 
@@ -246,7 +263,7 @@ class BDPTSession(IterativeSession):
             self.capacity["pairs"],
         )
 
-    def _connect(self, scene, tables, radiance, camera, light, pairs, spectral, entries):
+    def _connect(self, scene, tables, radiance, camera, light, pairs, seed, spectral, entries):
         """Radiance of camera paths with that of connections added."""
         camera_place, light_place, count = pairs
         index = lanes(self.capacity["pairs"])
@@ -254,7 +271,13 @@ class BDPTSession(IterativeSession):
         z = read_vertices(camera, dr.gather(mi.UInt32, camera_place, index, active), active)
         y = read_vertices(light, dr.gather(mi.UInt32, light_place, index, active), active)
         pair = join(self.traits, z, y, spectral["wavelengths"], active)
-        seen = visible(scene, pair, z, active & (dr.max(pair.value) > 0))
+        seen = active & (dr.max(pair.value) > 0)
+        if self.traits.has_media:
+            rng = vertex_streams(z["path"], z["number"] * MOST_VERTICES + y["number"], seed)
+            wavelengths = spectral["wavelengths"]
+            pair.value *= kept_between(scene, self.traits, pair, z, wavelengths, rng, seen)
+        else:
+            seen = visible(scene, pair, z, seen)
         share = self.weights(spectral).connected(pair, z, y)
         total = mi.Spectrum(radiance)
         dr.scatter_reduce(dr.ReduceOp.Add, total, pair.value * share, z["path"], seen)
@@ -285,18 +308,19 @@ class BDPTSession(IterativeSession):
             aperture,
             spectral["wavelengths"],
             active,
+            rng,
         )
         value = joined.value * (self.pixel_paths / self.light_path_count)
         share = self.weights(spectral).seen_by_sensor(joined, y)
-        channels = list(colour_channels(value * share, spectral["matrix"]))
+        channels = list(colour_channels(value * share, spectral["sensor_matrix"]))
         if self.integrator.splits_light:
             smooth = dr.select(y["depth"] == 1, mi.UInt32(1), mi.UInt32(2))
             for light in by_class(class_of(smooth, y["mark"]), value * share):
-                channels.extend(colour_channels(light, spectral["matrix"]))
+                channels.extend(colour_channels(light, spectral["sensor_matrix"]))
         if self.integrator.techniques:
             value = value * share if self.integrator.technique_weights else value
             channels += sensor_images(
-                self.integrator.techniques, y["depth"], value, spectral["matrix"]
+                self.integrator.techniques, y["depth"], value, spectral["sensor_matrix"]
             )
         return splat_channels(sensor.film(), joined.film, channels, joined.active)
 
@@ -348,7 +372,15 @@ class BDPTSession(IterativeSession):
                 if not self._grown("pairs", pairs[-1]):
                     break
             radiance, entries = self._connection_pass(
-                self.scene, self._tables, radiance, camera, light[0], pairs, spectral, entries
+                self.scene,
+                self._tables,
+                radiance,
+                camera,
+                light[0],
+                pairs,
+                self._seed(iteration, SHADOWS, chunk),
+                spectral,
+                entries,
             )
             radiance, entries = self._merge(radiance, camera, count, light, spectral, entries)
             dr.eval(radiance, entries)  # else its sums may still wait when the film's are made
@@ -383,5 +415,7 @@ class BDPTSession(IterativeSession):
         self.accumulator.add(block, iteration, techniques)
 
 
-LIGHT, CAMERA, APERTURE = 0, 1, 3
+MOST_VERTICES = 1 << 12
+"""Tells apart the random numbers of a camera vertex's connections with so many light vertices."""
+LIGHT, CAMERA, APERTURE, SHADOWS = 0, 1, 3, 5
 """Purposes of an iteration's random seeds, besides `IterativeSession.WAVELENGTH`."""

@@ -453,11 +453,11 @@ class ResampledSession(IterativeSession):
             active,
         )
         value = joined.value * (self.weights().seen_by_sensor(joined, y) / self.ratio)
-        channels = list(colour_channels(value, spectral["matrix"]))
+        channels = list(colour_channels(value, spectral["sensor_matrix"]))
         if self.integrator.splits_light:
             smooth = dr.select(y["depth"] == 1, mi.UInt32(1), mi.UInt32(2))
             for part in by_class(class_of(smooth, y["mark"]), value):
-                channels.extend(colour_channels(part, spectral["matrix"]))
+                channels.extend(colour_channels(part, spectral["sensor_matrix"]))
         return splat_channels(sensor.film(), joined.film, channels, joined.active)
 
     # ------------------------------------------------------------------ before the first iteration

@@ -90,6 +90,8 @@ class VCM(BDPT):
             "alpha": self.alpha,
         }
 
+    MEDIA = False
+
     def new_session(self, scene, sensor, seed, iterations):
         return VCMSession(self, scene, sensor, seed, iterations)
 

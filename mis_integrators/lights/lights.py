@@ -19,6 +19,7 @@ from ..core.packing import from_numpy
 from ..core.random import next_1d_and_2d, next_2d, next_floats, streams
 from ..core.spectra import channel_mean
 from ..core.traits import UnsupportedScene, lookup, registry_table
+from .emitter_media import media_at_emitters, media_beyond_boundaries
 from .environment_guide import AIMED_SHARE, EnvironmentGuide, direction_cell, infinite_emitters
 from .nearby import NearbyChoice
 
@@ -152,6 +153,17 @@ class Lights:
             sensor=sensor,
         )
 
+    def find_media(self, sensor, plugin):
+        """Finds the media in which emitters stand, for `medium_at`."""
+        beyond = media_beyond_boundaries(self.scene, sensor, plugin)
+        found = media_at_emitters(self, beyond, plugin)
+        self._media = from_numpy(mi.UInt32, found or [0])
+
+    def medium_at(self, emitter):
+        """The medium around emitters, after `find_media`."""
+        index = lookup(self.numbers, emitter, mi.UInt32)
+        return dr.reinterpret_array(mi.MediumPtr, dr.gather(mi.UInt32, self._media, index))
+
     @property
     def dark(self):
         """True where no emitter emits anything."""
@@ -173,6 +185,7 @@ class Lights:
                 "_surface_number",
                 "_sphere_center",
                 "_sphere_sign",
+                "_media",
             )
             if hasattr(self, name)
         ]

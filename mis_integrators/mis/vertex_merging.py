@@ -12,6 +12,7 @@ import mitsuba as mi
 
 from ..paths.light_starts import seen_from
 from ..paths.subpaths import STATES
+from ..paths.vertex import in_medium
 from ..weights import bidirectional as theory
 
 
@@ -19,13 +20,19 @@ class ConnectionWeights:
     """The state of sub-paths (`mis.state.ConnectionState`), and the weights of joined sub-paths.
 
     `beta`: Veach's exponent; `ratio`: light sub-paths over camera paths, of the whole crop window;
-    `eta` [m^2]: pi R^2 N of merging, or 0.
+    `eta` [m^2]: pi R^2 N of merging, or 0; `media`: vertices may lie in media (connections only).
+
+    In media densities per volume hold the extinction at the vertex. That stands in both densities
+    of each ratio p>(x_s) / p<(x_s) and cancels, so the equations are those of surfaces, with
+    cosines of one. Transmittance, which differs between the two segments, is left out of both: it
+    has no closed form in heterogeneous media. Weights still are functions of the path alone.
     """
 
     states = STATES
 
-    def __init__(self, lights, beta, ratio, eta=0.0):
+    def __init__(self, lights, beta, ratio, eta=0.0, media=False):
         self.lights, self.beta, self.ratio, self.eta = lights, beta, ratio, eta
+        self.media = media
 
     @staticmethod
     def blank(width):
@@ -37,6 +44,8 @@ class ConnectionWeights:
     def init_light(self, si, source, reachable, active, flux=None):
         ds = seen_from(si, source, active)
         cosine = dr.maximum(dr.abs(dr.dot(si.n, ds.d)), 1e-6)
+        if self.media:
+            cosine = dr.select(in_medium(si.n), 1, cosine)
         direct = self.lights.pdf_direct(si, ds, active)
         d_vcm, d_vc = theory.light_start(
             cosine * self.lights.emission_over_nee_pdf(si, ds, active), direct * dr.rcp(cosine)

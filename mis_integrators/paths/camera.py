@@ -10,6 +10,7 @@ import mitsuba as mi
 
 from ..core.random import next_1d_and_2d, next_2d
 from .camera_rays import sample_camera_ray
+from .media import begin_flights, interaction_at, medium_behind, next_hit, sample_phase
 from .roulette import russian_roulette
 from .setting import CameraPass, Limits, ListedPass, World
 
@@ -109,7 +110,8 @@ class CameraArrival:
     `si`, `hit`, `ray`: the interaction (perhaps invalid), what it is computed from, and the ray
     that led there; `towards`: unit vector to where the sub-path came from; `throughput` that
     arrives; `path`: its number; `depth`: segments so far; `visible`: it has met more than null
-    surfaces; `bsdf`: of the surface.
+    surfaces; `bsdf`: of the surface. In scenes with media, `medium`: the one that it comes through,
+    and `scatters`: it scatters there, at no surface (`interaction_at`).
     """
 
     si: mi.SurfaceInteraction3f
@@ -121,6 +123,8 @@ class CameraArrival:
     depth: mi.UInt32
     visible: mi.Bool
     bsdf: mi.BSDFPtr
+    medium: Any = None
+    scatters: Any = None
 
 
 class CameraVisitor(Protocol):
@@ -155,6 +159,10 @@ class CameraVisitor(Protocol):
         """After scattering, by a delta function or not: the state, the throughput's factor (at
         first `weight`), and which sub-paths go on."""
 
+    def cross(self, before: list[Any], after: list[Any], crosses: Array) -> list[Any]:
+        """In scenes with media: the state, where sub-paths have passed straight through a surface,
+        from those before they arrived and after they left."""
+
 
 @dr.syntax
 def trace_camera(
@@ -182,15 +190,30 @@ def trace_camera(
     if dr.hint(max_depth == 0, mode="scalar"):
         active &= False
 
-    hit = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
+    flight = begin_flights(traits, camera_pass.sensor.get_medium())
+    if dr.hint(traits.has_media, mode="scalar"):
+        hit, ray, flight, throughput = next_hit(
+            scene, traits, ray, flight, numbers, throughput, active
+        )
+    else:
+        hit = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
     if dr.hint(hide_emitters, mode="scalar"):
         hit, ray = behind_emitters(scene, camera_pass.integrator, hit, ray, active)
 
     while dr.hint(active, label="camera sub-paths"):
-        si = hit.compute_surface_interaction(ray, mi.RayFlags.All, active=active)
         depth += 1
-        rng = numbers.at(depth)
-        at = CameraArrival(si, hit, ray, -ray.d, throughput, path, depth, visible, si.bsdf(ray))
+        if dr.hint(traits.has_media, mode="scalar"):
+            medium, event, scatters = flight
+            si = interaction_at(hit, ray, scatters, active)
+            rng = numbers.at(event)
+        else:
+            medium = scatters = None
+            si = hit.compute_surface_interaction(ray, mi.RayFlags.All, active=active)
+            rng = numbers.at(depth)
+        before = state
+        at = CameraArrival(
+            si, hit, ray, -ray.d, throughput, path, depth, visible, si.bsdf(ray), medium, scatters
+        )
 
         # ---- Emission met by the path
         if dr.hint(traits.has_light_surfaces, mode="scalar"):
@@ -205,16 +228,34 @@ def trace_camera(
         radiance += direct
 
         # ---- Go on
-        bs, weight = at.bsdf.sample(context, si, *next_1d_and_2d(rng, met), met)
+        choice, point = next_1d_and_2d(rng, met)
+        if dr.hint(traits.has_media, mode="scalar"):
+            bs, weight = at.bsdf.sample(context, si, choice, point, met & ~scatters)
+            bs, weight = sample_phase(medium, si, choice, point, bs, weight, met & scatters)
+        else:
+            bs, weight = at.bsdf.sample(context, si, choice, point, met)
         delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         visible |= met & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
         state, weight, active = visitor.leave(state, at, rng, bs, weight, delta, active)
         throughput *= weight
         eta *= bs.eta
         ray = si.spawn_ray(si.to_world(bs.wo))
+        begun = depth >= rr_depth
+        if dr.hint(traits.has_media, mode="scalar"):
+            crosses = met & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
+            state = visitor.cross(before, state, crosses)
+            depth -= dr.select(crosses, mi.UInt32(1), mi.UInt32(0))
+            active |= crosses
+            begun &= ~crosses
+            flight = [medium_behind(si, medium, ray.d, met), event, scatters]
         throughput, active = russian_roulette(
-            rng, throughput, dr.max(throughput), eta, depth >= rr_depth, active
+            rng, throughput, dr.max(throughput), eta, begun, active
         )
-        hit = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
+        if dr.hint(traits.has_media, mode="scalar"):
+            hit, ray, flight, throughput = next_hit(
+                scene, traits, ray, flight, numbers, throughput, active
+            )
+        else:
+            hit = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
 
     return radiance, dr.select(visible, mi.Float(1), mi.Float(0)), splat

@@ -14,10 +14,11 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.packing import Store
+from .media import transmitted
 from .sensor import unblocked, unblocked_by_visible
 from .setting import Limits, World
-from .subpaths import Kept, read_vertices, vertex_bsdf_of
-from .vertex import SMALLEST_COSINE
+from .subpaths import Kept, read_vertices, sides_of, vertex_bsdf_of
+from .vertex import SMALLEST_COSINE, facing
 
 Array = Any
 
@@ -52,9 +53,9 @@ def join(traits, camera, light, wavelengths, active):
     at_light = vertex_bsdf_of(traits, light, wavelengths, active)
     value, p_camera, back_at_camera = at_camera.f_and_pdfs(camera["towards"], d, active)
     value_light, back_at_light, p_light = at_light.f_and_pdfs(-d, light["towards"], active)
-    leaving = dr.abs(dr.dot(light["n"], d))
-    landing = dr.maximum(dr.abs(dr.dot(light["n"], light["towards"])), SMALLEST_COSINE)
-    geometry = leaving * dr.abs(dr.dot(camera["n"], d)) * dr.rcp(squared)
+    leaving = facing(traits, light["n"], d)
+    landing = dr.maximum(facing(traits, light["n"], light["towards"]), SMALLEST_COSINE)
+    geometry = leaving * facing(traits, camera["n"], d) * dr.rcp(squared)
     carried = (
         camera["throughput"]
         * value
@@ -138,6 +139,15 @@ def visible(scene, connection, camera, active):
     return unblocked(scene, camera["p"], camera["n"], connection.d, connection.distance, active)
 
 
+def kept_between(scene, traits, connection, camera, wavelengths, rng, active):
+    """Share of light (spectrum) that media and boundaries leave between the two ends."""
+    sides = sides_of(camera, wavelengths)
+    d, distance = connection.d, connection.distance
+    return transmitted(
+        scene, traits, camera["p"], camera["n"], sides, d, distance, wavelengths, rng, active
+    )
+
+
 @dataclass
 class LensConnection:
     """Light vertices joined to the sensor.
@@ -157,18 +167,24 @@ class LensConnection:
 
 
 def join_sensor(
-    world: World, limits: Limits, integrator, lens, light, aperture, wavelengths, active
+    world: World, limits: Limits, integrator, lens, light, aperture, wavelengths, active, rng=None
 ):
     """The `LensConnection` of light vertices (records as of `read_vertices`). `integrator`: as of
-    `CameraPass`."""
-    scene, time = world.scene, mi.Float(lens.sensor.shutter_open())
+    `CameraPass`; `rng`: a generator, in scenes with media."""
+    scene, traits, time = world.scene, world.traits, mi.Float(lens.sensor.shutter_open())
     d, distance, film, density, active = lens.connect(light["p"], time, aperture, active)
     vertex_bsdf = vertex_bsdf_of(world.traits, light, wavelengths, active)
     value, back, _ = vertex_bsdf.f_and_pdfs(d, light["towards"], active)
-    leaving = dr.abs(dr.dot(light["n"], d))
-    landing = dr.maximum(dr.abs(dr.dot(light["n"], light["towards"])), SMALLEST_COSINE)
+    leaving = facing(traits, light["n"], d)
+    landing = dr.maximum(facing(traits, light["n"], light["towards"]), SMALLEST_COSINE)
     active = active & (dr.max(value) > 0)
-    if limits.hide_emitters:
+    if traits.has_media:
+        sides = sides_of(light, wavelengths)
+        value *= transmitted(
+            scene, traits, light["p"], light["n"], sides, d, distance, wavelengths, rng, active
+        )
+        active &= dr.max(value) > 0
+    elif limits.hide_emitters:
         active &= unblocked_by_visible(scene, integrator, light["p"], d, distance, active)
     else:
         active &= unblocked(scene, light["p"], light["n"], d, distance, active)

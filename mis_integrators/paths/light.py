@@ -10,6 +10,7 @@ import mitsuba as mi
 
 from ..core.random import next_1d_and_2d
 from ..core.traits import lookup
+from .media import begin_flights, interaction_at, medium_behind, next_hit, sample_phase
 from .perturbed import sample_perturbed
 from .roulette import russian_roulette
 from .setting import LightPass, Limits, World
@@ -29,14 +30,17 @@ def lane_count(n_paths):
     )
 
 
-def scatter_light(traits, si, bsdf, rng, active):
-    """Samples where a light sub-path goes on from a surface.
+def scatter_light(traits, si, bsdf, rng, active, medium=None, scatters=None):
+    """Samples where a light sub-path goes on from a surface, or, where it `scatters`, in a medium.
 
     Returns `(bs, delta, weight, wo, active)`: Mitsuba's BSDF sample, whether a delta function
     scattered, the flux's factor, the direction in world space, and the paths that go on: those end
     for which shading and geometric normal disagree about the side. The factor includes the adjoint
     one of shading normals (Veach 1997, section 5.3).
     """
+    if traits.has_media:
+        within = active & scatters
+        active = active & ~within
     if traits.has_perturbed:
         perturbed = lookup(traits.perturbed, bsdf, mi.Bool, active)
         bs, delta, weight = sample_perturbed(bsdf, si, rng, perturbed, active)
@@ -44,6 +48,9 @@ def scatter_light(traits, si, bsdf, rng, active):
         context = mi.BSDFContext(mi.TransportMode.Importance)
         bs, weight = bsdf.sample(context, si, *next_1d_and_2d(rng, active), active)
         delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+    if traits.has_media:
+        bs, weight = sample_phase(medium, si, *next_1d_and_2d(rng), bs, weight, within)
+        delta &= ~within
     wo = si.to_world(bs.wo)
     wi_shading, wo_shading = mi.Frame3f.cos_theta(si.wi), mi.Frame3f.cos_theta(bs.wo)
     wi_geometric, wo_geometric = dr.dot(si.n, si.to_world(si.wi)), dr.dot(si.n, wo)
@@ -51,6 +58,8 @@ def scatter_light(traits, si, bsdf, rng, active):
     adjoint = dr.abs(wi_shading * wo_geometric / (wo_shading * wi_geometric))
     if traits.has_perturbed:
         adjoint = dr.select(perturbed, dr.abs(wo_geometric / wi_geometric), adjoint)
+    if traits.has_media:
+        adjoint, active = dr.select(within, 1, adjoint), active | within
     return bs, delta, weight * adjoint, wo, active
 
 
@@ -62,7 +71,8 @@ class LightArrival:
     unit vector to where the sub-path came from; `flux` [W] that one sub-path carries; `path`: its
     number; `depth`: segments so far; `first`: no surface was met before; `source`: the point of
     the light, valid where `first`; `had_delta`: met a delta surface, or started out of reach of
-    next-event estimation; `scattered`: met a smooth surface.
+    next-event estimation; `scattered`: met a smooth surface. In scenes with media, `medium`: the
+    one that it comes through, and `scatters`: it scatters there, at no surface (`interaction_at`).
     """
 
     si: mi.SurfaceInteraction3f
@@ -76,6 +86,8 @@ class LightArrival:
     source: mi.DirectionSample3f
     had_delta: mi.Bool
     scattered: mi.Bool
+    medium: Any = None
+    scatters: Any = None
 
 
 class LightVisitor(Protocol):
@@ -95,6 +107,9 @@ class LightVisitor(Protocol):
         self, state: list[Any], at: LightArrival, wo: Array, delta: Array, active: Array
     ) -> list[Any]:
         """The state after scattering into the local direction `wo`, by a delta function or not."""
+
+    def cross(self, before: list[Any], after: list[Any], crosses: Array) -> list[Any]:
+        """As of `CameraVisitor`."""
 
 
 @dr.syntax
@@ -125,6 +140,9 @@ def trace_light(world: World, limits: Limits, light_pass: LightPass, visitor: Li
     eta = dr.ones(mi.Float, lanes)
     state = visitor.blank(lanes)
     active = dr.full(mi.Bool, False, lanes)
+    flight = begin_flights(traits, None)
+    # Where it comes from, until it scatters first: it may pass surfaces before.
+    start = [dr.zeros(mi.DirectionSample3f), mi.Bool(False)] if traits.has_media else []
 
     while dr.hint(active | (next_path < count), label="light sub-paths"):
         # ---- Start the lane's next path where one has ended
@@ -144,28 +162,70 @@ def trace_light(world: World, limits: Limits, light_pass: LightPass, visitor: Li
             active = dr.max(flux) > 0
             path = mi.UInt32(next_path)
             next_path += stride
+            if dr.hint(traits.has_media, mode="scalar"):
+                flight = begin_flights(traits, lights.medium_at(source.emitter))
+                start = [source, mi.Bool(True)]
 
         # ---- Arrive
-        hit = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
-        active &= hit.is_valid()
-        si = hit.compute_surface_interaction(ray, mi.RayFlags.All, active=active)
         depth += 1
-        rng = sequence.of_paths(first + path).at(depth)
+        numbers = sequence.of_paths(first + path)
+        if dr.hint(traits.has_media, mode="scalar"):
+            hit, ray, flight, flux = next_hit(scene, traits, ray, flight, numbers, flux, active)
+            medium, event, scatters = flight
+            active &= hit.is_valid() | scatters
+            si = interaction_at(hit, ray, scatters, active)
+            rng = numbers.at(event)
+            source, fresh = start
+        else:
+            medium = scatters = None
+            hit = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
+            active &= hit.is_valid()
+            si = hit.compute_surface_interaction(ray, mi.RayFlags.All, active=active)
+            rng = numbers.at(depth)
+            fresh = begin
+        before, arrived = state, mi.Bool(active)
         at = LightArrival(
-            si, hit, si.bsdf(ray), -ray.d, flux, path, depth, begin, source, had_delta, scattered
+            si,
+            hit,
+            si.bsdf(ray),
+            -ray.d,
+            flux,
+            path,
+            depth,
+            fresh,
+            source,
+            had_delta,
+            scattered,
+            medium,
+            scatters,
         )
         state = visitor.arrive(state, at, active)
 
         # ---- Go on: the next surface needs one more segment, and the sensor one after it
         if dr.hint(max_depth > 0, mode="scalar"):
             active &= depth + 2 <= max_depth
-        bs, delta, weight, wo, active = scatter_light(traits, si, at.bsdf, rng, active)
-        state = visitor.leave(state, at, bs.wo, delta, active)
-        had_delta |= delta
-        scattered |= ~delta
+        begun = depth >= rr_depth
+        if dr.hint(traits.has_media, mode="scalar"):
+            bs, delta, weight, wo, arrived = scatter_light(
+                traits, si, at.bsdf, rng, arrived, medium, scatters
+            )
+            crosses = arrived & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
+            active &= arrived & ~crosses
+            state = visitor.leave(state, at, bs.wo, delta, active)
+            state = visitor.cross(before, state, crosses)
+            had_delta |= delta & ~crosses
+            scattered |= ~delta
+            depth -= dr.select(crosses, mi.UInt32(1), mi.UInt32(0))
+            active |= crosses
+            begun &= ~crosses
+            start = [source, fresh & crosses]
+            flight = [medium_behind(si, medium, wo, active), event, scatters]
+        else:
+            bs, delta, weight, wo, active = scatter_light(traits, si, at.bsdf, rng, active)
+            state = visitor.leave(state, at, bs.wo, delta, active)
+            had_delta |= delta
+            scattered |= ~delta
         flux *= weight
         eta *= bs.eta
         ray = si.spawn_ray(wo)
-        flux, active = russian_roulette(
-            rng, flux, dr.max(flux) * strength, eta, depth >= rr_depth, active
-        )
+        flux, active = russian_roulette(rng, flux, dr.max(flux) * strength, eta, begun, active)

@@ -21,9 +21,10 @@ from ..core.records import Layout
 from .camera import trace_camera, within_crop
 from .light import trace_light
 from .light_classes import class_of, scattered_history, start_of_camera_path
+from .media import direct_light
 from .sensor import Lens
 from .setting import CameraPass, LightPass, Limits, World
-from .vertex import VertexBSDF, scattered_mean
+from .vertex import Sides, VertexBSDF, facing, scattered_mean
 
 Array = Any
 
@@ -59,6 +60,11 @@ def hit_record():
     return Layout({"hit": mi.PreliminaryIntersection3f})
 
 
+def media_record():
+    """The record of the media on both sides of a vertex (`vertex.Sides`)."""
+    return Layout({"above": mi.MediumPtr, "below": mi.MediumPtr})
+
+
 @dataclass(frozen=True)
 class Kept:
     """Kept vertices: their buffer (`new_vertices`), how many there are (width one), and how many
@@ -72,8 +78,9 @@ class Kept:
 def new_vertices(traits, capacity, states=STATES, marked=False):
     """Room for `capacity` vertices, a dictionary: `words` (records of `vertex_layout`), `parent`
     (the place of the vertex before, or `NO_PARENT`), and where surfaces are not all Lambertian
-    `hit` (records of `hit_record`), from which the surface interaction is made again. Only the
-    places below the count are valid.
+    `hit` (records of `hit_record`), from which the surface interaction is made again;
+    with media also `media` (records of `media_record`). Only the places below the count are
+    valid.
 
     If they are `marked`, for the classes of light, also `mark`: of light sub-paths whether what
     they met first scattered by a delta function, of camera sub-paths whether they have scattered
@@ -84,6 +91,8 @@ def new_vertices(traits, capacity, states=STATES, marked=False):
     }
     if traits.has_rough:
         buffer["hit"] = hit_record().room(capacity)
+    if traits.has_media:
+        buffer["media"] = media_record().room(capacity)
     if marked:
         buffer["mark"] = dr.zeros(mi.Bool, capacity)
     return buffer
@@ -114,6 +123,10 @@ def keep_vertex(store, at, throughput, number, parent, state, keep, mark=None):
     dr.scatter(store.vertices["parent"], parent, slot, keep)
     if "hit" in store.vertices:
         hit_record().write(store.vertices["hit"], {"hit": at.hit}, slot, keep)
+    if "media" in store.vertices:
+        sides = at.vertex_bsdf.sides
+        values = {"above": sides.above, "below": sides.below}
+        media_record().write(store.vertices["media"], values, slot, keep)
     if mark is not None:
         dr.scatter(store.vertices["mark"], mark, slot, keep)
     return slot
@@ -129,6 +142,8 @@ def read_vertices(vertices, index, active, only=None, states=STATES):
         record["mark"] = dr.gather(mi.Bool, vertices["mark"], index, active)
     if "hit" in vertices and (only is None or "hit" in only):
         record |= hit_record().read(vertices["hit"], index, active)
+    if "media" in vertices and (only is None or "media" in only):
+        record |= media_record().read(vertices["media"], index, active)
     return record
 
 
@@ -136,6 +151,14 @@ def seen_normal(vertex):
     """Geometric normal of vertices, as read by `read_vertices`, on the side that their sub-path
     came from."""
     return dr.mulsign(vertex["n"], dr.dot(vertex["n"], vertex["towards"]))
+
+
+def _selected(mask, yes, no):
+    """Element by element, of states that hold lists, too."""
+    return [
+        _selected(mask, a, b) if isinstance(a, list) else dr.select(mask, a, b)
+        for a, b in zip(yes, no)
+    ]
 
 
 def _either(mask, yes, no):
@@ -155,8 +178,26 @@ def vertex_bsdf_of(traits, record, wavelengths, active):
         si = hit.compute_surface_interaction(ray, mi.RayFlags.All, rough)
         bsdf = si.bsdf()
     return VertexBSDF(
-        traits, record["n"], record["ns"], record["value"], record["density"], si, bsdf
+        traits,
+        record["n"],
+        record["ns"],
+        record["value"],
+        record["density"],
+        si,
+        bsdf,
+        sides_of(record, wavelengths) if traits.has_media else None,
     )
+
+
+def sides_of(record, wavelengths):
+    """The `Sides` of kept vertices."""
+    return Sides(record["above"], record["below"], record["p"], wavelengths)
+
+
+def smooth_at(at, active):
+    """Where sub-paths have arrived at a smooth vertex: of a surface, or in a medium."""
+    smooth = mi.has_flag(at.bsdf.flags(), mi.BSDFFlags.Smooth)
+    return active & (smooth if at.scatters is None else smooth | at.scatters)
 
 
 class VertexVisitor:
@@ -193,14 +234,14 @@ class VertexVisitor:
         si, weights = at.si, self.weights
         first = active & at.first
         squared = dr.maximum(dr.squared_norm(si.p - origin), 1e-20)
-        arrival = density * dr.abs(dr.dot(si.n, at.towards)) * dr.rcp(squared)
+        arrival = density * facing(self.traits, si.n, at.towards) * dr.rcp(squared)
         sums = _either(
             first,
             weights.init_light(si, at.source, ~at.had_delta, first, at.flux),
             weights.propagate(sums, arrival, si, squared, at.depth),
         )
-        smooth = active & mi.has_flag(at.bsdf.flags(), mi.BSDFFlags.Smooth)
-        at.vertex_bsdf = VertexBSDF.at(self.traits, si, at.bsdf, smooth)
+        smooth = smooth_at(at, active)
+        at.vertex_bsdf = VertexBSDF.at(self.traits, si, at.bsdf, smooth, at.medium)
         slot = keep_vertex(
             self.store, at, at.flux, number, parent, dict(zip(weights.states, sums)), smooth, *mark
         )
@@ -214,9 +255,12 @@ class VertexVisitor:
         value, p_back, p_forward = at.vertex_bsdf.f_and_pdfs(away, at.towards, active & ~delta)
         mean = scattered_mean(value, si.n, at.towards)
         sums = _either(active, self.weights.scatter(sums, p_forward, p_back, delta, mean), sums)
-        density = dr.select(delta, 0, p_forward * dr.abs(dr.dot(si.n, away)))
+        density = dr.select(delta, 0, p_forward * facing(self.traits, si.n, away))
         mark = [dr.select(at.first, delta, before) for before in mark]
         return [number, parent, density, mi.Point3f(si.p), sums, mark]
+
+    def cross(self, before, after, crosses):
+        return [after[0], *_selected(crosses, before[1:], after[1:])]
 
 
 def trace_light_subpaths(
@@ -294,8 +338,8 @@ class CameraVertexVisitor:
     def arrive(self, state, at, rng, active):
         number, parent, density, origin, sums, history = state
         si, weights = at.si, self.weights
-        smooth = active & mi.has_flag(at.bsdf.flags(), mi.BSDFFlags.Smooth)
-        cosine = dr.abs(dr.dot(si.n, at.towards))
+        smooth = smooth_at(at, active)
+        cosine = facing(self.traits, si.n, at.towards)
         first = active & (at.depth == 1)
         of_rays = mi.Float(0)
         if self.lens.connects:
@@ -308,7 +352,7 @@ class CameraVertexVisitor:
             weights.init_camera(of_rays, first),
             weights.propagate(sums, arrival, si, squared, at.depth),
         )
-        at.vertex_bsdf = VertexBSDF.at(self.traits, si, at.bsdf, smooth)
+        at.vertex_bsdf = VertexBSDF.at(self.traits, si, at.bsdf, smooth, at.medium)
         direct = mi.Spectrum(0)
         if not self.lights.dark:
             direct = self._direct(sums, at, rng, smooth)
@@ -327,17 +371,22 @@ class CameraVertexVisitor:
     def _direct(self, sums, at, rng, smooth):
         """Radiance of direct light at smooth vertices, by next-event estimation."""
         si, lights = at.si, self.lights
-        ds, light, light_pdf = lights.sample_direct(si, rng, smooth)
+        if self.traits.has_media:
+            ds, light, light_pdf = direct_light(
+                self.scene, self.traits, lights, si, at.vertex_bsdf.sides, rng, smooth
+            )
+        else:
+            ds, light, light_pdf = lights.sample_direct(si, rng, smooth)
         reached = smooth & (dr.max(light) > 0)
         # elsewhere the direction may not even be a number
         direction = dr.select(reached, ds.d, mi.Vector3f(0, 0, 1))
         response, p_camera, p_light = at.vertex_bsdf.f_and_pdfs(at.towards, direction, reached)
-        facing = dr.abs(dr.dot(si.n, direction))
+        cosine = facing(self.traits, si.n, direction)
         share = self.weights.next_event(
             sums,
             light_pdf,
-            facing * lights.emission_over_nee_pdf(si, ds, reached),
-            p_camera * facing,
+            cosine * lights.emission_over_nee_pdf(si, ds, reached),
+            p_camera * cosine,
             p_light,
             ds.delta,
         )
@@ -352,9 +401,12 @@ class CameraVertexVisitor:
         value, p_forward, p_back = at.vertex_bsdf.f_and_pdfs(at.towards, wo, active & ~delta)
         mean = scattered_mean(value, si.n, wo)
         sums = _either(active, self.weights.scatter(sums, p_forward, p_back, delta, mean), sums)
-        density = dr.select(delta, 0, p_forward * dr.abs(dr.dot(si.n, wo)))
+        density = dr.select(delta, 0, p_forward * facing(self.traits, si.n, wo))
         history = scattered_history(history, delta, active) if history else []
         return [number, parent, density, mi.Interaction3f(si), sums, history], weight, active
+
+    def cross(self, before, after, crosses):
+        return [after[0], *_selected(crosses, before[1:], after[1:])]
 
 
 def trace_camera_subpaths(

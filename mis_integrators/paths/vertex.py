@@ -13,6 +13,7 @@ import mitsuba as mi
 
 from ..core.spectra import channel_mean
 from ..core.traits import lookup
+from .media import phase_f_and_pdfs
 from .perturbed import smooth_density
 
 SMALLEST_COSINE = 1e-6
@@ -26,15 +27,48 @@ def scattered_mean(value, n, to_light):
     return channel_mean(value) * dr.rcp(dr.maximum(dr.abs(dr.dot(n, to_light)), SMALLEST_COSINE))
 
 
+def in_medium(n):
+    """Whether vertices lie in a medium: then they have no normal."""
+    return dr.squared_norm(n) < 0.5
+
+
+def facing(traits, n, d):
+    """Cosine (positive) between geometric normals and directions, which turns solid angles into
+    projected ones; one at vertices in media."""
+    cosine = dr.abs(dr.dot(n, d))
+    return dr.select(in_medium(n), 1, cosine) if traits.has_media else cosine
+
+
+class Sides:
+    """Media on both sides of vertices: `above`, where the geometric normal points to, and `below`;
+    of vertices in media both are the medium. `p`: the vertices."""
+
+    def __init__(self, above, below, p, wavelengths):
+        self.above, self.below, self.p, self.wavelengths = above, below, p, wavelengths
+
+    @classmethod
+    def at(cls, si, medium):
+        """Those of interactions that were reached through a `medium`."""
+        transition = si.is_medium_transition()
+        above = dr.select(transition, si.target_medium(mi.Vector3f(si.n)), medium)
+        below = dr.select(transition, si.target_medium(-mi.Vector3f(si.n)), medium)
+        return cls(above, below, si.p, si.wavelengths)
+
+    def medium(self, n, d):
+        """The medium into which a ray in direction `d` leaves vertices with normals `n`."""
+        return dr.select(dr.dot(n, d) > 0, self.above, self.below)
+
+
 class VertexBSDF:
-    """A vertex, seen from one side of it.
+    """A vertex, seen from one side of it. In a medium (without a normal, see `in_medium`) the phase
+    function is the BSDF, and there is no cosine.
 
     Attributes: `n`, `ns` geometric and shading normal; `value` (a spectrum, BSDF without cosine)
     and `density` (per projected solid angle) of Lambertian surfaces on the side from which they
-    were described; `si`, `bsdf` where there are others.
+    were described; `si`, `bsdf` where there are others; `sides` (`Sides`) in scenes with media.
     """
 
-    def __init__(self, traits, n, ns, value, density, si=None, bsdf=None):
+    def __init__(self, traits, n, ns, value, density, si=None, bsdf=None, sides=None):
         self.traits, self.n, self.ns, self.value, self.density, self.si, self.bsdf = (
             traits,
             n,
@@ -44,10 +78,17 @@ class VertexBSDF:
             si,
             bsdf,
         )
+        self.sides = sides
 
     @classmethod
-    def at(cls, traits, si, bsdf, active):
-        """The vertex at an interaction, described from the side of `si.wi`."""
+    def at(cls, traits, si, bsdf, active, medium=None):
+        """The vertex at an interaction, described from the side of `si.wi`; `medium`: the one
+        through which it was reached, in scenes with media."""
+        sides = None
+        if traits.has_media:
+            sides = Sides.at(si, medium)
+            inside = in_medium(si.n)
+            active = active & ~inside
         value, density = mi.Spectrum(0), mi.Float(ROUGH)
         if traits.has_lambertian:
             lambertian = (
@@ -60,7 +101,10 @@ class VertexBSDF:
             )
             value, density = bsdf.eval_pdf(mi.BSDFContext(), si, upright, lambertian)
             density = dr.select(lambertian, density, ROUGH)
-        return cls(traits, mi.Vector3f(si.n), mi.Vector3f(si.sh_frame.n), value, density, si, bsdf)
+        if traits.has_media:
+            density = dr.select(inside, 0, density)
+        n, ns = mi.Vector3f(si.n), mi.Vector3f(si.sh_frame.n)
+        return cls(traits, n, ns, value, density, si, bsdf, sides)
 
     def f_and_pdfs(self, to_camera, to_light, active=True):
         """`(value, p_camera, p_light)`: radiance towards the camera per radiance from the light and
@@ -95,4 +139,13 @@ class VertexBSDF:
             )
         # Light sub-paths end where shading and geometric normal disagree about the side.
         agreed = (geometric_camera * shading_camera > 0) & (geometric_light * shading_light > 0)
-        return value, p_camera * per_light, dr.select(agreed, p_light * per_camera, 0)
+        p_camera, p_light = p_camera * per_light, dr.select(agreed, p_light * per_camera, 0)
+        if traits.has_media:
+            inside = active & in_medium(self.n)
+            phase, phase_camera, phase_light = phase_f_and_pdfs(
+                self.sides, to_camera, to_light, inside
+            )
+            value = dr.select(inside, phase, value)
+            p_camera = dr.select(inside, phase_camera, p_camera)
+            p_light = dr.select(inside, phase_light, p_light)
+        return value, p_camera, p_light

@@ -6,7 +6,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from .media import collision, section
+from ..paths.media import collision, section
 from .pivots import ON_SURFACE, added_stream, next_gap, null_stream, passing, pivot_surface
 from .shifts import Sections, at_optical_depth, total_optical_depth
 

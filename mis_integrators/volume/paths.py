@@ -7,16 +7,13 @@ import mitsuba as mi
 
 from ..core.random import next_1d_and_2d
 from ..lights.lights import mis_power
+from ..paths.media import collision, point_in, section, transmittance
 from ..paths.roulette import russian_roulette
-from .media import collision, section, transmittance
 
 
 def scattering_interaction(medium, p, wi, time, wavelengths):
     """A `MediumInteraction3f` that scatters towards `wi` (away from where light goes)."""
-    mei = dr.zeros(mi.MediumInteraction3f)
-    mei.p, mei.time, mei.wavelengths, mei.medium = p, time, wavelengths, medium
-    mei.wi, mei.sh_frame, mei.t = wi, mi.Frame3f(wi), mi.Float(0)
-    return mei
+    return point_in(medium, p, time, wavelengths, wi)
 
 
 @dr.syntax

@@ -8,7 +8,7 @@ import mitsuba as mi
 
 from ..core.random import streams
 from ..core.spectra import channel_mean
-from .media import collision, section
+from ..paths.media import collision, section
 
 NOWHERE, IN_MEDIUM, ON_SURFACE = range(3)
 """Where a path's pivot is."""

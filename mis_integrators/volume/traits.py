@@ -6,39 +6,32 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.traits import UnsupportedScene, check_emitters, check_variant, scene_objects, used_bsdfs
+from ..core.traits import (
+    MediaTraits,
+    UnsupportedScene,
+    check_emitters,
+    check_variant,
+    used_bsdfs,
+)
 from ..lights.environment_guide import infinite_emitters
-from .media import point_in
 
 
-class VolumeTraits:
-    """Attributes: `has_grids` (media that are not homogeneous), `has_null_media` (media in which
-    collisions may be null: grids, and media whose extinction depends on the channel),
-    `has_infinite_lights`, `has_delta` (specular reflection or refraction), `has_mixed` (smooth and
-    specular parts in one BSDF), `has_null_vertices` (BSDFs that let part of the light pass straight
-    on), `has_masks` (BSDFs that ignore the component mask), `boundary_flags` (what must be known of
-    surfaces that only let light pass), `shares` (see `density_share`, by the media's registry
-    numbers)."""
+class VolumeTraits(MediaTraits):
+    """Attributes: those of `MediaTraits`, `has_infinite_lights`, `has_delta` (specular reflection
+    or refraction), `has_mixed` (smooth and specular parts in one BSDF), `has_masks` (BSDFs that
+    ignore the component mask), `shares` (see `density_share`, by the media's registry numbers)."""
 
     def __init__(self, scene, sensors):
+        super().__init__(scene, sensors)
         flag = mi.BSDFFlags
         bsdfs = used_bsdfs(scene)
         flags = [int(b.flags()) for b in bsdfs]
         specular = int(flag.DeltaReflection) | int(flag.DeltaTransmission)
         self.has_delta = any(f & specular for f in flags)
         self.has_mixed = any(f & specular and f & int(flag.Smooth) for f in flags)
-        self.has_null_vertices = any(
-            f & int(flag.Null) and f & (specular | int(flag.Smooth)) for f in flags
-        )
         self.has_masks = any(b.class_name() == "MaskBSDF" for b in bsdfs)
-        # Where all boundaries are plain, neither textures nor shading frames matter there.
-        self.boundary_flags = mi.RayFlags.All if self.has_null_vertices else mi.RayFlags.Minimal
         self.has_infinite_lights = bool(infinite_emitters(scene))
-        media = [
-            o for root in (scene, *sensors) for o in scene_objects(root) if isinstance(o, mi.Medium)
-        ]
-        self.has_grids = any(not m.is_homogeneous() for m in media)
-        self.has_null_media = self.has_grids or any(_is_coloured(m) for m in media)
+        media = self.media
         numbers = [int(dr.reinterpret_array(mi.UInt32, mi.MediumPtr(m))[0]) for m in media]
         shares = np.zeros(max(numbers, default=0) + 1, dtype=np.float32)
         shares[numbers] = [_mean_over_majorant(m) for m in media]
@@ -65,16 +58,6 @@ def _mean_over_majorant(medium):
     )
     values = np.abs(np.array(parameters[name], dtype=np.float64)) if name else np.zeros(1)
     return float(values.mean() / values.max()) if values.max() > 0 else 0.0
-
-
-def _is_coloured(medium):
-    """Whether a homogeneous medium's extinction depends on the channel or wavelength."""
-    if mi.is_spectral:
-        return True
-    _, _, sigma_t = medium.get_scattering_coefficients(
-        point_in(medium, mi.Point3f(0), mi.Float(0), dr.zeros(mi.Ray3f).wavelengths)
-    )
-    return bool((dr.max(sigma_t) > dr.min(sigma_t))[0])
 
 
 def check_volume_scene(scene, plugin):

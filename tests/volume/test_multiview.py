@@ -8,7 +8,7 @@ import functools
 
 import mis_integrators
 from mis_integrators.app import cli, output
-from mis_integrators.volume.media import transmittance
+from mis_integrators.paths.media import transmittance
 from mis_integrators.volume.shifts import SHIFTS
 from mis_integrators.volume.traits import VolumeTraits
 from mis_integrators.volume.views import Views

@@ -1,0 +1,272 @@
+"""Participating media: what one does at a point, free flight to the next scattering, and what light
+is left on the way between two points.
+
+Free flight is delta tracking (Woodcock et al. 1965) against a medium's majorant, the largest one of
+its channels: a tentative collision is null or real, with the mean probability over the channels, so
+that one density serves all of them and throughput carries the ratios (spectral tracking, Kutz et
+al. 2017; Mitsuba's `prbvolpath` does the same).
+
+Index-matched boundaries (the BSDF `null`, and the share that others let pass straight on) end no
+segment: paths and connections go through them.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from ..core.random import own_stream
+from ..core.spectra import channel_mean
+
+FAINT = 0.05
+"""Tuned: transmittance below which the estimate on the way to a light plays roulette."""
+
+
+FLIGHT = 1 << 16
+"""Where paths draw their numbers for free flights (`PathNumbers.at`): beyond those of vertices."""
+FLIGHT_SALT, SHADOW_SALT = 0x666C7900, 0x73686164
+
+
+def point_in(medium, p, time, wavelengths, wi=None):
+    """A `MediumInteraction3f` at `p`, for the evaluation of coefficients and of the phase function:
+    `wi` (world space) leads to where a path came from. (Coefficients depend on it in media of
+    flakes.)"""
+    mei = dr.zeros(mi.MediumInteraction3f)
+    mei.p, mei.time, mei.wavelengths, mei.medium = p, time, wavelengths, medium
+    mei.wi = mi.Vector3f(0, 0, 1) if wi is None else wi
+    mei.sh_frame = mi.Frame3f(mei.wi)
+    return mei
+
+
+def section(medium, ray, active):
+    """Where the medium's constant majorant begins and ends on a ray, and the majorant: `(near, far,
+    majorant)`, zero where there is none."""
+    inside, near, far = medium.intersect_aabb(ray)
+    majorant = dr.max(
+        medium.get_majorant(point_in(medium, ray.o, ray.time, ray.wavelengths, -ray.d), active)
+    )
+    near, far = dr.maximum(near, 0), dr.minimum(far, ray.maxt)
+    inside &= active & (far > near) & (majorant > 0)
+    return dr.select(inside, near, 0), dr.select(inside, far, 0), dr.select(inside, majorant, 0)
+
+
+def collision(medium, p, majorant, time, wavelengths, active, wi=None):
+    """At a tentative collision: `(null, real, probability)`, the spectra that a null collision and
+    a scattering multiply throughput with, and the probability of the former. With the probability's
+    mean over the spectrum, one density serves all channels (prbvolpath does the same)."""
+    sigma_s, _, sigma_t = medium.get_scattering_coefficients(
+        point_in(medium, p, time, wavelengths, wi), active
+    )
+    share = sigma_t * dr.rcp(dr.maximum(majorant, 1e-30))
+    probability = dr.clip(1 - channel_mean(share), 0, 1)
+    null = dr.select(probability > 0, (1 - share) * dr.rcp(dr.maximum(probability, 1e-30)), 0)
+    total = channel_mean(sigma_t)
+    return null, dr.select(total > 0, sigma_s * dr.rcp(dr.maximum(total, 1e-30)), 0), probability
+
+
+@dr.syntax
+def transmittance(scene, traits, ray, medium, rng, active):
+    """Share of light that gets along `ray` (to its `maxt`) through media and null boundaries: exact
+    in homogeneous media, in others estimated without bias by ratio tracking (Novak et al. 2014),
+    with roulette once it is faint. Returns it and the advanced `rng`."""
+    rng = mi.PCG32(rng)
+    ray = mi.Ray3f(ray)
+    medium = mi.MediumPtr(medium)
+    active = mi.Bool(active)
+    value = dr.select(active, mi.Spectrum(1), mi.Spectrum(0))
+    surface = dr.zeros(mi.SurfaceInteraction3f)
+    fresh = mi.Bool(True)  # the next surface is not known yet
+    while dr.hint(active, label="transmittance"):
+        look = active & fresh
+        surface[look] = scene.ray_intersect(ray, traits.boundary_flags, False, look)
+        fresh = mi.Bool(False)
+        inside = active & (medium != None)  # noqa: E711 (array comparison)
+        stretch = mi.Ray3f(ray)
+        stretch.maxt = dr.minimum(ray.maxt, surface.t)
+        near, far, majorant = section(medium, stretch, inside)
+        collided = mi.Bool(False)
+        t = mi.Float(far)
+        if dr.hint(traits.has_grids, mode="scalar"):
+            grid = inside & (majorant > 0) & ~medium.is_homogeneous()
+            t[grid] = near - dr.log(1 - rng.next_float32(grid)) * dr.rcp(
+                dr.maximum(majorant, 1e-30)
+            )
+            collided = grid & (t < far)
+            null, _, probability = collision(
+                medium, ray(t), majorant, ray.time, ray.wavelengths, collided, -ray.d
+            )
+            value[collided] = value * null * probability
+            faint = collided & (dr.max(value) < FAINT)
+            survives = rng.next_float32(faint) < 0.5
+            value[faint] = dr.select(survives, 2 * value, 0)
+            inside &= ~grid
+        _, _, sigma_t = medium.get_scattering_coefficients(
+            point_in(medium, ray.o, ray.time, ray.wavelengths, -ray.d), inside
+        )
+        value[inside] = value * dr.exp(-sigma_t * (far - near))
+
+        met = active & ~collided & surface.is_valid() & (surface.t <= ray.maxt)
+        value[met] = value * surface.bsdf().eval_null_transmission(surface, met)
+        medium[met & surface.is_medium_transition()] = surface.target_medium(ray.d)
+        step = dr.select(collided, t, surface.t)
+        onward = surface.spawn_ray(ray.d)
+        ray.maxt = ray.maxt - step
+        ray.o = dr.select(collided, ray.o + ray.d * step, onward.o)
+        surface.t = surface.t - step
+        fresh |= met
+        active &= (collided | met) & (dr.max(value) > 0) & (ray.maxt > 0)
+    return value, rng
+
+
+# --- Free flight ------------------------------------------------------------------------------
+
+
+@dr.syntax
+def fly(scene, traits, ray, medium, draws, active):
+    """Moves rays through media and boundaries with the plain BSDF `null` to where they scatter or
+    meet another surface.
+
+    `draws`: a `VertexNumbers` of this flight. Returns `(hit, ray, medium, scatters, weight)`: the
+    surface (of those that scatter: none, at the distance of the collision), the ray that leads
+    there, the medium at its end, whether it scatters there, and what throughput is multiplied with:
+    albedo and null collisions.
+    """
+    ray = mi.Ray3f(ray)
+    medium = mi.MediumPtr(medium)
+    flying = mi.Bool(active)
+    flight, chance = draws.next_floats(2)
+    rng = own_stream(draws, FLIGHT_SALT)
+    hit = dr.zeros(mi.PreliminaryIntersection3f)
+    weight = mi.Spectrum(1)
+    scatters = mi.Bool(False)
+    passed = mi.Float(0)
+    fresh = mi.Bool(True)  # the next surface is not known yet
+    scattering = int(mi.BSDFFlags.Delta) | int(mi.BSDFFlags.Smooth)  # Null among them
+    while dr.hint(flying, label="free flight"):
+        look = flying & fresh
+        hit[look] = scene.ray_intersect_preliminary(ray, coherent=False, active=look)
+        fresh = mi.Bool(False)
+
+        # ---- Media
+        inside = flying & (medium != None)  # noqa: E711 (array comparison)
+        stretch = mi.Ray3f(ray)
+        stretch.maxt = dr.minimum(ray.maxt, hit.t)
+        near, far, majorant = section(medium, stretch, inside)
+        t = dr.maximum(near, passed) - dr.log(1 - flight) * dr.rcp(dr.maximum(majorant, 1e-30))
+        collided = inside & (majorant > 0) & (t < far)
+        null, real, probability = collision(
+            medium, ray(t), majorant, ray.time, ray.wavelengths, collided, -ray.d
+        )
+        passes = mi.Bool(False)
+        if dr.hint(traits.has_null_media, mode="scalar"):
+            passes = collided & (chance < probability)
+        here = collided & ~passes
+        scatters |= here
+        weight *= dr.select(passes, null, dr.select(here, real, 1))
+        passed[collided] = t
+
+        # ---- Boundaries
+        met = flying & ~collided & hit.is_valid()
+        surface = hit.compute_surface_interaction(ray, traits.boundary_flags, met)
+        bsdf = surface.bsdf()
+        crosses = (
+            met & ~hit.shape.is_emitter() & ((bsdf.flags() & scattering) == int(mi.BSDFFlags.Null))
+        )
+        weight[crosses] = weight * bsdf.eval_null_transmission(surface, crosses)
+        medium[crosses & surface.is_medium_transition()] = surface.target_medium(ray.d)
+        ray.o[crosses] = surface.spawn_ray(ray.d).o
+        passed[crosses] = 0
+        fresh |= crosses
+        flying &= passes | crosses
+        flight, chance = rng.next_float32(flying), rng.next_float32(flying)
+    hit.t = dr.select(scatters, passed, hit.t)
+    hit.shape = dr.select(scatters, dr.zeros(mi.ShapePtr), hit.shape)
+    return hit, ray, medium, scatters, weight
+
+
+def begin_flights(traits, medium):
+    """What a path carries through media: the medium, the number of its next flight, and whether it
+    scatters in the medium where it has arrived. Nothing in scenes without media."""
+    if not traits.has_media:
+        return []
+    medium = dr.zeros(mi.MediumPtr) if medium is None else mi.MediumPtr(medium)
+    return [medium, mi.UInt32(0), mi.Bool(False)]
+
+
+def next_hit(scene, traits, ray, flight, numbers, throughput, active):
+    """`fly`, for paths that carry `flight`: `(hit, ray, flight, throughput)`."""
+    medium, number, _ = flight
+    hit, ray, medium, scatters, weight = fly(
+        scene, traits, ray, medium, numbers.at(FLIGHT + number), active
+    )
+    return hit, ray, [medium, number + 1, scatters], throughput * weight
+
+
+def interaction_at(hit, ray, scatters, active):
+    """The surface interaction of a hit, or one without shape and normal where a path `scatters` in
+    a medium; its frame is that of the ray."""
+    si = hit.compute_surface_interaction(ray, mi.RayFlags.All, active & ~scatters)
+    within = dr.zeros(mi.SurfaceInteraction3f)
+    within.t, within.p, within.time, within.wavelengths = (
+        hit.t,
+        ray(hit.t),
+        ray.time,
+        ray.wavelengths,
+    )
+    within.sh_frame, within.wi = mi.Frame3f(-ray.d), mi.Vector3f(0, 0, 1)
+    return dr.select(active & scatters, within, si)
+
+
+def sample_phase(medium, si, choice, point, bs, weight, active):
+    """`(bs, weight)` of a BSDF's sample, on the lanes `active` those of the medium's phase function
+    at `si`."""
+    here = dr.select(active, medium, dr.zeros(mi.MediumPtr))
+    mei = point_in(here, si.p, si.time, si.wavelengths, si.to_world(si.wi))
+    wo, phase_weight, pdf = here.phase_function().sample(
+        mi.PhaseFunctionContext(None), mei, choice, point, active
+    )
+    bs.wo = dr.select(active, si.to_local(wo), bs.wo)
+    bs.pdf = dr.select(active, pdf, bs.pdf)
+    bs.eta = dr.select(active, 1, bs.eta)
+    bs.sampled_type = dr.select(active, mi.UInt32(0), bs.sampled_type)
+    return bs, dr.select(active, dr.select(pdf > 0, mi.Spectrum(phase_weight), 0), weight)
+
+
+def medium_behind(si, medium, wo, active):
+    """The medium of paths that go on from `si` in direction `wo`."""
+    return dr.select(active & si.is_medium_transition(), si.target_medium(wo), medium)
+
+
+# --- Vertices ---------------------------------------------------------------------------------
+
+
+def phase_f_and_pdfs(sides, to_camera, to_light, active):
+    """The phase function [1/sr] at vertices in media (`vertex.Sides`), and the densities with which
+    a camera path goes on to the light's side, and a light sub-path to the camera's. Phase functions
+    are symmetric here (media of flakes are refused), in their densities, too."""
+    medium = dr.select(active, sides.above, dr.zeros(mi.MediumPtr))
+    phase, context = medium.phase_function(), mi.PhaseFunctionContext(None)
+    mei = point_in(medium, sides.p, mi.Float(0), sides.wavelengths, to_camera)
+    value, pdf = phase.eval_pdf(context, mei, to_light, active)
+    return value, pdf, pdf
+
+
+def direct_light(scene, traits, lights, ref, sides, draws, active):
+    """`Lights.sample_direct` through media and boundaries."""
+    ds, light, pdf = lights.propose_direct(ref, draws, active)
+    lit = active & (dr.max(light) > 0)
+    shadow = lights.shadow_ray(ref, ds, lights.guide is not None)
+    kept, _ = transmittance(
+        scene, traits, shadow, sides.medium(ref.n, ds.d), own_stream(draws, SHADOW_SALT), lit
+    )
+    return ds, dr.select(lit, light * kept, 0), pdf
+
+
+def transmitted(scene, traits, p, n, sides, d, distance, wavelengths, rng, active):
+    """Share of light that gets from vertices `p` (with geometric normals `n`) to the points
+    `distance` away in direction `d`."""
+    si = dr.zeros(mi.SurfaceInteraction3f, dr.width(p))
+    si.p, si.n, si.wavelengths = p, mi.Normal3f(n), wavelengths
+    ray = si.spawn_ray_to(p + d * distance)
+    kept, _ = transmittance(scene, traits, ray, sides.medium(n, d), rng, active)
+    return kept
