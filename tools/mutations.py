@@ -258,7 +258,7 @@ MUTATIONS = [
         SHIFTS,
     ),
     Mutation(
-        "volume/media.py",
+        "paths/media.py",
         "value[faint] = dr.select(survives, 2 * value, 0)",
         "value[faint] = dr.select(survives, value, 0)",
         "roulette on the way to a light loses half of what is faint",
