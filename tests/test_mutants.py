@@ -31,8 +31,9 @@ def test_mutation_can_be_made(mutation):
 
 
 def test_mutations_are_spread():
-    """Four in each package, and no two alike."""
-    assert set(Counter(m.file.partition("/")[0] for m in MUTATIONS).values()) == {4}
+    """Three at least in each of ten packages, and no two alike."""
+    counts = Counter(m.file.partition("/")[0] for m in MUTATIONS)
+    assert len(counts) == 10 and min(counts.values()) >= 3
     assert len(MUTATIONS) == 40 and len({m.name for m in MUTATIONS}) == 40
 
 
