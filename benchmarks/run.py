@@ -18,6 +18,7 @@ from common import references  # noqa: E402
 from common.methods import COMPARED, VARIED, Method, parse_method, registered  # noqa: E402
 from common.scene_files import BUNDLED, bundled  # noqa: E402
 from experiments import (  # noqa: E402
+    combine,
     compare,
     constants,
     converge,
@@ -148,6 +149,19 @@ def _parser() -> argparse.ArgumentParser:
     )
     command.add_argument(
         "--record", action="store_true", help="keep the figures in benchmarks/history"
+    )
+
+    command = _measuring(commands, "combine", combine)
+    _renders(command, 10)
+    _compares_with_references(command)
+    command.set_defaults(seeds=1)
+    command.add_argument(
+        "--shares",
+        nargs="+",
+        type=_share,
+        default=[0.15, 0.5],
+        metavar="SHARE",
+        help="of the time that the second method has (default: 0.15 0.5)",
     )
 
     command = _measuring(commands, "converge", converge)
@@ -408,6 +422,13 @@ def _positive(text: str) -> float:
         value = 0.0
     if not 0 < value < float("inf"):
         raise argparse.ArgumentTypeError(f"{text} is not a number above 0")
+    return value
+
+
+def _share(text: str) -> float:
+    value = _positive(text)
+    if value >= 1:
+        raise argparse.ArgumentTypeError(f"{text} is not a number below 1")
     return value
 
 

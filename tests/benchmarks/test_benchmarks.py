@@ -533,3 +533,40 @@ def test_comparisons_of_denoised_images(tmp_path, module, rgb):
         for label in ("bdpm", "bdpm:denoised=false", "bdpt")
     ]
     assert [getattr(integrator, "denoised", None) for integrator in told] == [True, False, None]
+
+
+def test_images_combined_by_their_true_errors(module):
+    """Two images of independent noise, each good in another half: the combination has the error
+    1 / (1/a + 1/b) in each. Of 4096 pixels and three channels, five standard errors: false alarms
+    below 1e-6."""
+    combine, metrics = module("experiments.combine"), module("mis_integrators.analysis.metrics")
+    rng = np.random.default_rng(1)
+    references = metrics.References(*(np.ones((64, 64, 3)) for _ in range(2)), "ones", False)
+    left = np.arange(64)[None, :, None] < 32
+    deviations = [np.where(left, 0.1, 0.4), np.where(left, 0.2, 0.1)]
+    images = [1 + rng.normal(size=(64, 64, 3)) * deviation for deviation in deviations]
+    found = metrics.errors(combine.mixed(images, references), references).mse
+    least = np.mean(1 / sum(1 / deviation**2 for deviation in deviations))
+    assert found == pytest.approx(least, rel=5 * (2 / (64 * 64 * 3)) ** 0.5)
+
+
+def test_whether_methods_should_share_the_time(tmp_path, module, capsys):
+    """One row a share and method beside the best; a method is at most as good as the best alone in
+    the product of both errors."""
+    scene = tmp_path / "tiny.xml"
+    scene.write_text(TINY)
+    module("run").main(
+        [
+            *("combine", "--scenes", str(scene), "--time", "0.2", "--shares", "0.15", "0.5"),
+            *("--integrators", "path", "bdpm:bdd=0", "bdpt", "--reference-time", "0.2"),
+            *("--references", str(tmp_path / "references"), "--out", str(tmp_path / "out")),
+        ]
+    )
+    rows = json.loads((tmp_path / "out" / "combine.json").read_text())["rows"]
+    assert len(rows) == 4 and len({row["method"] for row in rows} | {rows[0]["best"]}) == 3
+    for row in rows:
+        assert row["relMSE / best"] * row["MSE / best"] >= 1
+        assert row["relMSE with the best / best"] > 0 and row["share"] in (0.15, 0.5)
+    with pytest.raises(SystemExit):
+        module("run").main(["combine", "--shares", "1.5"])
+    assert "1.5 is not a number below 1" in capsys.readouterr().err
