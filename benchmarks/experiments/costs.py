@@ -13,7 +13,7 @@ import time
 from pathlib import Path
 
 from mis_integrators.integrators import costs
-from mis_integrators.integrators.choice import PHOTON_MAPPERS, name_of
+from mis_integrators.integrators.choice import CANDIDATES
 from mis_integrators.integrators.unidirectional import PathSession
 from mis_integrators.paths.path_length_statistics import mean_segments
 
@@ -23,8 +23,7 @@ import numpy as np
 from common.rows import show, tell
 from common.scene_files import open_scene, scaled_size
 
-METHODS = (("path", {}), *PHOTON_MAPPERS)
-PLUGINS = tuple(dict.fromkeys(plugin for plugin, _ in METHODS))
+PLUGINS = tuple(CANDIDATES)
 RADII = (1.0, 2.0)
 """Multiples of the automatic radius, so that the price of a gathered photon shows."""
 ITERATIONS, SKIPPED = 8, 2
@@ -79,10 +78,10 @@ def measured(opened, plugins) -> list[dict]:
         scene, sensor, 1, 1, int(np.prod(opened.size)), first.max_depth, first.rr_depth
     )
     sessions = []
-    for plugin, parameters in METHODS:
+    for plugin in PLUGINS:
         if plugin not in (*plugins, "path"):
             continue
-        given = {**opened.inherited, "direct_paths": 1, **parameters}
+        given = {**opened.inherited, "direct_paths": 1, **CANDIDATES[plugin]}
         if plugin == "path":
             session = PathSession(first, scene, sensor, 0, None)
             sessions.append((plugin, plugin, session, costs.events(session, segments, None, 0.0)))
@@ -98,9 +97,7 @@ def measured(opened, plugins) -> list[dict]:
             counted = costs.events(
                 session, segments, session.last_vertex, pilot.prediction.gathered * factor**2
             )
-            sessions.append(
-                (plugin, f"{name_of(plugin, parameters)} x {factor:g}", session, counted)
-            )
+            sessions.append((plugin, f"{plugin} x {factor:g}", session, counted))
     seconds = {label: [] for _, label, _, _ in sessions}
     for _ in range(ITERATIONS):
         for _, label, session, _ in sessions:

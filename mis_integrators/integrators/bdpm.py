@@ -24,7 +24,7 @@ from ..photons.gather import QueryVertices, gather_photons, mean_photon_count
 from ..photons.grid import PhotonMap, build_photon_map, smallest_cell
 from ..photons.queries import Queries, read_queries, trace_camera_paths
 from ..photons.trace import trace_light_paths
-from ..pilot.direct_paths import MOST_PATHS, DirectNoise
+from ..pilot.direct_paths import MOST_PATHS
 from ..pilot.setting import PilotSetting
 from .common import MOST_LIGHT_PATHS, IterativeIntegrator
 from .direct_light import DirectLight
@@ -35,18 +35,6 @@ SPARE_PHOTONS = 1 << 20
 """Unused room beyond half of a photon buffer that is worth the time to record the passes anew."""
 CAMERA_CHUNK = 1 << 21
 """Camera paths traced at once at most; larger films are traced in parts (bounds memory)."""
-
-
-class Survey(NamedTuple):
-    """What sessions of the same scene have in common."""
-
-    traits: SceneTraits
-    lights: Lights
-    mean: np.ndarray | None = None
-    """Radiance of the pilot's pixels that errors are relative to (None: that which the pilot
-    finds)."""
-    direct_noise: DirectNoise | None = None
-    """Of direct light, in each pixel."""
 
 
 class BDPM(IterativeIntegrator):
@@ -141,8 +129,6 @@ class BDPM(IterativeIntegrator):
     """
 
     LAYERS = *CHANNELS, *SPLIT
-    survey = None
-    """A `Survey`, where another session has made it already."""
 
     def read_parameters(self, parameters):
         self.read_photon_parameters(parameters)
@@ -179,10 +165,8 @@ class BDPMSession(PilotedSession):
 
     def __init__(self, integrator, scene, sensor, seed, iterations):
         super().__init__(integrator, scene, sensor, seed, iterations)
-        survey = integrator.survey or Survey(
-            SceneTraits(scene), Lights.seen_by(scene, sensor, integrator.plugin)
-        )
-        self.traits, self.lights, self.reference_mean, direct_noise = survey
+        self.traits = SceneTraits(scene)
+        self.lights = Lights.seen_by(scene, sensor, integrator.plugin)
         self.world = World(scene, self.lights, self.traits)
         self.light_path_count = integrator.photon_count or min(
             film_sample_count(sensor), MOST_LIGHT_PATHS
@@ -206,7 +190,7 @@ class BDPMSession(PilotedSession):
         self.photons_found = 0  # by the last light pass
         self._sized = False
         self.recorded = recorder()
-        self.direct_light = DirectLight(self, direct_noise)
+        self.direct_light = DirectLight(self)
         self._freeze()
 
     @property
@@ -239,7 +223,6 @@ class BDPMSession(PilotedSession):
             self.camera_paths,
             self.iterations_planned,
             self.seconds,
-            self.reference_mean,
             integrator.denoised,
         )
 

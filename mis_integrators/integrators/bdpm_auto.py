@@ -1,5 +1,5 @@
-"""Plugin `bdpm_auto`: decides from the scene and a short pilot which integrator of this package, or
-Mitsuba's `path`, renders it."""
+"""Plugin `bdpm_auto`: decides from the scene and a short pilot whether a photon mapper of this
+package or Mitsuba's `path` renders it."""
 
 from __future__ import annotations
 
@@ -30,18 +30,18 @@ class BDPMAuto(IterativeIntegrator):
        -
        - As of :monosp:`bdpm`.
 
-    Chooses among ``path``, ``bdpm`` and ``bdpm_opt`` with two or three strategies: those that can
-    see all the light of the scene are tried on a few thousand pixels for a few iterations, and the
-    one of which the least error is expected in the time that is planned renders the image. What an
-    iteration costs is counted (segments, photons) and priced, not clocked. Scenes with media are
-    rendered by ``volpath_multiview``.
+    Chooses between ``path`` and a photon mapper: ``bdpm_opt2``, or ``bdpm_opt3`` in scenes with
+    rough glass, or ``bdpm`` with ``bdd`` 0 in renders of less than three seconds or sixteen
+    iterations. The photon mapper runs its pilot; a few samples of ``path`` on the same pixels tell
+    what that would bring in the same time. What an iteration costs is counted (segments, photons)
+    and priced, not clocked. Where ``path`` cannot see all the light of the scene, it is not tried.
+    Scenes with media are rendered by ``volpath_multiview``.
 
     The settings of the image (in the EXR's header) say which integrator was chosen and why, with
     the predictions; ``mis-render`` prints the reasons, too. Without a time limit, the same seed and
-    number of samples make the same choice and image again. ``bdpm`` with ``bdd`` 0, if chosen,
-    makes the same image by itself. The others' merge radii are judged by the image that this first
-    candidate's pilot saw, so that by themselves they may find different ones. ``path`` draws the
-    random numbers of this package, not those of Mitsuba: the same mean, other noise.
+    number of samples make the same choice and image again. A photon mapper that is chosen makes the
+    same image by itself. ``path`` draws the random numbers of this package, not those of Mitsuba:
+    the same mean, other noise.
 
     .. tabs::
         .. code-tab:: xml
@@ -140,7 +140,6 @@ class AutoSession(IterativeSession):
         decision = self.decision
         return {
             "plugin": decision.plugin,
-            "parameters": decision.parameters,
             "reasons": decision.reasons,
             "errors": decision.errors,
             "session": decision.session.learned,
@@ -148,17 +147,13 @@ class AutoSession(IterativeSession):
 
     def recall(self, learned):
         fields = Fields(learned, "learned")
-        plugin = fields.choice("plugin", [name for name, _ in CANDIDATES])
-        parameters = fields.choice(
-            "parameters", [given for name, given in CANDIDATES if name == plugin]
-        )
+        plugin = fields.choice("plugin", list(CANDIDATES))
         expected = fields.object("errors")
         errors = {name: expected.number(name) for name in expected.names()}
         reasons, inner = fields.texts("reasons"), fields.any("session")
         fields.finish()
         session = new_session(
             plugin,
-            parameters,
             self.integrator,
             self.scene,
             self.sensor,
@@ -167,7 +162,7 @@ class AutoSession(IterativeSession):
         )
         session.recall(inner)
         self.iterations_planned = session.iterations_planned
-        self._take(Decision(plugin, parameters, session, reasons, errors))
+        self._take(Decision(plugin, session, reasons, errors))
 
     def _iteration(self, iteration):
         return self.decision.session._iteration(iteration)

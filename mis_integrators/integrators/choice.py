@@ -1,16 +1,13 @@
-"""The choice of `bdpm_auto`: which integrator will have the least error in the time that there is,
-predicted from a pilot.
+"""The choice of `bdpm_auto`: photons, or camera paths alone.
 
-Every candidate is tried on the same few thousand pixels. Its error after n iterations is its
-squared bias (the blur of the photons' disks) plus its variance over n, both relative and pixel by
-pixel (`pilot.radius`); n follows from what an iteration costs (`costs`). Candidates that cannot
-see some of the light are not tried.
+Both are judged on the same few thousand pixels. Their errors after n iterations are the squared
+bias (the blur of the photons' disks) plus the variance over n, both relative and pixel by pixel
+(`pilot.radius`); n follows from what an iteration costs (`costs`).
 """
 
 from __future__ import annotations
 
 import math
-import time
 from dataclasses import dataclass, field
 
 import mitsuba as mi
@@ -19,33 +16,19 @@ import numpy as np
 from ..core.recording import lanes
 from ..core.spectra import channel_mean
 from ..core.stratified_variance import contrasts, extrapolated
+from ..core.traits import SceneTraits
 from ..paths.layers import written
 from ..paths.path_length_statistics import mean_segments
 from ..pilot.denoiser import LEFT
 from ..pilot.noise import relative_weights, trimmed_mean
-from ..pilot.run import FEWEST_ITERATIONS
 from ..pilot.setting import UNPLANNED_ITERATIONS
 from . import costs
-from .bdpm import Survey
 from .unidirectional import PathSession
 
-PHOTON_MAPPERS = FIRST, OPT2, LATER, OPT3 = (
-    ("bdpm", {"bdd": 0}),
-    ("bdpm_opt2", {}),
-    ("bdpm", {"bdd": 1}),
-    ("bdpm_opt3", {}),
-)
-"""The first is tried in any case."""
-CANDIDATES = ("path", {}), *PHOTON_MAPPERS
-TRIAL_TIME_SHARE = 0.05
-"""Tuned: share of the planned time that the pilot may have; `path` and the first photon mapper are
-tried however long that takes."""
-WORTH_SHARE = 0.3
-"""Tuned: the share of the time that is left that the trial of optimal weights may take, where they
-are of use: they often win, by more than their trial takes."""
-LIKE_THE_FIRST = 1.5
-"""Tuned: what trying another photon mapper takes, in the seconds that the first one took, which has
-rendered its first iterations (optimal weights have to learn first)."""
+CANDIDATES = {"path": {}, "bdpm": {"bdd": 0}, "bdpm_opt2": {}, "bdpm_opt3": {}}
+"""Plugins that may be chosen, and their parameters."""
+SHORT_SECONDS, SHORT_ITERATIONS = 3.0, 16
+"""Tuned: renders for which learning weights takes longer than they save."""
 PATH_TRIALS = 16
 """Tuned: samples of `path` on each of the pilot's pixels; a power of two."""
 TRIAL_INDEX = 1 << 28
@@ -63,15 +46,13 @@ class Decision:
     """What renders, why it does, and what was expected of all that were tried."""
 
     plugin: str
-    parameters: dict
     session: object
     reasons: list[str]
     errors: dict[str, float] = field(default_factory=dict)
     """Relative mean squared errors predicted, by candidate."""
     trials: list[Trial] = field(default_factory=list)
     usual_cost: float = 0.0
-    """Of an iteration of the first photon mapper, a pixel; the time planned for is counted in
-    those."""
+    """Of an iteration of the photon mapper, a pixel; the time planned for is counted in those."""
 
 
 @dataclass
@@ -79,17 +60,12 @@ class Trial:
     """What the pilot tells of one candidate."""
 
     plugin: str
-    parameters: dict
     session: object
     """None once another is chosen."""
     squared_bias: float
     variance: float
     cost: float
     """Of one iteration, a pixel."""
-
-    @property
-    def name(self):
-        return name_of(self.plugin, self.parameters)
 
     def error(self, budget):
         """Relative mean squared error when the cost a pixel is `budget`."""
@@ -111,31 +87,33 @@ def handed_on(integrator):
     }
 
 
-def name_of(plugin, parameters):
-    """A candidate's name: its plugin, and how it differs from the plugin's defaults."""
-    return " ".join([plugin, *(f"{name}={value}" for name, value in parameters.items())])
+def photon_mapper(traits, iterations, seconds):
+    """The plugin that stands for all photon mappers in a scene of these `SceneTraits`. Two
+    strategies are within a third of the best number of them, and are one where all smooth surfaces
+    are diffuse; but within and behind rough glass camera paths meet it twice before photons are of
+    use. Short renders have one strategy."""
+    if seconds is not None and seconds < SHORT_SECONDS:
+        return "bdpm"
+    if seconds is None and iterations is not None and iterations < SHORT_ITERATIONS:
+        return "bdpm"
+    return "bdpm_opt3" if traits.has_rough_glass else "bdpm_opt2"
 
 
 def choose(integrator, scene, sensor, seed, iterations, seconds):
     """The `Decision` for a render of so many iterations, or of so many seconds (either may be
     `None`)."""
-    began = time.perf_counter()
     path = PathSession(integrator, scene, sensor, seed, iterations)
-    plugin, parameters = FIRST
-    first = new_session(plugin, parameters, integrator, scene, sensor, seed, iterations)
-    split = integrator.splits_light
-    if not first.kinds():
-        chosen = (plugin, parameters, first) if split else ("path", {}, path)
-        reason = _no_photons(integrator, first)
-        return Decision(*chosen, [f"{name_of(*chosen[:2])}: {reason}"])
-    first.plan_time(seconds, began)
-    first.start()
-    prediction = first.prediction
+    plugin = photon_mapper(SceneTraits(scene), iterations, seconds)
+    photons = new_session(plugin, integrator, scene, sensor, seed, iterations)
+    alone = (plugin, photons) if integrator.splits_light else ("path", path)
+    if not photons.kinds():
+        return Decision(*alone, [f"{alone[0]}: {_no_photons(integrator, photons)}"])
+    photons.plan_time(seconds)
+    photons.start()
+    prediction = photons.prediction
     if prediction is None:
-        chosen = (plugin, parameters, first) if split else ("path", {}, path)
         reason = "no camera path meets a surface that scatters smoothly"
-        return Decision(*chosen, [f"{name_of(*chosen[:2])}: {reason}"])
-    first_seconds = time.perf_counter() - began
+        return Decision(*alone, [f"{alone[0]}: {reason}"])
 
     pixels = prediction.pixels
     segments = mean_segments(
@@ -147,92 +125,35 @@ def choose(integrator, scene, sensor, seed, iterations, seconds):
         integrator.max_depth,
         integrator.rr_depth,
     )
-    trials, reasons = [_trial(plugin, parameters, first, segments)], []
-    spent, usual = _pilot_cost(first, segments), trials[0].cost
+    trials, reasons = [_trial(plugin, photons, segments)], []
+    usual = trials[0].cost
     budget = (prediction.iterations if seconds else iterations or UNPLANNED_ITERATIONS) * usual
-    blind = "not path: it does not split the light" if split else None
-    blind = blind or _why_not_path(first, prediction)
+    blind = "not path: it does not split the light" if integrator.splits_light else None
+    blind = blind or _why_not_path(photons, prediction)
     if blind:
         reasons.append(blind)
     else:
         trials.insert(0, _try_path(path, segments, pixels, prediction.mean, budget))
-    likely = True  # that the first of the candidates with optimal weights is the best
-    survey = Survey(first.traits, first.lights, prediction.mean, first.direct_light.noise)
-    for plugin, parameters in later_candidates(first.traits):
-        weighted = plugin.startswith("bdpm_opt")
-        if seconds is None:
-            time_of_trials = budget, spent, FEWEST_ITERATIONS * usual * 0.5
-        else:
-            time_of_trials = seconds, time.perf_counter() - began, LIKE_THE_FIRST * first_seconds
-        reason = _why_useless(plugin, first.traits, trials, budget) or _why_too_dear(
-            weighted and likely, *time_of_trials
-        )
-        if reason:
-            reasons.append(f"not {name_of(plugin, parameters)}: {reason}")
-            continue
-        likely &= not weighted
-        planned = max(int(budget / usual), 1)
-        session = new_session(plugin, parameters, integrator, scene, sensor, seed, planned, survey)
-        session.plan_time(seconds, began)
-        session.rehearse()
-        if session.prediction is not None:
-            trials.append(_trial(plugin, parameters, session, segments))
-            spent += _pilot_cost(session, segments)
-    return _decision(trials, reasons, budget, usual, iterations)
+    return _decision(trials, reasons, budget, usual)
 
 
-def _decision(trials, reasons, budget, usual, iterations):
+def _decision(trials, reasons, budget, usual):
     """The `Decision` for the trial with the least error predicted for this budget."""
     best = min(trials, key=lambda trial: trial.error(budget))
     why = (
-        f"{best.name}: least predicted error in this time; bias {best.squared_bias:.2g}, noise "
+        f"{best.plugin}: least predicted error in this time; bias {best.squared_bias:.2g}, noise "
         f"{best.variance * best.cost / budget:.2g} (squared, relative)"
     )
-    best.session.iterations_planned = iterations
     for trial in trials:
         if trial is not best:
             trial.session = None  # its photons' and kernels' memory is free to go
-    predicted = {trial.name: float(trial.error(budget)) for trial in trials}
+    predicted = {trial.plugin: float(trial.error(budget)) for trial in trials}
     errors = {name: error for name, error in predicted.items() if math.isfinite(error)}
-    return Decision(
-        best.plugin, best.parameters, best.session, [why, *reasons], errors, trials, usual
-    )
+    return Decision(best.plugin, best.session, [why, *reasons], errors, trials, usual)
 
 
-def _why_useless(plugin, traits, trials, budget):
-    """Why this candidate cannot be the best, given the `trials` so far; `None` if it can."""
-    if plugin.startswith("bdpm_opt") and not traits.has_rough:
-        return "all smooth surfaces are diffuse, where one strategy does as well"
-    if (
-        plugin == "bdpm_opt3"
-        and not traits.has_mixed
-        and trials[-1].name.endswith("bdd=1")
-        and _worse(trials, budget)
-    ):
-        return "merging at the second vertex does not pay, let alone at the third"
-    return None
-
-
-def _why_too_dear(likely, whole, gone, takes):
-    """Why there is no time for a trial that `takes` so much, where so much of the `whole` is
-    `gone`; `None` if there is. A candidate that is `likely` to be the best may take more."""
-    if gone + takes <= TRIAL_TIME_SHARE * whole or (
-        likely and takes < WORTH_SHARE * (whole - gone)
-    ):
-        return None
-    share = WORTH_SHARE if likely else TRIAL_TIME_SHARE
-    return f"trying it would take more than {share:.0%} of the time"
-
-
-def later_candidates(traits):
-    """Photon mappers, those first that are most often the best. Within and behind rough glass
-    camera paths meet it twice before photons are of use: three strategies."""
-    return (OPT3, OPT2, LATER) if traits.has_rough_glass else (OPT2, LATER, OPT3)
-
-
-def new_session(plugin, parameters, integrator, scene, sensor, seed, iterations, survey=None):
-    """A session of a candidate, with the parameters of `integrator` that all share; `survey` as in
-    `BDPM`."""
+def new_session(plugin, integrator, scene, sensor, seed, iterations):
+    """A session of a candidate, with the parameters of `integrator` that all share."""
     if plugin == "path":
         return PathSession(integrator, scene, sensor, seed, iterations)
     shared = {
@@ -241,9 +162,9 @@ def new_session(plugin, parameters, integrator, scene, sensor, seed, iterations,
         "denoised": integrator.denoised,
         "aovs": written(integrator.layers),
     }
-    made = mi.load_dict({"type": plugin, **shared, **parameters})
-    made.survey = survey
-    return made.new_session(scene, sensor, seed, iterations)
+    return mi.load_dict({"type": plugin, **shared, **CANDIDATES[plugin]}).new_session(
+        scene, sensor, seed, iterations
+    )
 
 
 def _no_photons(integrator, session):
@@ -269,24 +190,16 @@ def _why_not_path(session, prediction):
     return None
 
 
-def _trial(plugin, parameters, session, segments):
+def _trial(plugin, session, segments):
     prediction = session.prediction
     counted = costs.events(session, segments, session.last_vertex, prediction.gathered)
     return Trial(
         plugin,
-        parameters,
         session,
         prediction.squared_bias,
         prediction.variance,
         costs.cost(plugin, counted) + costs.of_direct_paths(session, segments),
     )
-
-
-def _pilot_cost(session, segments):
-    """What a session's pilot took, a pixel: its light passes are whole, its camera paths few."""
-    _, light, _, _ = costs.events(session, segments, session.last_vertex, 0.0)
-    plugin = session.integrator.plugin
-    return session.prediction.pilot_iterations * costs.cost(plugin, (0.0, light, 0.0, 1.0))
 
 
 def _try_path(path, segments, pixels, mean, budget):
@@ -317,7 +230,7 @@ def _try_path(path, segments, pixels, mean, budget):
     else:
         variance = trimmed_mean(weights * np.var(values, axis=0, ddof=1))
     variance *= LEFT if path.integrator.denoised else 1
-    return Trial("path", {}, path, 0.0, variance / path.camera_paths, cost * path.camera_paths)
+    return Trial("path", path, 0.0, variance / path.camera_paths, cost * path.camera_paths)
 
 
 def _variance_of_samples(values, weights, samples):
@@ -326,8 +239,3 @@ def _variance_of_samples(values, weights, samples):
     lengths, found, counts = contrasts(values, np.ones(len(values), bool), 1)
     pooled = [[trimmed_mean(weights * contrast)] for contrast in found]
     return float(extrapolated(lengths, np.array(pooled), counts, samples)[0])
-
-
-def _worse(trials, budget):
-    """Whether the last trial is worse than the best by more than a pilot may err."""
-    return trials[-1].error(budget) > 2 * min(trial.error(budget) for trial in trials)

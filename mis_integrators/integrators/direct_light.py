@@ -56,8 +56,8 @@ class DirectLight:
     `DirectNoise` by which they are chosen (None until it is measured).
     """
 
-    def __init__(self, session, noise=None):
-        self.session, self.noise = session, noise
+    def __init__(self, session):
+        self.session, self.noise = session, None
         self.mean_paths = self._paths = self._beside = None
         self._lists = None  # what `_listed` has made
         self._exponent = EXPONENTS[session.integrator.low_discrepancy]

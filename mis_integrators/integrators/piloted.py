@@ -37,7 +37,6 @@ class PilotedSession(IterativeSession):
         self.corrected = {}  # whether estimates are corrected at edges, by kind of photons
         self.prediction = None  # a `Prediction`, where a pilot has chosen
         self.kept = {}  # iterations that were rendered to measure their time, by number
-        self._rehearsed = None  # a `PilotResult` that has not been rendered by
 
     def kinds(self):
         """Photon maps that the scene needs."""
@@ -59,10 +58,10 @@ class PilotedSession(IterativeSession):
         """Records the camera pass anew, because its estimates are others."""
         raise TypeError(f"{type(self).__name__} does not define _record_camera_pass")
 
-    def plan_time(self, seconds, begun=None):
-        """Rendering will last `seconds`, from `begun` (else from `start`) on: the automatic radius
-        is chosen for as many iterations as fit."""
-        self.seconds, self.begun = seconds, begun
+    def plan_time(self, seconds):
+        """Rendering will last `seconds`, from `start` on: the automatic radius is chosen for as
+        many iterations as fit."""
+        self.seconds = seconds
 
     @property
     def settings(self):
@@ -105,22 +104,14 @@ class PilotedSession(IterativeSession):
     # ------------------------------------------------------------------ choice
 
     def start(self):
-        if self.begun is None:
-            self.begun = time.perf_counter()
-        pilot, self._rehearsed = self._rehearsed or self._run_pilot(), None
+        self.begun = time.perf_counter()
+        pilot = self._run_pilot()
         if pilot is None:
             self.radii = self.radii or {}
         elif self.seconds is None:
             self._take(pilot.choose(pilot.setting.planned_iterations))
         else:
             self._choose_by_clock(pilot)
-
-    def rehearse(self):
-        """Runs the pilot, and predicts what as many iterations as are planned would bring; renders
-        nothing."""
-        self._rehearsed = self._run_pilot()
-        if self._rehearsed is not None:
-            self._take(self._rehearsed.choose(self._rehearsed.setting.planned_iterations))
 
     def _run_pilot(self):
         """The `PilotResult`; None where radii are known, or there are no photons to gather."""

@@ -54,7 +54,6 @@ class Prediction(NamedTuple):
     """Those of the pilot."""
     caustic_share: float
     """Share of the light that caustic photons bring."""
-    pilot_iterations: int
 
     @property
     def error(self) -> float:
@@ -144,7 +143,6 @@ class PilotResult:
             self.mean,
             self.pixels,
             self.caustic_share,
-            self.iterations,
         )
 
     def gathered(self, kind: str, radius: Radii) -> Radii:
@@ -181,10 +179,8 @@ def measure(
         kind: samples.gathered[kind, False][:, middle_index(samples.ladder)].mean(axis=1)
         for kind in setting.kinds
     }  # (iterations, pixels)
-    mean = setting.mean
-    if mean is None:
-        image = samples.direct.mean(axis=1) + sum(middle.values())
-        mean = shrink_to_neighbours(image, neighbourhoods(setting.width, pixels))
+    image = samples.direct.mean(axis=1) + sum(middle.values())
+    mean = shrink_to_neighbours(image, neighbourhoods(setting.width, pixels))
     weights = relative_weights(mean)
     errors = {}
     for kind in setting.kinds:

@@ -40,8 +40,6 @@ class PilotSetting:
     """Iterations planned, if their number is."""
     seconds: float | None
     """Seconds planned, if those are."""
-    mean: np.ndarray | None
-    """Radiance of the pilot's pixels that errors are relative to; None: the pilot's own."""
     denoised: bool = False
     """Whether the errors that count are those that a denoiser leaves (see `denoiser`)."""
 
