@@ -27,7 +27,7 @@ from .unidirectional import PathSession
 
 CANDIDATES = {"path": {}, "bdpm": {"bdd": 0}, "bdpm_opt2": {}, "bdpm_opt3": {}}
 """Plugins that may be chosen, and their parameters."""
-SHORT_SECONDS, SHORT_ITERATIONS = 3.0, 16
+SHORT_SECONDS, SHORT_ITERATIONS = 5.0, 32
 """Tuned: renders for which learning weights takes longer than they save."""
 PATH_TRIALS = 16
 """Tuned: samples of `path` on each of the pilot's pixels; a power of two."""

@@ -305,11 +305,11 @@ def test_rough_glass_is_for_three_strategies(rgb, monkeypatch, material, chosen)
     set_price_of_path(monkeypatch, 1e4)
     ball = {"type": "sphere", "center": [0, -1.3, 0.4], "radius": 0.3, "bsdf": material}
     scene = box_scene(ball=ball)
-    assert decided(scene, 16).settings["choice"] == chosen
-    assert decided(scene, 15).settings["choice"] == "bdpm"
+    assert decided(scene, 32).settings["choice"] == chosen
+    assert decided(scene, 31).settings["choice"] == "bdpm"
 
 
-@pytest.mark.parametrize("seconds, chosen", [(2.9, "bdpm"), (3.0, "bdpm_opt2")])
+@pytest.mark.parametrize("seconds, chosen", [(4.9, "bdpm"), (5.0, "bdpm_opt2")])
 def test_short_renders_learn_no_weights(rgb, monkeypatch, seconds, chosen):
     """By the time that is planned where one is, whatever number of samples is planned too."""
     set_price_of_path(monkeypatch, 1e4)
@@ -360,7 +360,7 @@ def test_prediction_is_checked(rgb, sampler):
 # --- The image ----------------------------------------------------------------
 
 
-@pytest.mark.parametrize("variant_name, spp", [(RGB, 6), (RGB, 16), *extended((MONO, 6))])
+@pytest.mark.parametrize("variant_name, spp", [(RGB, 6), (RGB, 32), *extended((MONO, 6))])
 def test_image_is_that_of_the_integrator_chosen(variant_name, spp):
     mi.set_variant(variant_name)
     scene = glossy_box()
@@ -368,7 +368,7 @@ def test_image_is_that_of_the_integrator_chosen(variant_name, spp):
     while session.iterations < session.iterations_planned:
         session.iterate()
     settings = session.settings
-    assert settings["choice"] == ("bdpm" if spp < 16 else "bdpm_opt2")
+    assert settings["choice"] == ("bdpm" if spp < 32 else "bdpm_opt2")
     given = {"bdd": 0} if settings["choice"] == "bdpm" else {}
     alone = mi.load_dict(
         {"type": settings["choice"], "max_depth": 4, "variance": True, **given}
