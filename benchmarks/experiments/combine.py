@@ -46,7 +46,8 @@ def combine(measurement: Measurement, seconds: float, shares: list[float]) -> li
     rest. Of the first seed."""
     references = measurement.references
     whole = {
-        measured.method.label: _error(measured, references) for measured in measurement.methods
+        measured.method.label: _errors(measured.images[0], references)
+        for measured in measurement.methods
     }
     best = min(measurement.methods, key=lambda measured: np.prod(whole[measured.method.label]))
     least = whole[best.method.label]
@@ -100,10 +101,6 @@ def _image(measured: Measured, seconds: float) -> np.ndarray:
     """The first seed's picture after so many seconds, or the last one before."""
     snapshots = measured.runs[0].snapshots
     return min(snapshots, key=lambda snapshot: abs(snapshot.seconds - seconds)).image
-
-
-def _error(measured: Measured, references: References) -> tuple[float, float]:
-    return _errors(measured.images[0], references)
 
 
 def _errors(image: np.ndarray, references: References) -> tuple[float, float]:

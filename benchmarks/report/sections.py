@@ -62,11 +62,7 @@ def summary(rows: Sequence[Row], failures: dict[str, dict[str, str]], what: str)
             f'<td class="text">{chip(best["method"], style[best["method"]])}</td>'
             f"<td>{1 / best['trimmed ratio']:.1f} ×</td>{''.join(cells)}</tr>"
         )
-    means = [
-        np.exp(np.mean(np.log(np.maximum(values, 1e-9)))) if values else None
-        for values in ratios.values()
-    ]
-    total = "".join("<td>-</td>" if mean is None else f"<td>{short(mean)}</td>" for mean in means)
+    total = _geometric_means(ratios)
     head = "".join(f"<th>{chip(label, style[label])}</th>" for label in labels)
     return f"""<p>Error of each method {html.escape(what)}, over that of <b>{base}</b>
 in the same run: below 1 is better. Relative mean square error without the worst 0.1 % of the
@@ -77,6 +73,16 @@ Tooltips: 95 % intervals.</p>
 <th>less error<br>than {base}</th>{head}</tr>
 {"".join(lines)}
 <tr class="total"><td>geometric mean</td><td></td><td></td>{total}</tr></table></div>"""
+
+
+def _geometric_means(ratios: dict[str, list[float]]) -> str:
+    """A cell a method. (A ratio can be below zero, where errors are products with noisy
+    references.)"""
+    means = [
+        np.exp(np.mean(np.log(np.maximum(values, 1e-9)))) if values else None
+        for values in ratios.values()
+    ]
+    return "".join("<td>-</td>" if mean is None else f"<td>{short(mean)}</td>" for mean in means)
 
 
 def denoised(rows: Sequence[Row]) -> str:
@@ -100,10 +106,7 @@ def denoised(rows: Sequence[Row]) -> str:
                 else f"<td>{short(row[name])} ({short(row[perceived])})</td>"
             )
         lines.append(f'<tr><td><a href="#{scene}">{scene}</a></td>{"".join(cells)}</tr>')
-    means = "".join(
-        f"<td>{short(float(np.exp(np.mean(np.log(values)))))}</td>" if values else "<td>-</td>"
-        for values in ratios.values()
-    )
+    means = _geometric_means(ratios)
     head = "".join(f"<th>{chip(label, style[label])}</th>" for label in labels)
     return f"""<p>The same images denoised, all with the same denoiser: relative mean square error
 (and FLIP), over that of the better <b>path</b> denoised. Below 1 is better.</p>

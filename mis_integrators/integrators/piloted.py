@@ -32,7 +32,7 @@ class PilotedSession(IterativeSession):
 
     def __init__(self, integrator, scene, sensor, seed, iterations):
         super().__init__(integrator, scene, sensor, seed, iterations)
-        self.seconds = self.begun = None  # what rendering may take, and when it began
+        self.seconds = None  # what rendering may take
         self.radii = None  # by kind of photons, once they are known
         self.corrected = {}  # whether estimates are corrected at edges, by kind of photons
         self.prediction = None  # a `Prediction`, where a pilot has chosen
@@ -104,14 +104,14 @@ class PilotedSession(IterativeSession):
     # ------------------------------------------------------------------ choice
 
     def start(self):
-        self.begun = time.perf_counter()
+        begun = time.perf_counter()
         pilot = self._run_pilot()
         if pilot is None:
             self.radii = self.radii or {}
         elif self.seconds is None:
             self._take(pilot.choose(pilot.setting.planned_iterations))
         else:
-            self._choose_by_clock(pilot)
+            self._choose_by_clock(pilot, begun)
 
     def _run_pilot(self):
         """The `PilotResult`; None where radii are known, or there are no photons to gather."""
@@ -121,11 +121,11 @@ class PilotedSession(IterativeSession):
         pixels = pilot_pixels(setting)
         return run_pilot(setting, pixels, self.pilot_passes(setting, pixels))
 
-    def _choose_by_clock(self, pilot):
-        """Chooses for a guess of how many iterations there is time for, measures what one takes
-        with that choice, and chooses again."""
+    def _choose_by_clock(self, pilot, begun):
+        """Chooses for a guess of how many iterations there is time for since `begun`, measures what
+        one takes with that choice, and chooses again."""
         guess = LIKE_A_PILOT * pilot.seconds
-        left = max(self.begun + self.seconds - time.perf_counter(), guess)
+        left = max(begun + self.seconds - time.perf_counter(), guess)
         first = pilot.choose(left / guess)
         self._take(first)
         seconds, spent = self._time_first_iterations(guess, left)

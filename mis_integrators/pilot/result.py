@@ -78,10 +78,8 @@ class PilotResult:
 
     setting: PilotSetting
     pixels: PilotPixels
-    iterations: int
-    """Of the pilot."""
     seconds: float
-    """Of its last iteration."""
+    """Of the pilot's last iteration."""
     photons: dict[str, float]
     """As in `PilotSamples`."""
     errors: dict[str, ErrorByRadius]
@@ -167,14 +165,13 @@ def measure(
     setting: PilotSetting,
     pixels: PilotPixels,
     samples: PilotSamples | None,
-    iterations: int,
     seconds: float,
 ) -> PilotResult:
     """The `PilotResult` of all samples of a pilot; of `None`, where no camera path meets a surface
     that gathers."""
     if samples is None:
         nothing = np.zeros(pixels.count)
-        return PilotResult(setting, pixels, iterations, seconds, {}, {}, 0.0, nothing, 0.0, 0.0)
+        return PilotResult(setting, pixels, seconds, {}, {}, 0.0, nothing, 0.0, 0.0)
     middle = {
         kind: samples.gathered[kind, False][:, middle_index(samples.ladder)].mean(axis=1)
         for kind in setting.kinds
@@ -199,7 +196,6 @@ def measure(
     return PilotResult(
         setting,
         pixels,
-        iterations,
         seconds,
         samples.photons,
         errors,

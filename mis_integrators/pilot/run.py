@@ -87,7 +87,7 @@ def run_pilot(setting: PilotSetting, pixels: PilotPixels, passes: PilotPasses) -
     if radii is not None:
         estimates = {key: np.array([step[key] for step in gathered]) for key in gathered[0]}
         samples = PilotSamples(radii, photons, estimates, np.array(direct))
-    return measure(setting, pixels, samples, done, seconds)
+    return measure(setting, pixels, samples, seconds)
 
 
 def has_enough(setting: PilotSetting, done: int, seconds: float) -> bool:

@@ -11,11 +11,6 @@ from ..paths.media import collision, point_in, section, transmittance
 from ..paths.roulette import russian_roulette
 
 
-def scattering_interaction(medium, p, wi, time, wavelengths):
-    """A `MediumInteraction3f` that scatters towards `wi` (away from where light goes)."""
-    return point_in(medium, p, time, wavelengths, wi)
-
-
 @dr.syntax
 def direct_light(scene, lights, traits, it, medium, transition, surface, draws, rng, active):
     """Next-event estimation at interaction `it`, in `medium` or where `transition` between the
@@ -118,7 +113,7 @@ def incident_radiance(
 
         # ---- Direct light
         bsdf = surface.bsdf(ray)
-        mei = scattering_interaction(medium, p, -ray.d, ray.time, ray.wavelengths)
+        mei = point_in(medium, p, ray.time, ray.wavelengths, -ray.d)
         phase = dr.select(scatters, medium, dr.zeros(mi.MediumPtr)).phase_function()
         lit = scatters | (met & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth))
         if dr.hint(max_depth > 0, mode="scalar"):

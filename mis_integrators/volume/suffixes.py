@@ -7,7 +7,8 @@ import mitsuba as mi
 
 from ..core.random import next_1d_and_2d, streams
 from ..lights.lights import mis_power
-from .paths import direct_light, incident_radiance, scattering_interaction
+from ..paths.media import point_in
+from .paths import direct_light, incident_radiance
 from .pivots import IN_MEDIUM, LATER, NOWHERE, ON_SURFACE, OWN, PIVOT, pivot_surface
 
 SUFFIX_SALT = 0x73756666
@@ -21,9 +22,7 @@ def scattering(pivot, surface, d, wo, active):
     seen = mi.SurfaceInteraction3f(surface)
     seen.wi = surface.to_local(d)
     value, pdf = surface.bsdf().eval_pdf(mi.BSDFContext(), seen, surface.to_local(wo), on_surface)
-    mei = scattering_interaction(
-        pivot["medium"], pivot["p"], d, pivot["time"], pivot["wavelengths"]
-    )
+    mei = point_in(pivot["medium"], pivot["p"], pivot["time"], pivot["wavelengths"], d)
     phase = dr.select(in_medium, pivot["medium"], dr.zeros(mi.MediumPtr)).phase_function()
     phase_value, phase_pdf = phase.eval_pdf(mi.PhaseFunctionContext(None), mei, wo, in_medium)
     return dr.select(on_surface, value, phase_value), dr.select(on_surface, pdf, phase_pdf)
@@ -52,9 +51,7 @@ def sample_scattering(pivot, surface, d, traits, draws, active):
         bs, weight = dr.select(own, bs_own, bs), dr.select(own, weight_own, weight)
     null = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
     delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-    mei = scattering_interaction(
-        pivot["medium"], pivot["p"], d, pivot["time"], pivot["wavelengths"]
-    )
+    mei = point_in(pivot["medium"], pivot["p"], pivot["time"], pivot["wavelengths"], d)
     phase = dr.select(in_medium, pivot["medium"], dr.zeros(mi.MediumPtr)).phase_function()
     wo, _, phase_pdf = phase.sample(mi.PhaseFunctionContext(None), mei, choice, point, in_medium)
     taken = (in_medium & (phase_pdf > 0)) | (
@@ -121,9 +118,7 @@ def continue_paths(
 
     # ---- Two directions, and their densities in the mixture
     medium = mi.MediumPtr(pivot["medium"])
-    mei = scattering_interaction(
-        medium, pivot["p"], pivot["wi"], pivot["time"], pivot["wavelengths"]
-    )
+    mei = point_in(medium, pivot["p"], pivot["time"], pivot["wavelengths"], pivot["wi"])
     it = dr.select(pivot["kind"] == ON_SURFACE, mi.Interaction3f(surface), mi.Interaction3f(mei))
     next_d, delta_weight, taken = sample_scattering(pivot, surface, chosen, traits, draws, active)
     light_d = mi.Vector3f(0, 0, 1)

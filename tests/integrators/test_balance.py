@@ -23,7 +23,7 @@ import pytest
 from comparing import PathBatches, SessionBatches, agree, assert_same, collect_until
 from selection import extended, one_of_each_kind
 from test_against_path import MONO, RGB, SPECTRAL
-from worlds import RADIUS, T, diffuse, film, has_delta, look, path, ptracer, tray
+from worlds import EMITTERS, RADIUS, T, diffuse, film, has_delta, look, path, ptracer, tray
 
 
 def balance(**parameters):
@@ -307,23 +307,7 @@ def test_weights_are_veachs(rgb, light, bsdf, beta):
 
 @pytest.mark.parametrize(
     "emitter",
-    one_of_each_kind(
-        [
-            "point",
-            "spot",
-            "directional",
-            "rectangle",
-            "sphere",
-            "cylinder",
-            "cube",
-            "textured",
-            "constant",
-            "envmap",
-            "envmap rotated",
-            "sunsky",
-            "several",
-        ]
-    ),
+    one_of_each_kind(name for name in EMITTERS if name not in ("projector", "directionalarea")),
 )
 def test_emission_ratio(rgb, emitter):
     """The flux of a light sub-path is what next-event estimation would weigh the same light with,

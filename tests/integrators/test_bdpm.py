@@ -935,7 +935,7 @@ def test_rare_photons_get_no_smallest_radius(rgb):
         {("indirect", corrected): np.zeros((4, 7, 1, 256)) for corrected in (False, True)},
         np.ones((4, 1, 256)),
     )
-    choice = measure(setting, pilot_pixels(setting), samples, 4, 1.0).choose(100)
+    choice = measure(setting, pilot_pixels(setting), samples, 1.0).choose(100)
     assert choice.radii["indirect"] == pytest.approx(0.16)
 
 

@@ -142,18 +142,23 @@ SCENES = {
 }
 
 
-@pytest.mark.parametrize("name", SCENES)
-def test_agrees_with_volpath(rgb, name):
+def agree_with_volpath(scene, max_depth, **visible):
+    """`bdpt` and `volpath` have the same mean in the image and in its quarters; `visible`: the
+    errors that are seen, as of `comparing.agree`."""
     agree(
-        bdpt(),
-        volpath(max_depth=6),
-        SCENES[name](),
+        bdpt(max_depth=max_depth),
+        volpath(max_depth=max_depth),
+        scene,
         blocks=2,
-        whole=0.02,
-        block=0.06,
         spp=512,
         most=600,
+        **visible,
     )
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_agrees_with_volpath(rgb, name):
+    agree_with_volpath(SCENES[name](), 6, whole=0.02, block=0.06)
 
 
 @pytest.mark.parametrize("variant_name", ["llvm_ad_spectral", "llvm_ad_mono"])
@@ -167,7 +172,7 @@ def test_agrees_in_other_variants(variant_name):
         # One iteration has one set of wavelengths; a narrow response takes their noise away.
         sensor["srf"] = {"type": "spectrum", "value": [(554, 0.0), (555, 1.0), (556, 0.0)]}
     scene = fog_scene(medium, sensor, ball=ball({"type": "plastic"}, exterior=FOG))
-    agree(bdpt(), volpath(max_depth=6), scene, 2, whole=0.02, block=0.06, spp=512, most=600)
+    agree_with_volpath(scene, 6, whole=0.02, block=0.06)
 
 
 @pytest.mark.parametrize("max_depth", [1, 2, 3])
@@ -179,16 +184,7 @@ def test_depth_is_that_of_volpath(rgb, max_depth):
         ball=ball({"type": "mask", "opacity": 0.4, "nested": diffuse()}, **inner()),
         sky={"type": "constant", "radiance": grey(0.4)},
     )
-    agree(
-        bdpt(max_depth=max_depth),
-        volpath(max_depth=max_depth),
-        scene,
-        2,
-        whole=0.02,
-        block=0.05,
-        spp=512,
-        most=600,
-    )
+    agree_with_volpath(scene, max_depth, whole=0.02, block=0.05)
 
 
 @pytest.mark.parametrize(
@@ -205,16 +201,7 @@ def test_half_transparent_surfaces(rgb, max_depth, opacity, radius, fov):
         curtain=ball(mask, radius, exterior=FOG, interior=FOG),
         sky={"type": "constant", "radiance": grey(0.4)},
     )
-    agree(
-        bdpt(max_depth=max_depth),
-        volpath(max_depth=max_depth),
-        scene,
-        2,
-        whole=0.01,
-        block=0.02,
-        spp=512,
-        most=600,
-    )
+    agree_with_volpath(scene, max_depth, whole=0.01, block=0.02)
 
 
 # --- Closed forms -------------------------------------------------------------

@@ -496,23 +496,13 @@ def test_spectral_suns_are_chosen_by_their_light():
 # --- Direct light -------------------------------------------------------------
 
 
+SINGULAR = "point", "spot", "directional", "projector", "directionalarea"
+"""Emitters whose direct light has no density."""
+
+
 @pytest.mark.parametrize(
     "emitter",
-    one_of_each_kind(
-        [
-            "rectangle",
-            "sphere",
-            "disk",
-            "cylinder",
-            "cube",
-            "textured",
-            "constant",
-            "envmap",
-            "envmap rotated",
-            "sunsky",
-            "several",
-        ]
-    ),
+    one_of_each_kind(name for name in EMITTERS if name not in SINGULAR),
 )
 def test_density_of_direct_light(emitter):
     """The density that `sample_direct` states is the one that `pdf_direct` gives for the same
