@@ -284,8 +284,8 @@ class BDPMSession(PilotedSession):
         """The weights of camera paths (a `mis.state.MergeState`); None where there are none."""
         return None
 
-    def _trace_camera(self, camera_pass, capacity, spectral, beyond=None, classes=None):
-        """Traces the paths of a `CameraPass`, with room for so many vertices; `classes` as of
+    def _trace_camera(self, camera_pass, capacity, spectral, first=1.0, beyond=None, classes=None):
+        """Traces the paths of a `CameraPass`, with room for so many vertices; other arguments as of
         `trace_camera_paths`."""
         queries = Queries(
             self.last_vertex, capacity, self.has_caustics, self.has_indirect, self.one_vertex
@@ -296,6 +296,7 @@ class BDPMSession(PilotedSession):
             camera_pass,
             queries,
             self._merge_state(spectral),
+            first,
             beyond,
             classes,
         )
@@ -374,7 +375,7 @@ class BDPMSession(PilotedSession):
         if self.integrator.splits_light:
             classes = LightClasses(self.chunk, None, ("met", "next_event"))
         radiance, alpha, position, vertices, count = self._trace_camera(
-            camera_pass, self.vertex_capacity, spectral, beyond, classes
+            camera_pass, self.vertex_capacity, spectral, 1.0, beyond, classes
         )
         if classes is not None:
             dr.eval(radiance, alpha, position, vertices, count, classes.entries)
@@ -495,8 +496,15 @@ class SubsetPasses:
                 ),
                 capacity,
                 spectral,
+                0.0,
+                mi.Float(1),
             )
         )
+
+    def seen(self):
+        """As of `pilot.run.PilotPasses`: what the paths for direct light see."""
+        pixels = self.pixels
+        return self.session.direct_light.measured().mean[np.arange(pixels.count) * pixels.stride]
 
     def _record_gather(self):
         session, kinds = self.session, self.setting.kinds

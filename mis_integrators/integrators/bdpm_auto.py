@@ -107,7 +107,7 @@ class AutoSession(IterativeSession):
                 f"choice.because.{number}": reason
                 for number, reason in enumerate(self.decision.reasons, 1)
             },
-            **{f"choice.relmse.{name}": error for name, error in self.decision.errors.items()},
+            **{f"choice.{name}": error for name, error in self.decision.errors.items()},
         }
 
     @property

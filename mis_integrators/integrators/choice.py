@@ -1,8 +1,10 @@
 """The choice of `bdpm_auto`: photons, or camera paths alone.
 
 Both are judged on the same few thousand pixels. Their errors after n iterations are the squared
-bias (the blur of the photons' disks) plus the variance over n, both relative and pixel by pixel
-(`pilot.radius`); n follows from what an iteration costs (`costs`).
+bias (the blur of the photons' disks) plus the variance over n (`pilot.radius`); n follows from what
+an iteration costs (`costs`). There are two measures of error, relative and absolute
+(`pilot.noise`), and what has the least product of both renders: the other would lose more in one
+of them than it wins in the other.
 """
 
 from __future__ import annotations
@@ -20,7 +22,7 @@ from ..core.traits import SceneTraits
 from ..paths.layers import written
 from ..paths.path_length_statistics import mean_segments
 from ..pilot.denoiser import LEFT
-from ..pilot.noise import relative_weights, trimmed_mean
+from ..pilot.noise import MEASURES, trimmed_mean
 from ..pilot.setting import UNPLANNED_ITERATIONS
 from . import costs
 from .unidirectional import PathSession
@@ -49,7 +51,7 @@ class Decision:
     session: object
     reasons: list[str]
     errors: dict[str, float] = field(default_factory=dict)
-    """Relative mean squared errors predicted, by candidate."""
+    """Predicted, by measure and candidate: "relmse.path"."""
     trials: list[Trial] = field(default_factory=list)
     usual_cost: float = 0.0
     """Of an iteration of the photon mapper, a pixel; the time planned for is counted in those."""
@@ -62,14 +64,21 @@ class Trial:
     plugin: str
     session: object
     """None once another is chosen."""
-    squared_bias: float
-    variance: float
+    parts: dict[str, tuple[float, float]]
+    """By measure: squared bias, and variance of one iteration."""
     cost: float
     """Of one iteration, a pixel."""
 
-    def error(self, budget):
-        """Relative mean squared error when the cost a pixel is `budget`."""
-        return self.squared_bias + self.variance * self.cost / budget
+    def errors(self, budget):
+        """Mean squared errors, by measure, when the cost a pixel is `budget`."""
+        return {
+            measure: squared_bias + variance * self.cost / budget
+            for measure, (squared_bias, variance) in self.parts.items()
+        }
+
+    def product(self, budget):
+        """Of the errors."""
+        return math.prod(self.errors(budget).values())
 
 
 def handed_on(integrator):
@@ -139,16 +148,21 @@ def choose(integrator, scene, sensor, seed, iterations, seconds):
 
 def _decision(trials, reasons, budget, usual):
     """The `Decision` for the trial with the least error predicted for this budget."""
-    best = min(trials, key=lambda trial: trial.error(budget))
+    best = min(trials, key=lambda trial: trial.product(budget))
+    squared_bias, variance = best.parts["relmse"]
     why = (
-        f"{best.plugin}: least predicted error in this time; bias {best.squared_bias:.2g}, noise "
-        f"{best.variance * best.cost / budget:.2g} (squared, relative)"
+        f"{best.plugin}: least predicted error in this time; bias {squared_bias:.2g}, noise "
+        f"{variance * best.cost / budget:.2g} (squared, relative)"
     )
     for trial in trials:
         if trial is not best:
             trial.session = None  # its photons' and kernels' memory is free to go
-    predicted = {trial.plugin: float(trial.error(budget)) for trial in trials}
-    errors = {name: error for name, error in predicted.items() if math.isfinite(error)}
+    errors = {
+        f"{measure}.{trial.plugin}": float(error)
+        for trial in trials
+        for measure, error in trial.errors(budget).items()
+        if math.isfinite(error)
+    }
     return Decision(best.plugin, best.session, [why, *reasons], errors, trials, usual)
 
 
@@ -196,8 +210,7 @@ def _trial(plugin, session, segments):
     return Trial(
         plugin,
         session,
-        prediction.squared_bias,
-        prediction.variance,
+        {name: (error.squared_bias, error.variance) for name, error in prediction.errors.items()},
         costs.cost(plugin, counted) + costs.of_direct_paths(session, segments),
     )
 
@@ -224,17 +237,23 @@ def _try_path(path, segments, pixels, mean, budget):
         )
     cost = costs.cost("path", costs.events(path, segments, None, 0.0))
     samples = max(round(budget / cost), 1)
-    values, weights = np.array(values), relative_weights(mean)
-    if path.integrator.low_discrepancy:  # `Trial.error` divides by the samples
-        variance = samples * _variance_of_samples(values, weights, samples)
-    else:
-        variance = trimmed_mean(weights * np.var(values, axis=0, ddof=1))
-    variance *= LEFT if path.integrator.denoised else 1
-    return Trial("path", path, 0.0, variance / path.camera_paths, cost * path.camera_paths)
+    values, left = np.array(values), LEFT if path.integrator.denoised else 1
+    parts = {
+        measure: (0.0, left * _variance(path, values, weigh(mean), samples) / path.camera_paths)
+        for measure, weigh in MEASURES.items()
+    }
+    return Trial("path", path, parts, cost * path.camera_paths)
+
+
+def _variance(path, values, weights, samples):
+    """Of one of so many samples a pixel, by the `values` (trials, pixels) of a few."""
+    if path.integrator.low_discrepancy:  # `Trial.errors` divides by the samples
+        return samples * _variance_of_samples(values, weights, samples)
+    return trimmed_mean(weights * np.var(values, axis=0, ddof=1))
 
 
 def _variance_of_samples(values, weights, samples):
-    """Relative variance of the mean of so many samples a pixel: what `values` (trials, pixels) of
+    """Variance of the mean of so many samples a pixel: what `values` (trials, pixels) of
     samples that are consecutive in the pixels' sequences extrapolate to."""
     lengths, found, counts = contrasts(values, np.ones(len(values), bool), 1)
     pooled = [[trimmed_mean(weights * contrast)] for contrast in found]

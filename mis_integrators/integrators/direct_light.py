@@ -27,6 +27,7 @@ from ..pilot.direct_paths import (
     measure,
     paths_per_pixel,
 )
+from ..pilot.noise import MEASURES
 from ..pilot.run import PILOT_INDEX
 from ..pilot.setting import UNPLANNED_ITERATIONS
 
@@ -83,7 +84,7 @@ class DirectLight:
             paths = np.full(pixels, given * gathering)
         else:
             beside = self._beside or Beside(0.0, 1 / USUAL_PHOTONS, UNPLANNED_ITERATIONS)
-            wanted = paths_per_pixel(self._measured(), *beside, self._exponent)
+            wanted = paths_per_pixel(self.measured(), *beside, self._exponent)
             paths = np.maximum(np.rint(wanted).astype(int), gathering)
         self._paths, self._lists = paths, None
         self.mean_paths = float(np.mean(paths)) - gathering
@@ -91,22 +92,22 @@ class DirectLight:
     def beside(self, prediction, anew):
         """A `Prediction` made without knowing of these paths, with the noise that they leave; they
         are chosen by it, where they are to be chosen `anew`."""
-        if self.session.integrator.direct_paths:
-            if anew:
-                self.spread()
-            return prediction
         light, iterations = prediction.photon_light, prediction.iterations
-        of_one = direct_error(self._measured(), light, 1.0, 1, 1.0) / self.session.camera_paths
-        others = prediction.variance - min(prediction.direct, of_one)
         if anew:
-            error = others + prediction.squared_bias * iterations
-            self._beside = Beside(light, float(error), float(iterations))
+            if not self.session.integrator.direct_paths:
+                error = prediction.errors["relmse"]
+                error = error.variance + error.squared_bias * iterations
+                self._beside = Beside(light, float(error), float(iterations))
             self.spread()
-        left = direct_error(self.noise, light, self._paths, iterations, self._exponent)
-        return prediction._replace(variance=others + left)
+        found, errors = self.measured(), {}
+        for name, weigh in MEASURES.items():
+            weights, error = weigh(found.mean + light), prediction.errors[name]
+            left = direct_error(found, weights, self._paths, iterations, self._exponent)
+            errors[name] = error._replace(variance=error.variance + left)
+        return prediction._replace(errors=errors)
 
-    def _measured(self):
-        """The `noise`, measured if need be."""
+    def measured(self):
+        """The `noise`, which is measured if need be."""
         if self.noise is None:
             self.noise = measure(self._trials(TRIALS), film_size(self.session.sensor)[0])
             if self.session.integrator.denoised:

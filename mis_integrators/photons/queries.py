@@ -89,8 +89,8 @@ class Queries:
 class QueryVisitor:
     """Direct light, and vertices that wait for photons (a `CameraVisitor`).
 
-    Where other paths see emission, and direct light at the first smooth vertex, too, `beyond` is
-    what all else counts over that.
+    `first` is what emission, and direct light at the first smooth vertex, count, which other paths
+    see, too; `beyond` what direct light counts beyond that, if it is not the same.
 
     Its state: smooth vertices left behind (the last one counts as the `bdd`-th); whether the last
     vertex scattered by a delta function; the density of the last smooth scattering; the last smooth
@@ -98,10 +98,11 @@ class QueryVisitor:
     state of `weights`; and with `classes` what these carry along.
     """
 
-    def __init__(self, world, limits, queries, weights, beyond, classes):
+    def __init__(self, world, limits, queries, weights, first, beyond, classes):
         self.scene, self.lights, self.traits = world.scene, world.lights, world.traits
         self.hide_emitters, self.queries, self.weights = limits.hide_emitters, queries, weights
-        self.bdd, self.beyond, self.classes = queries.bdd, beyond, classes
+        self.bdd, self.classes = queries.bdd, classes
+        self.first, self.beyond = first, beyond
         self.sections = 1 if weights is None else self.bdd + 1
         self.by_light = weights is not None and weights.weighs_points_of_lights
         self.store = Store(
@@ -116,7 +117,7 @@ class QueryVisitor:
         origin = dr.zeros(mi.Interaction3f)
         one = mi.Float(1)
         history = [] if self.classes is None else start_of_camera_path()
-        begun = [mi.UInt32(0), mi.Bool(False), one, origin, mi.Spectrum(1), mi.Float(one)]
+        begun = [mi.UInt32(0), mi.Bool(False), one, origin, mi.Spectrum(1), mi.Float(self.first)]
         return [*begun, sums, history]
 
     def emission(self, state, at, active):
@@ -235,6 +236,7 @@ def trace_camera_paths(
     camera_pass: CameraPass | ListedPass,
     queries: Queries,
     weights=None,
+    first=1.0,
     beyond=None,
     classes=None,
 ):
@@ -254,10 +256,11 @@ def trace_camera_paths(
     of the path, of `capacity` each (a path's last vertex in the last section), and `count` has one
     entry for each.
 
-    `beyond` (one a path): what direct light counts at smooth vertices beyond the first. `classes`
-    (a `LightClasses` with the entries `met` and `next_event`): learns the radiance by class; the
+    `first`: what emission, and direct light at the first smooth vertex, count; `beyond` (one a
+    path): what direct light counts at later ones, and emission met from there. `classes` (a
+    `LightClasses` with the entries `met` and `next_event`): learns the radiance by class; the
     vertex buffer then has what photons' classes need.
     """
-    visitor = QueryVisitor(world, limits, queries, weights, beyond, classes)
+    visitor = QueryVisitor(world, limits, queries, weights, first, beyond, classes)
     radiance, alpha, splat = trace_camera(world, limits, camera_pass, visitor)
     return radiance, alpha, splat, visitor.store.vertices, visitor.store.count

@@ -122,13 +122,12 @@ def paths_per_pixel(
 
 def direct_error(
     found: DirectNoise,
-    photon_light: float,
+    weights: np.ndarray,
     paths: np.ndarray | float,
     iterations: float,
     exponent: float,
 ) -> float:
-    """Relative noise of direct light in one iteration with so many `paths` a pixel; arguments as of
-    `paths_per_pixel`."""
+    """Noise of direct light in one iteration with so many `paths` a pixel, by the pixels'
+    `weights` (`noise.MEASURES`); other arguments as of `paths_per_pixel`."""
     noise = found.own * max(iterations, 1) ** (1 - exponent)
-    relative = relative_weights(found.mean + photon_light)
-    return trimmed_mean(relative * noise * paths**-exponent)
+    return trimmed_mean(weights * noise * paths**-exponent)

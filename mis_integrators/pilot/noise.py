@@ -15,12 +15,25 @@ RARE_PIXELS = 0.001
 """Tuned: share of the pixels, the noisiest, without which noise is judged."""
 
 
+def usual_radiance(mean: np.ndarray) -> float:
+    """Mean over pixels, the brightest tenth cut down to the least of them (visible lamps, the sky
+    in windows)."""
+    return float(np.mean(np.minimum(mean, np.quantile(mean, 0.9))))
+
+
 def relative_weights(mean: np.ndarray) -> np.ndarray:
-    """Weights 1 / (mean^2 + 0.1 <mean>^2) of squared errors: relative error, without letting dark
-    pixels rule. The overall mean <mean> leaves out the brightest tenth (visible lamps, the sky in
-    windows)."""
-    usual = np.mean(np.minimum(mean, np.quantile(mean, 0.9)))
-    return 1 / (mean**2 + 0.1 * usual**2 + 1e-30)
+    """Weights 1 / (mean^2 + 0.1 usual^2) of squared errors: relative error, without letting dark
+    pixels rule."""
+    return 1 / (mean**2 + 0.1 * usual_radiance(mean) ** 2 + 1e-30)
+
+
+def absolute_weights(mean: np.ndarray) -> np.ndarray:
+    """Weights 1 / usual^2 of squared errors, the same for all pixels."""
+    return np.full(len(mean), 1 / (usual_radiance(mean) ** 2 + 1e-30))
+
+
+MEASURES = {"relmse": relative_weights, "mse": absolute_weights}
+"""Measures of error: weights of the pixels' squared errors, from the pixels' radiance."""
 
 
 def shrink_to_neighbours(samples: np.ndarray, cells: np.ndarray) -> np.ndarray:
@@ -96,8 +109,8 @@ def bounded_by_larger_disks(
 
 
 def direct_variance(direct: np.ndarray, weights: np.ndarray) -> float:
-    """Relative variance, in an iteration, of light that does not come from photons; infinite where
-    one iteration tells nothing of it. `direct`: (iterations, groups, pixels)."""
+    """Variance, in an iteration, of light that does not come from photons; infinite where one
+    iteration tells nothing of it. `direct`: (iterations, groups, pixels)."""
     if len(direct) < 2:
         return trimmed_mean(weights * np.full(direct.shape[-1], np.inf))
     return max(trimmed_mean(weights * variance_left(direct)), 0.0)

@@ -2,8 +2,8 @@
 
 A pilot estimates a few thousand pixels in a few independent iterations, at a ladder of radii R that
 double from one to the next, all from the same photons. Let x(R) be the estimate of a pixel in one
-iteration, and <.> the mean over pixels of squares relative to the pixels' radiance
-(`noise.relative_weights`).
+iteration, and <.> the weighted mean over pixels (`noise.MEASURES`; radii are chosen by relative
+errors).
 
 Measured
     V(R) = <Var[x(R)]>, the noise of one iteration (`noise.py`), or what a denoiser leaves of it
@@ -34,7 +34,7 @@ import numpy as np
 
 from .bias import LEAST_BIAS, LEAST_CORRECTED, expected_squared_bias, squared_difference
 from .edges import light_lost_at_edges
-from .noise import photon_variance, relative_weights
+from .noise import photon_variance
 
 LADDER_STEPS = 7
 """Tuned: radii of the ladder."""
@@ -61,7 +61,7 @@ def middle_index(radii: np.ndarray) -> int:
 
 
 class ErrorByRadius(NamedTuple):
-    """Relative squared bias and variance of the estimates from one kind of photons. Both are
+    """Squared bias and variance of the estimates from one kind of photons. Both are
     dictionaries, False: plain estimates, True: corrected ones. They are empty where the pilot found
     no photon."""
 
@@ -73,12 +73,20 @@ class ErrorByRadius(NamedTuple):
     variance: dict[bool, np.ndarray]
     """Of an iteration like the pilot's, at the ladder."""
 
+    def at(self, radius: float, corrected: bool) -> tuple[float, float]:
+        """Squared bias and variance at a radius."""
+        if corrected not in self.variance:
+            return 0.0, 0.0
+        bias = between(np.array([radius]), self.fine, self.squared_bias[corrected])
+        variance = between(np.array([radius]), self.ladder, self.variance[corrected])
+        return float(bias[0]), float(variance[0])
+
 
 def error_by_radius(
     radii: np.ndarray,
     plain: np.ndarray,
     corrected: np.ndarray | None,
-    mean: np.ndarray,
+    weights: np.ndarray,
     at_first_vertex: bool = True,
     alike: bool = False,
 ) -> ErrorByRadius:
@@ -90,15 +98,14 @@ def error_by_radius(
         Estimates of independent iterations, by the groups of camera paths of `denoiser`.
     corrected : as `plain`, or None
         The same corrected at edges.
-    mean : (pixels,)
-        Radiance that errors are relative to.
+    weights : (pixels,)
+        Of the pixels' squared errors, see `noise.MEASURES`.
     at_first_vertex, alike
         See `noise.photon_variance`.
     """
     fine = np.exp(np.linspace(np.log(radii[0]), np.log(radii[-1]), 16 * len(radii)))
     if not np.any(plain):
         return ErrorByRadius(radii, fine, {}, {})
-    weights = relative_weights(mean)
     variance = {
         which: photon_variance(radii, samples, weights, at_first_vertex, alike)
         for which, samples in ((False, plain), (True, corrected))
@@ -125,14 +132,10 @@ def error_by_radius(
 
 
 class RadiusChoice(NamedTuple):
-    """A radius, whether estimates are corrected at edges, and the errors predicted then, in
-    relative terms."""
+    """A radius, and whether estimates are corrected at edges."""
 
     radius: float
     corrected: bool
-    squared_bias: float
-    variance: float
-    """Of one iteration."""
 
 
 def best_radius(
@@ -158,16 +161,13 @@ def best_radius(
         variance = between(fine, radii, errors.variance[corrected])
         predicted = bias + variance / iterations(fine, corrected)
         at = int(np.argmin(predicted))
-        candidates = [(float(predicted[at]), float(fine[at]), at)]
+        candidates = [(float(predicted[at]), float(fine[at]))]
         if used is not None and used[1] == corrected:
             at = int(np.argmin(np.abs(np.log(fine / used[0]))))
-            candidates.append((float(predicted[at]) * (1 - reluctance), used[0], at))
-        choices += [
-            (error, RadiusChoice(radius, corrected, float(bias[at]), float(variance[at])))
-            for error, radius, at in candidates
-        ]
+            candidates.append((float(predicted[at]) * (1 - reluctance), used[0]))
+        choices += [(error, RadiusChoice(radius, corrected)) for error, radius in candidates]
     if not choices:
-        return RadiusChoice(float(radii[middle_index(radii)]), False, 0.0, 0.0)
+        return RadiusChoice(float(radii[middle_index(radii)]), False)
     return min(choices)[1]
 
 

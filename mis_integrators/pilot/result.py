@@ -9,7 +9,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from .cost import iteration_cost
-from .noise import direct_variance, relative_weights, shrink_to_neighbours
+from .noise import MEASURES, direct_variance, shrink_to_neighbours
 from .radius import ErrorByRadius, RadiusChoice, best_radius, error_by_radius, middle_index
 from .setting import PilotPixels, PilotSetting, neighbourhoods
 
@@ -30,18 +30,29 @@ class PilotSamples(NamedTuple):
     """By kind and whether they are corrected at edges: what photons bring, (iterations, radii,
     groups of camera paths, pixels)."""
     direct: np.ndarray
-    """Light that does not come from photons, (iterations, groups, pixels)."""
+    """Light that neither photons bring nor other paths see, (iterations, groups, pixels)."""
+    seen: np.ndarray
+    """Light that other paths see, (pixels,)."""
 
 
-class Prediction(NamedTuple):
-    """What is predicted of a render with a choice; errors are relative, by `relative_weights` of
-    `mean`."""
+class PredictedError(NamedTuple):
+    """Of a render with a choice, in one of `noise.MEASURES`."""
 
     squared_bias: float
     variance: float
-    """Of one iteration, light that does not come from photons included."""
-    direct: float
-    """The part of it that such light has."""
+    """Of one iteration; that of other paths, which see direct light, is not in what a pilot
+    measures."""
+
+    def after(self, iterations: float) -> float:
+        """Mean squared error of so many iterations: bias^2 + V / n."""
+        return self.squared_bias + self.variance / max(iterations, 1)
+
+
+class Prediction(NamedTuple):
+    """What is predicted of a render with a choice."""
+
+    errors: dict[str, PredictedError]
+    """By measure."""
     photon_light: float
     """What photons bring to a pixel, on average."""
     gathered: float
@@ -54,11 +65,6 @@ class Prediction(NamedTuple):
     """Those of the pilot."""
     caustic_share: float
     """Share of the light that caustic photons bring."""
-
-    @property
-    def error(self) -> float:
-        """Relative mean squared error of the render: bias^2 + V / n."""
-        return self.squared_bias + self.variance / max(self.iterations, 1)
 
 
 @dataclass(frozen=True)
@@ -74,7 +80,8 @@ class Choice:
 @dataclass(frozen=True)
 class PilotResult:
     """What a pilot has measured (made by `measure`), and the choices that follow from it. The
-    dictionaries are empty where no camera path meets a surface that gathers."""
+    dictionaries are empty where no camera path meets a surface that gathers. Measures are
+    `noise.MEASURES`."""
 
     setting: PilotSetting
     pixels: PilotPixels
@@ -82,18 +89,18 @@ class PilotResult:
     """Of the pilot's last iteration."""
     photons: dict[str, float]
     """As in `PilotSamples`."""
-    errors: dict[str, ErrorByRadius]
-    """By kind of photons."""
-    direct: float
-    """Relative variance, in an iteration, of light that does not come from photons."""
+    errors: dict[str, dict[str, ErrorByRadius]]
+    """By measure, and by kind of photons."""
+    direct: dict[str, float]
+    """By measure: variance, in an iteration, of the light that `PilotSamples.direct` is."""
     mean: np.ndarray
-    """(pixels,): the radiance that errors are relative to."""
+    """(pixels,): radiance."""
     photon_light: float
     """What photons bring to a pixel, on average."""
     caustic_share: float
 
     def choose(self, count: float, kept: Choice | None = None, reluctance: float = 0.0) -> Choice:
-        """The choice with the least predicted error.
+        """The choice with the least predicted relative error.
 
         Parameters
         ----------
@@ -107,14 +114,13 @@ class PilotResult:
             radius = RADIUS_WITHOUT_VERTICES * self.setting.extent
             kinds = self.setting.kinds
             return Choice(dict.fromkeys(kinds, radius), dict.fromkeys(kinds, False), None)
-        chosen = {kind: self._best_radius(kind, count, kept, reluctance) for kind in self.errors}
+        chosen = {kind: self._best_radius(kind, count, kept, reluctance) for kind in self.photons}
         choice = Choice(
             {kind: found.radius for kind, found in chosen.items()},
             {kind: found.corrected for kind, found in chosen.items()},
             None,
         )
-        prediction = self._predict(choice, list(chosen.values()), count)
-        return replace(choice, prediction=prediction)
+        return replace(choice, prediction=self._predict(choice, count))
 
     def _best_radius(
         self, kind: str, count: float, kept: Choice | None, reluctance: float
@@ -127,14 +133,22 @@ class PilotResult:
             return np.maximum(count / cost, 1)
 
         used = None if kept is None else (kept.radii[kind], kept.corrected[kind])
-        return best_radius(self.errors[kind], iterations, used, reluctance)
+        return best_radius(self.errors["relmse"][kind], iterations, used, reluctance)
 
-    def _predict(self, choice: Choice, chosen: list[RadiusChoice], count: float) -> Prediction:
-        """The `Prediction` for a choice, made of those for its kinds of photons."""
+    def _predict(self, choice: Choice, count: float) -> Prediction:
+        """The `Prediction` for a choice."""
+        errors = {}
+        for measure, by_kind in self.errors.items():
+            found = [
+                by_kind[kind].at(radius, choice.corrected[kind])
+                for kind, radius in choice.radii.items()
+            ]
+            errors[measure] = PredictedError(
+                sum(squared_bias for squared_bias, _ in found),
+                self.direct[measure] + sum(variance for _, variance in found),
+            )
         return Prediction(
-            sum(found.squared_bias for found in chosen),
-            self.direct + sum(found.variance for found in chosen),
-            self.direct,
+            errors,
             self.photon_light,
             sum(self.gathered(kind, radius) for kind, radius in choice.radii.items()),
             count / self.cost(choice),
@@ -145,7 +159,7 @@ class PilotResult:
 
     def gathered(self, kind: str, radius: Radii) -> Radii:
         """Photons of a kind within `radius` of a vertex, on average."""
-        return self.photons[kind] * (radius / self.errors[kind].ladder[-1]) ** 2
+        return self.photons[kind] * (radius / self.errors["relmse"][kind].ladder[-1]) ** 2
 
     def cost(self, choice: Choice) -> float:
         """Cost of an iteration with the radii and corrections of a choice, see `cost`."""
@@ -155,7 +169,7 @@ class PilotResult:
                     self.gathered(kind, radius), choice.corrected[kind], self.setting.camera_paths
                 )
                 for kind, radius in choice.radii.items()
-                if kind in self.errors
+                if kind in self.photons
             ),
             default=1.0,
         )
@@ -171,27 +185,28 @@ def measure(
     that gathers."""
     if samples is None:
         nothing = np.zeros(pixels.count)
-        return PilotResult(setting, pixels, seconds, {}, {}, 0.0, nothing, 0.0, 0.0)
+        return PilotResult(setting, pixels, seconds, {}, {}, {}, nothing, 0.0, 0.0)
     middle = {
         kind: samples.gathered[kind, False][:, middle_index(samples.ladder)].mean(axis=1)
         for kind in setting.kinds
     }  # (iterations, pixels)
     image = samples.direct.mean(axis=1) + sum(middle.values())
-    mean = shrink_to_neighbours(image, neighbourhoods(setting.width, pixels))
-    weights = relative_weights(mean)
-    errors = {}
+    mean = samples.seen + shrink_to_neighbours(image, neighbourhoods(setting.width, pixels))
+    weights = {measure: weigh(mean) for measure, weigh in MEASURES.items()}
+    errors: dict[str, dict[str, ErrorByRadius]] = {measure: {} for measure in MEASURES}
     for kind in setting.kinds:
         by_correction = {
             corrected: samples.gathered[kind, corrected] for corrected in setting.corrections(kind)
         }
-        errors[kind] = error_by_radius(
-            samples.ladder,
-            by_correction[False],
-            by_correction.get(True),
-            mean,
-            setting.at_first_vertex,
-            kind == "caustic",
-        )
+        for measure in MEASURES:
+            errors[measure][kind] = error_by_radius(
+                samples.ladder,
+                by_correction[False],
+                by_correction.get(True),
+                weights[measure],
+                setting.at_first_vertex,
+                kind == "caustic",
+            )
     caustics = np.mean(middle["caustic"]) if "caustic" in middle else 0.0
     return PilotResult(
         setting,
@@ -199,7 +214,7 @@ def measure(
         seconds,
         samples.photons,
         errors,
-        direct_variance(samples.direct, weights),
+        {measure: direct_variance(samples.direct, weights[measure]) for measure in MEASURES},
         mean,
         float(sum(np.mean(part) for part in middle.values())),
         float(caustics / max(np.mean(mean), 1e-30)),

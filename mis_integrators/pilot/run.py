@@ -42,7 +42,8 @@ class PilotIteration(Protocol):
         channels, (radii, groups of camera paths, pixels)."""
 
     def direct(self) -> np.ndarray:
-        """Light that does not come from photons: mean over the channels, (groups, pixels)."""
+        """Light that neither photons bring nor other paths see: mean over the channels, (groups,
+        pixels)."""
 
 
 class PilotPasses(Protocol):
@@ -51,6 +52,10 @@ class PilotPasses(Protocol):
     def trace(self, number: int) -> PilotIteration:
         """Traces the light and camera sub-paths of iteration `number`, which has random numbers of
         its own."""
+
+    def seen(self) -> np.ndarray:
+        """Light that other paths see, which have numbers of their own: mean over the channels,
+        (pixels,)."""
 
 
 def run_pilot(setting: PilotSetting, pixels: PilotPixels, passes: PilotPasses) -> PilotResult:
@@ -86,7 +91,7 @@ def run_pilot(setting: PilotSetting, pixels: PilotPixels, passes: PilotPasses) -
     samples = None
     if radii is not None:
         estimates = {key: np.array([step[key] for step in gathered]) for key in gathered[0]}
-        samples = PilotSamples(radii, photons, estimates, np.array(direct))
+        samples = PilotSamples(radii, photons, estimates, np.array(direct), passes.seen())
     return measure(setting, pixels, samples, seconds)
 
 

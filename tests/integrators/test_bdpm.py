@@ -6,7 +6,7 @@ import gc
 import sys
 
 from mis_integrators._plugins import PLUGINS
-from mis_integrators.pilot.noise import relative_weights, trimmed_mean
+from mis_integrators.pilot.noise import MEASURES, trimmed_mean
 from mis_integrators.pilot.result import PilotResult, PilotSamples, measure
 from mis_integrators.pilot.setting import pilot_pixels
 
@@ -934,6 +934,7 @@ def test_rare_photons_get_no_smallest_radius(rgb):
         {"indirect": 0.0},
         {("indirect", corrected): np.zeros((4, 7, 1, 256)) for corrected in (False, True)},
         np.ones((4, 1, 256)),
+        np.zeros(256),
     )
     choice = measure(setting, pilot_pixels(setting), samples, 1.0).choose(100)
     assert choice.radii["indirect"] == pytest.approx(0.16)
@@ -971,8 +972,10 @@ def test_noise_of_several_camera_paths_is_foreseen(rgb, plugin, given, camera_pa
     for _ in range(12):
         session.iterate()
     mean, variance = session.estimate()
-    measured = relative_weights(mean.mean(axis=-1).ravel()) * 12 * variance.mean(axis=-1).ravel()
-    assert 1 / 1.3 < session.prediction.variance / trimmed_mean(measured) < 1.3
+    for name, weigh in MEASURES.items():
+        measured = weigh(mean.mean(axis=-1).ravel()) * 12 * variance.mean(axis=-1).ravel()
+        predicted = session.prediction.errors[name].variance
+        assert 1 / 1.3 < predicted / trimmed_mean(measured) < 1.3, name
 
 
 # --- Errors -------------------------------------------------------------------

@@ -95,8 +95,10 @@ def test_error_that_is_left_falls_with_the_paths():
     """For independent paths by their number; one path in one iteration has its own variance."""
     rng = np.random.default_rng(3)
     samples = rng.normal(1.0, 0.1, (64, 32 * WIDTH))
+    found = found_in(samples)
+    weights = relative_weights(found.mean)
     one, four = (
-        direct_paths.direct_error(found_in(samples), 0.0, np.full(32 * WIDTH, number), 8, 1.0)
+        direct_paths.direct_error(found, weights, np.full(32 * WIDTH, number), 8, 1.0)
         for number in (1.0, 4.0)
     )
     assert one == pytest.approx(4 * four)
