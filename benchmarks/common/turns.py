@@ -3,6 +3,7 @@ else the machine does hits all alike."""
 
 from __future__ import annotations
 
+import functools
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -13,7 +14,7 @@ from mis_integrators.core.session import Session
 import drjit as dr
 import numpy as np
 
-from common.references import colours
+from common.references import COLOURS
 
 SLICE_SECONDS = 0.5
 
@@ -25,8 +26,15 @@ class Snapshot:
     seconds: float
     iterations: int
     samples_per_pixel: int
-    image: np.ndarray
-    """Colours, (H, W, 3)."""
+    whole: np.ndarray
+    """All channels, (H, W, C)."""
+    channels: list[str]
+    """Their names."""
+
+    @functools.cached_property
+    def image(self) -> np.ndarray:
+        """Colours, (H, W, 3)."""
+        return self.whole[..., [self.channels.index(name) for name in COLOURS]]
 
 
 @dataclass
@@ -98,7 +106,7 @@ class Contender:
         session = self.session
         samples = session.iterations * session.camera_paths
         self.snapshots.append(
-            Snapshot(self.rendering, session.iterations, samples, colours(session))
+            Snapshot(self.rendering, session.iterations, samples, session.image(), session.channels)
         )
 
     def wants(self, seconds: float, spp: int | None = None) -> bool:

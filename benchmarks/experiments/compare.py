@@ -7,7 +7,14 @@ from dataclasses import fields
 from pathlib import Path
 
 from mis_integrators.analysis.confidence import log_ratio_error, mean_interval, ratio_interval
-from mis_integrators.analysis.metrics import Errors, decompose, efficiency, errors, flip
+from mis_integrators.analysis.metrics import (
+    Errors,
+    artefact_share,
+    decompose,
+    efficiency,
+    errors,
+    flip,
+)
 from mis_integrators.app import denoising
 
 import numpy as np
@@ -31,6 +38,7 @@ COLUMNS = (
     "relMSE / best path",
     "MSE / best path",
     "FLIP",
+    "artefacts",
     "bias share",
     "cost ratio",
     "settings",
@@ -44,7 +52,10 @@ DENOISED_COLUMNS = (
     "denoised relMSE",
     "denoised MSE",
     "denoised FLIP",
+    "denoised artefacts",
+    "relMSE, all at once",
     "denoised relMSE / best path",
+    "denoised MSE / best path",
     "denoised FLIP / best path",
     "settings",
 )
@@ -127,13 +138,27 @@ def compare(measurement: Measurement) -> list[Row]:
         measured.method.label: _figures(measured, measurement) for measured in measurement.methods
     }
     base = every[measurement.base.method.label]
+    denoised = [_denoised(measured, measurement) for measured in measurement.methods]
     rows = [
         _row(measured, every[measured.method.label], base, measurement)
-        for measured in measurement.methods
+        | _denoised_errors(measured, pictures, measurement)
+        for measured, pictures in zip(measurement.methods, denoised)
     ]
-    paths = [
-        row for row, measured in zip(rows, measurement.methods) if measured.method.plugin == "path"
-    ]
+    of_path = [measured.method.plugin == "path" for measured in measurement.methods]
+    paths = [row for row, is_path in zip(rows, of_path) if is_path]
+    for name, column, images in (
+        ("relMSE", "artefacts", [measured.images for measured in measurement.methods]),
+        ("denoised relMSE", "denoised artefacts", denoised),
+    ):
+        beside = [
+            (row[name], shown[0])
+            for row, shown, is_path in zip(rows, images, of_path)
+            if is_path and shown
+        ]
+        if beside:
+            _, other = min(beside, key=lambda pair: pair[0])
+            for row, shown in zip(rows, images):
+                row[column] = artefact_share(shown[0], other, measurement.references)
     for name, column in TO_BETTER_PATH.items():
         better = min((row[name] for row in paths if name in row), default=float("nan"))
         for row in rows:
@@ -154,17 +179,35 @@ def _figures(measured: Measured, measurement: Measurement) -> dict[str, list[flo
     return figures
 
 
-def _denoised(measured: Measured, measurement: Measurement) -> Row:
-    """Errors of the denoised images, mean over the seeds; nothing where they are not denoised."""
+def _denoised(measured: Measured, measurement: Measurement) -> list[np.ndarray]:
+    """The denoised images, one a seed; none where they are not denoised."""
     if not measurement.opened.denoise:
+        return []
+    scene = measurement.opened.scene
+    pictures = []
+    for run in measured.runs:
+        denoised, _ = denoising.denoised_picture(
+            run.last.whole, run.last.channels, scene, scene.sensors()[0]
+        )
+        pictures.append(denoised[..., :3])
+    return pictures
+
+
+def _denoised_errors(
+    measured: Measured, pictures: list[np.ndarray], measurement: Measurement
+) -> Row:
+    """Errors of the denoised images, mean over the seeds, and of the first one denoised without its
+    direct light apart."""
+    if not pictures:
         return {}
-    pictures = [denoising.denoise(image, measurement.opened.scene) for image in measured.images]
+    at_once = denoising.denoise(measured.images[0], measurement.opened.scene)
     judged = [errors(picture, measurement.references) for picture in pictures]
     perceived = flip(pictures[0], measurement.references)
     return {
         "denoised MSE": float(np.mean([error.mse for error in judged])),
         "denoised relMSE": float(np.mean([error.relmse for error in judged])),
         "denoised relMSE trimmed": float(np.mean([error.relmse_trimmed for error in judged])),
+        "relMSE, all at once": errors(at_once, measurement.references).relmse,
         "denoised FLIP": perceived[0] if perceived else float("nan"),
     }
 
@@ -221,7 +264,6 @@ def _row(measured: Measured, mine: dict, base: dict, measurement: Measurement) -
         "cost ratio low": cost.low,
         "cost ratio high": cost.high,
         "cost ratio error": log_ratio_error(mine["cost"], base["cost"]),
-        **_denoised(measured, measurement),
         "settings": chosen(measured.runs[-1].settings),
         "references": measurement.references.origin,
     }

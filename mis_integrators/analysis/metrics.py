@@ -24,6 +24,9 @@ TRIMMED_SHARE = 1e-3
 """Share of the pixels, the worst ones, that trimmed errors leave out."""
 GROUPS = 15
 """Groups of pixels of the median of means."""
+OUTSTANDING, NEAR = 10.0, 16
+"""An artefact's squared error is above so many times the median of those in its neighbourhood, a
+block of so many pixels squared, in the image that it is compared with."""
 BLOCKS = 8
 """Blocks a side of an image whose means are compared, or whose spread is a standard error."""
 
@@ -183,6 +186,24 @@ def median_of_means(values: np.ndarray, groups: int = GROUPS) -> float:
             [group.mean() for group in np.array_split(values[order], min(groups, len(values)))]
         )
     )
+
+
+# --- Artefacts ------------------------------------------------------------------------------------
+
+
+def artefact_share(image: np.ndarray, other: np.ndarray, references: References) -> float:
+    """Share of an image's pixels that an eye would take for artefacts beside an `other` image,
+    (H, W, 3) each: their squared error is above `OUTSTANDING` times the median of the other's in
+    the block of `NEAR` pixels squared that they are in. Errors are of grey against the references'
+    mean, so they include its noise; the other image's own share is what to compare with."""
+    level = references.mean.mean(axis=-1)
+    mine, others = (np.square(x.astype(np.float64).mean(axis=-1) - level) for x in (image, other))
+    found = 0
+    for y in range(0, level.shape[0], NEAR):
+        for x in range(0, level.shape[1], NEAR):
+            block = slice(y, y + NEAR), slice(x, x + NEAR)
+            found += np.count_nonzero(mine[block] > OUTSTANDING * np.median(others[block]))
+    return found / level.size
 
 
 # --- FLIP -----------------------------------------------------------------------------------------

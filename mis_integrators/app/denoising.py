@@ -1,4 +1,8 @@
-"""Denoised pictures, by Open Image Denoise (the package `mitsuba-oidn`)."""
+"""Denoised pictures, by Open Image Denoise (the package `mitsuba-oidn`).
+
+Images rendered with the parameter `denoised` have their direct light in channels of its own. That
+is denoised apart, and only as far as it is noisy: see `shrunk`.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +12,8 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
+from ..core.film import WINDOW, direct_channels
+from ..core.windows import window_mean
 from ..paths.guides import albedo_and_normal
 from .output import picture_channels
 
@@ -29,7 +35,25 @@ def version() -> str:
     return f"Open Image Denoise {'.'.join(map(str, require().oidn_version()))}"
 
 
-def denoise(image: Any, scene: mi.Scene | None = None, sensor: int | mi.Sensor = 0) -> np.ndarray:
+def shrunk(raw: np.ndarray, clean: np.ndarray, variance: np.ndarray) -> np.ndarray:
+    """An image (H, W, C) moved towards its denoised copy `clean`, as far as it is noisy.
+
+    The squared difference of the two has the expectation v + b^2: the `variance` v (H, W) of `raw`
+    (of the mean of its channels, over a window), and the squared bias b of `clean`, which is nearly
+    free of noise. The best weight of `raw` in a mean of both is b^2 / (v + b^2), the
+    positive-part estimator of James and Stein 1961 with the differences measured over the window.
+    """
+    apart = window_mean(np.square((raw - clean).mean(axis=-1)), WINDOW)
+    weight = np.maximum(1 - variance / np.maximum(apart, 1e-30), 0)
+    return clean + weight[..., None] * (raw - clean)
+
+
+def denoise(
+    image: Any,
+    scene: mi.Scene | None = None,
+    sensor: int | mi.Sensor = 0,
+    channels: Sequence[str] = (),
+) -> np.ndarray:
     """A denoised copy of a rendered image.
 
     Images should be rendered with a box filter (``<rfilter type="box"/>``): wider ones make the
@@ -43,6 +67,9 @@ def denoise(image: Any, scene: mi.Scene | None = None, sensor: int | mi.Sensor =
     scene, sensor
         What the image shows: albedo and normals of what the camera sees are then made from it, and
         keep edges and textures sharp. `sensor`: one of the scene's, or its number.
+    channels
+        The names of the image's channels. Where there are those of direct light (an integrator
+        with the parameter `denoised` makes them), it is denoised apart.
 
     Returns
     -------
@@ -54,12 +81,15 @@ def denoise(image: Any, scene: mi.Scene | None = None, sensor: int | mi.Sensor =
     ImportError
         Without the package ``mitsuba-oidn``.
     ValueError
-        If the image has another shape, or another size than the sensor's film.
+        If the image has another shape, another size than the sensor's film, or another number of
+        channels than are named.
     """
     oidn = require()
     pixels = np.array(image, dtype=np.float32)
     if pixels.ndim not in (2, 3) or 0 in pixels.shape:
         raise ValueError(f"an image of shape (height, width, channels), not {pixels.shape}")
+    if channels and len(channels) != (1 if pixels.ndim == 2 else pixels.shape[2]):
+        raise ValueError(f"{len(channels)} names of channels for an image of shape {pixels.shape}")
     guides: tuple[np.ndarray, ...] = ()
     if scene is not None:
         sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
@@ -73,9 +103,18 @@ def denoise(image: Any, scene: mi.Scene | None = None, sensor: int | mi.Sensor =
     planes = pixels[..., None] if pixels.ndim == 2 else pixels
     colours = planes[..., : 3 if planes.shape[2] >= 3 else 1]
     clean = np.maximum(np.nan_to_num(colours, nan=0, posinf=0, neginf=0), 0)
-    clean = np.ascontiguousarray(np.broadcast_to(clean, (*clean.shape[:2], 3)))
-    found = oidn.denoise(clean, *guides, hdr=True)
-    colours[...] = np.asarray(found)[..., : colours.shape[2]]
+
+    def without_noise(light: np.ndarray) -> np.ndarray:
+        grey_too = np.ascontiguousarray(np.broadcast_to(light, (*light.shape[:2], 3)))
+        return np.asarray(oidn.denoise(grey_too, *guides, hdr=True))[..., : light.shape[2]]
+
+    if set(direct_channels()) <= set(channels):
+        *direct, variance = (planes[..., channels.index(name)] for name in direct_channels())
+        light = np.clip(np.stack(direct[: colours.shape[2]], axis=-1), 0, clean)
+        found = shrunk(light, without_noise(light), variance) + without_noise(clean - light)
+        colours[...] = np.maximum(found, 0)
+    else:
+        colours[...] = without_noise(clean)
     return pixels
 
 
@@ -90,4 +129,5 @@ def denoised_picture(
     if names is None:
         raise ValueError("--denoise: the film has no colours, and so there is nothing to denoise")
     order = [*names, *(name for name in channels if name not in names)]
-    return denoise(image[..., [channels.index(name) for name in order]], scene, sensor), order
+    image = image[..., [channels.index(name) for name in order]]
+    return denoise(image, scene, sensor, order), order

@@ -9,7 +9,7 @@ import numpy as np
 
 from . import segments
 from .packing import from_numpy
-from .stratified_variance import variance_ratio
+from .stratified_variance import variance_nearby, variance_ratio
 from .sums import Sums
 
 
@@ -163,6 +163,19 @@ def zero_where(left_out, block):
     return dr.select(left_out > 0, 0, block)
 
 
+DIRECT = "direct_light"
+"""What the channels of a render that will be denoised are called: its direct light, and the
+variance of that."""
+WINDOW = 5
+"""Width in pixels of the windows in which the noise of direct light is measured. (3 and 9 leave the
+same error within 2 %, in four scenes.)"""
+
+
+def direct_channels():
+    """Names of the channels of direct light, the last one that of its variance."""
+    return [f"{DIRECT}.{name}" for name in ("R", "G", "B", "variance")]
+
+
 class Accumulator:
     """Sums of the iterations' blocks and, for the variance, of their squares. Its size does not
     grow with iterations.
@@ -170,15 +183,22 @@ class Accumulator:
     The sums are `total`; `left_out`, how many iterations had a value at the pixel that is not
     finite and are left out there, weight and all; with the variance `square` (colour squared),
     `cross` (colour times weight), `weight_square`; `techniques` if there are such images.
-    Blocks have `class_channels` before their last one.
+    Blocks have `class_channels` before their last one, those of direct light first.
 
     Where iterations are `stratified` together (low-discrepancy numbers), the variance needs
     `grey_square` and the segments (see `segments`) of grey and weight, too; grey is the mean of the
-    colours.
+    colours. Images that will be `denoised` need the segments for direct light: its grey is their
+    last channel.
     """
 
     def __init__(
-        self, film, with_variance, technique_channels=0, stratified=False, class_channels=0
+        self,
+        film,
+        with_variance,
+        technique_channels=0,
+        stratified=False,
+        class_channels=0,
+        denoised=False,
     ):
         self.film, self.with_variance, self.technique_channels, self.stratified = (
             film,
@@ -186,7 +206,7 @@ class Accumulator:
             technique_channels,
             stratified,
         )
-        self.class_channels = class_channels
+        self.class_channels, self.denoised = class_channels, denoised
         self.sums = Sums(mi.TensorXd)
 
     @property
@@ -207,10 +227,17 @@ class Accumulator:
         if self.with_variance:
             channels |= {"square": 3, "cross": 3, "weight_square": 1}
             if self.stratified:
-                channels |= {"grey_square": 1, **dict.fromkeys(segments.NAMES, 2)}
+                channels["grey_square"] = 1
+        if self._segmented:
+            channels |= dict.fromkeys(segments.NAMES, 3 if self.denoised else 2)
         if self.technique_channels:
             channels["techniques"] = self.technique_channels
         return {name: (*size, count) for name, count in channels.items()}
+
+    @property
+    def _segmented(self):
+        """Whether there are segments."""
+        return self.denoised or (self.with_variance and self.stratified)
 
     def add(self, block, iteration, techniques=None):
         """Adds the block tensor of an iteration, and that of its techniques' images."""
@@ -226,11 +253,19 @@ class Accumulator:
             if self.stratified:
                 grey = grey_of(mi.TensorXd(block[:, :, :3]))
                 self.sums.add("grey_square", grey * grey)
-                self.sums.add_to_segment(
-                    iteration, dr.concat([grey, mi.TensorXd(block[:, :, -1:])], axis=2)
-                )
+        if self._segmented:
+            wide = mi.TensorXd(block)
+            followed = [grey_of(wide[:, :, :3]), wide[:, :, -1:]]
+            if self.denoised:
+                followed.append(grey_of(self._direct(wide)))
+            self.sums.add_to_segment(iteration, dr.concat(followed, axis=2))
         self.sums.done.add(iteration)
         dr.schedule(self.sums.tensors)
+
+    def _direct(self, tensor):
+        """The channels of direct light in a tensor of blocks."""
+        first = tensor.shape[2] - 1 - self.class_channels
+        return tensor[:, :, first : first + 3]
 
     def mean(self):
         """Mean colour (height, width, 3), and the sums of weights (height, width, 1) by which it
@@ -262,14 +297,27 @@ class Accumulator:
             "weight_square": self._inside(self.sums["weight_square"]),
         }
         naive = np.maximum(spread(grey, mean), 0) * (n / ((n - 1) * weight * weight))
-        length, complete = segments.complete(done.below, done.beyond, done.end)
-        sums = np.array([self._inside(self.sums[name]) for name in segments.NAMES])
-        deviations = (sums[..., :1] - mean * sums[..., 1:]) * (n / (weight * length))
-        ratio = variance_ratio(
-            deviations[..., 0], complete, length, naive[..., 0], done.below, done.beyond
-        )
+        ratio = variance_ratio(*self._deviations(0, mean), naive[..., 0], done.below, done.beyond)
         border = self.film.rfilter().border_size()
         return np.pad(ratio, border, constant_values=1.0)[..., None]
+
+    def _deviations(self, channel, mean):
+        """Of each segment's mean from the `mean` (H, W, 1) of a channel of the segments: (segments,
+        H, W); which segments are complete; their length."""
+        done, weight = self.sums.done, self._inside(self.sums["total"])[..., -1]
+        length, complete = segments.complete(done.below, done.beyond, done.end)
+        sums = np.array([self._inside(self.sums[name]) for name in segments.NAMES])
+        deviations = sums[..., channel] - mean[..., 0] * sums[..., 1]
+        scale = self.iterations / (np.where(weight == 0, 1, weight) * length)
+        return deviations * scale, complete, length
+
+    def direct_variance(self):
+        """Estimated variance of the mean of direct light, grey, mean over `WINDOW`: (height, width)
+        without the block's border. Its square where it is not known."""
+        total, done = self._inside(self.sums["total"]), self.sums.done
+        mean = grey_of(self._direct(total)) / np.where(total[..., -1:] == 0, 1, total[..., -1:])
+        found = variance_nearby(*self._deviations(2, mean), done.below, done.beyond, WINDOW)
+        return np.square(mean[..., 0]) if found is None else found
 
     def estimate(self):
         """Mean colour and its estimated variance, float64 (height, width, 3) each, without the
@@ -299,6 +347,10 @@ class Accumulator:
             tensor = dr.concat(
                 [tensor, channels[:, :, :1] if mi.is_monochromatic else channels], axis=2
             )
+        if self.denoised:
+            border = self.film.rfilter().border_size()
+            noise = mi.TensorXd(np.pad(self.direct_variance(), border)[..., None])
+            tensor = dr.concat([tensor, self._direct(total), noise * weight], axis=2)
         if self.technique_channels:
             tensor = dr.concat([tensor, self.sums["techniques"]], axis=2)
         for layer in layers:

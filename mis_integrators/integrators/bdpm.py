@@ -371,15 +371,15 @@ class BDPMSession(PilotedSession):
         if beyond is not None:
             pixel = (dr.arange(mi.UInt32, self.chunk) + first) // self.camera_paths
             beyond = dr.gather(mi.Float, beyond, pixel, there)
-        classes = None
-        if self.integrator.splits_light:
+        classes, kept = None, self.integrator.kept_classes
+        if kept:
             classes = LightClasses(self.chunk, None, ("met", "next_event"))
         radiance, alpha, position, vertices, count = self._trace_camera(
             camera_pass, self.vertex_capacity, spectral, 1.0, beyond, classes
         )
         if classes is not None:
             dr.eval(radiance, alpha, position, vertices, count, classes.entries)
-            classes = classes.radiance()
+            classes = classes.radiance()[:kept]
         elif radii:
             dr.eval(radiance, alpha, position, vertices, count)
         for kind, radius in radii.items():
@@ -396,7 +396,7 @@ class BDPMSession(PilotedSession):
                 gathered = self._per_path(gathered, vertices, self.chunk)
                 gathered = gathered if beyond is None else gathered * beyond
                 radiance += gathered
-                if classes is not None:
+                if self.integrator.splits_light:
                     classes[number] += gathered
         if self.integrator.hide_emitters:
             radiance = dr.select(

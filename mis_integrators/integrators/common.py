@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.film import Accumulator, shared_wavelengths, variance_channels
+from ..core.film import Accumulator, direct_channels, shared_wavelengths, variance_channels
 from ..core.packing import rounded_up
 from ..core.random import mix, reversed_bits
 from ..core.recording import settle
@@ -48,6 +48,8 @@ class IterativeIntegrator(mi.AdjointIntegrator):
     as the session finds worth while."""
     LAYERS = tuple(CHANNELS)
     """Types of layers that the parameter `aovs` may ask for."""
+    denoised = False
+    """Whether the image will be denoised: a parameter of some subclasses."""
 
     def __init__(self, props):
         parameters = Parameters(props)
@@ -77,6 +79,12 @@ class IterativeIntegrator(mi.AdjointIntegrator):
         """Whether layers ask for classes of light (`paths.light_classes`)."""
         return any(layer.type in CLASSES for layer in self.layers)
 
+    @property
+    def kept_classes(self):
+        """How many of the classes iterations are summed for: direct light, the first, is denoised
+        apart."""
+        return len(CLASSES) if self.splits_light else int(self.denoised)
+
     def new_session(self, scene, sensor, seed, iterations):
         """The object that runs iterations; see `mis_integrators.core.session.Session`. Every
         subclass has its own."""
@@ -88,7 +96,8 @@ class IterativeIntegrator(mi.AdjointIntegrator):
 
     def estimated_channels(self):
         """Names of the channels beside the image's that iterations are summed for."""
-        return variance_channels() if self.variance else []
+        variance = variance_channels() if self.variance else []
+        return [*variance, *direct_channels()] if self.denoised else variance
 
     def aov_names(self):
         return [*self.estimated_channels(), *channel_names(self.layers)]
@@ -237,8 +246,8 @@ class IterativeIntegrator(mi.AdjointIntegrator):
 
 class IterativeSession:
     """Runs iterations and accumulates them; a subclass implements `_iteration(index) -> block
-    tensor`. (Where light is split, the block has three channels for each of
-    `light_classes.CLASSES` before its last one.)
+    tensor`. (Before its last channel the block has three for each of `light_classes.CLASSES` that
+    is kept.)
 
     `seed` is an integer; iteration `i` draws all its random numbers from (seed, i), so any subset
     of the iterations can be rendered anywhere. They are independent, or parts of sequences
@@ -254,7 +263,8 @@ class IterativeSession:
             sensor.film(),
             integrator.variance,
             stratified=integrator.low_discrepancy,
-            class_channels=3 * len(CLASSES) if integrator.splits_light else 0,
+            class_channels=3 * integrator.kept_classes,
+            denoised=integrator.denoised,
         )
         self.variant = mi.variant()
         settle(scene)

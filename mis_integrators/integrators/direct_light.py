@@ -218,9 +218,8 @@ class DirectLight:
     def _block(self, scene, sensor, tables, sequence, done, part, spectral, beyond):
         radiance, alpha, position, there = self._trace(sensor, sequence, done, part, spectral)
         weight = dr.rcp(dr.gather(mi.Float, beyond, part[0], there))
-        classes = ()
-        if self.session.integrator.splits_light:
-            classes = by_class(class_of(mi.UInt32(1), mi.Bool(False)), radiance)  # all is direct
+        kept = self.session.integrator.kept_classes
+        classes = by_class(class_of(mi.UInt32(1), mi.Bool(False)), radiance)[:kept]  # all is direct
         return splat_samples(
             sensor.film(), position, radiance, alpha, spectral["matrix"], there, weight, classes
         )

@@ -104,9 +104,17 @@ class PathSession(IterativeSession):
             radiance, alpha, position, active = self.trace(
                 iteration, first, 1, self.chunk, spectral
             )
+            # `path` does not split its light: none of it counts as direct light.
+            classes = [mi.Spectrum(0)] * self.integrator.kept_classes
             return (
                 splat_samples(
-                    self.sensor.film(), position, radiance, alpha, spectral["matrix"], active
+                    self.sensor.film(),
+                    position,
+                    radiance,
+                    alpha,
+                    spectral["matrix"],
+                    active,
+                    classes=classes,
                 ),
             )
 

@@ -4,6 +4,7 @@ import sys
 
 import mis_integrators
 from mis_integrators.app import cli
+from mis_integrators.app.denoising import shrunk
 from mis_integrators.paths.guides import albedo_and_normal
 
 import lamplit
@@ -143,6 +144,99 @@ def test_images_of_other_shapes_are_refused(rgb):
         mis_integrators.denoise(np.zeros((5, 3, 3)), painted_wall())
 
 
+# --- direct light apart --------------------------------------------------------------------------
+
+
+def test_light_is_denoised_as_far_as_it_is_noisy():
+    """Towards a copy that is wrong by 0.5 on one side, and right on the other; the noise has the
+    variance 0.01. The best weights of the raw image are 0.25 / 0.26 and 0, and leave 0.0096 and
+    nothing. (65536 pixels in windows of 25: hardly by chance more than a fifth from that.)"""
+    noise = np.random.default_rng(2).normal(0, 0.1, (256, 256, 1)) * np.ones(3)
+    clean = np.where(np.arange(256)[:, None] < 128, 0.5, 0.0) * np.ones((256, 256))
+    clean = clean[..., None] * np.ones(3)
+    left = np.square(shrunk(noise, clean, np.full((256, 256), 0.01)))
+    assert left[:120].mean() == pytest.approx(0.0096, rel=0.2)
+    assert left[136:].mean() < 0.002
+    np.testing.assert_allclose(shrunk(noise, clean, np.zeros((256, 256))), noise, atol=1e-9)
+    np.testing.assert_array_equal(shrunk(noise, clean, np.ones((256, 256))), clean)
+
+
+def lamp_in_a_box(rgb, **film):
+    scene = mi.cornell_box()
+    scene["sensor"]["film"] = {"type": "hdrfilm", "width": 48, "height": 48} | film
+    scene["sensor"]["film"]["rfilter"] = {"type": "box"}
+    return mi.load_dict(scene)
+
+
+def denoised_with_names(plugin, scene, seed=1, **parameters):
+    """A render for the denoiser, and its channels by name."""
+    integrator = mi.load_dict({"type": plugin, "max_depth": 4, "denoised": True, **parameters})
+    image = np.array(mi.render(scene, integrator=integrator, spp=16, seed=seed))
+    names = ["R", "G", "B", *integrator.aov_names()]
+    return image, names
+
+
+def channels_of(image, names, prefix):
+    return image[..., [names.index(f"{prefix}.{name}") for name in "RGB"]]
+
+
+@pytest.mark.parametrize("plugin", ["bdpm", "bdpm_opt2"])
+def test_direct_light_is_the_layer_of_that_name(rgb, plugin):
+    image, names = denoised_with_names(plugin, lamp_in_a_box(rgb), aovs="lit:direct,rest:indirect")
+    direct = channels_of(image, names, "direct_light")
+    np.testing.assert_allclose(direct, channels_of(image, names, "lit"), rtol=1e-4, atol=1e-6)
+    assert 0.2 < direct.mean() / image[..., :3].mean() < 0.95
+
+
+@pytest.mark.parametrize("sampler", ["sobol", "independent"])
+def test_noise_of_direct_light_is_measured(rgb, sampler):
+    """The channel of its variance against that of 24 renders, in blocks of 8 x 8 pixels without
+    the lamp's: the median ratio is within a factor 1.5 (seeds are fixed)."""
+    scene, images, estimates = lamp_in_a_box(rgb), [], []
+    for seed in range(24):
+        image, names = denoised_with_names("bdpm", scene, seed, sampler=sampler)
+        images.append(channels_of(image, names, "direct_light").mean(axis=-1))
+        estimates.append(image[..., names.index("direct_light.variance")])
+    cells = (6, 8, 6, 8)
+    true = np.var(images, axis=0, ddof=1).reshape(cells).mean(axis=(1, 3))
+    estimated = np.mean(estimates, axis=0).reshape(cells).mean(axis=(1, 3))
+    assert 1 / 1.5 < np.median(estimated / np.maximum(true, 1e-12)) < 1.5
+
+
+def test_edges_of_lamps_stay_sharp(rgb):
+    """Of an image with its direct light apart: a tenth of the error of the whole one, denoised."""
+    scene = lamp_in_a_box(rgb)
+    truth = np.array(
+        mi.render(scene, integrator=mi.load_dict({"type": "path", "max_depth": 4}), spp=1024)
+    )
+    image, names = denoised_with_names("bdpm", scene)
+    apart, whole = (
+        np.mean((mis_integrators.denoise(image, scene, channels=given)[..., :3] - truth) ** 2)
+        for given in (names, ())
+    )
+    assert apart < 0.1 * whole
+
+
+def test_path_under_bdpm_auto_has_no_direct_light_apart(rgb):
+    """Its channels are there, and empty: all light is denoised."""
+    scene = lamp_in_a_box(rgb)
+    integrator = mi.load_dict({"type": "bdpm_auto", "max_depth": 2, "denoised": True})
+    session = integrator.session(scene, seed=1, spp=4)
+    for _ in range(4):
+        session.iterate()
+    image, names = session.image(), session.channels
+    assert session.decision.plugin == "path"
+    assert not image[..., names.index("direct_light.R") :].any()
+    np.testing.assert_array_equal(
+        mis_integrators.denoise(image, scene, channels=names), mis_integrators.denoise(image, scene)
+    )
+
+
+def test_names_of_another_number_of_channels_are_refused(rgb):
+    with pytest.raises(ValueError, match="2 names of channels for an image of shape"):
+        mis_integrators.denoise(np.zeros((4, 4, 3)), channels=["R", "G"])
+
+
 # --- the command ---------------------------------------------------------------------------------
 
 
@@ -199,8 +293,10 @@ def test_integrators_are_told(scene, tmp_path, arguments, told):
         assert read(tmp_path / "a.exr")[0]["denoised"] == 0
 
 
-def test_like_denoises_again(scene, tmp_path):
-    assert render(scene, "-o", tmp_path / "a.exr", "--denoise") == 0
+@pytest.mark.parametrize("plugin", ["path", "bdpm"])
+def test_like_denoises_again(scene, tmp_path, plugin):
+    arguments = "-i", plugin, "--spp", 4, "-o", tmp_path / "a.exr", "--denoise"
+    assert lamplit.render(scene, *arguments) == 0
     assert lamplit.render(scene, "-o", tmp_path / "b.exr", "--like", tmp_path / "a.exr") == 0
     for name in (".exr", ".denoised.exr"):
         assert same(read(tmp_path / f"a{name}")[1], read(tmp_path / f"b{name}")[1])

@@ -1,0 +1,20 @@
+"""Means over windows."""
+
+from mis_integrators.core.windows import window_mean
+
+import numpy as np
+import pytest
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (3, 2), (9, 12), (2, 7, 8)])
+@pytest.mark.parametrize("width", [1, 3, 5])
+def test_every_window_by_itself(shape, width):
+    values, reach = np.random.default_rng(3).normal(size=shape), width // 2
+    height, across = shape[-2:]
+    found = window_mean(values, width)
+    for y in range(height):
+        for x in range(across):
+            window = values[
+                ..., max(y - reach, 0) : y + reach + 1, max(x - reach, 0) : x + reach + 1
+            ]
+            np.testing.assert_allclose(found[..., y, x], window.mean(axis=(-2, -1)), atol=1e-12)
