@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import signal
 import sys
 import time
@@ -160,7 +161,10 @@ def iterate(
             for remark in getattr(session, "remarks", []):
                 progress.say(remark)
         progress.update(
-            session.iterations, clock.rendering, target.share_done() if target else None
+            session.iterations,
+            clock.rendering,
+            target.share_done() if target else None,
+            target.error if target else math.inf,
         )
         for chore in chores:
             chore.when_due()
