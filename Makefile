@@ -3,6 +3,7 @@
 # make test-all the same with all extended cases (half an hour; what continuous integration runs)
 # make mutants  set everything up, then see how many of forty errors the tests find (a quarter of an hour)
 # make bench    set everything up, then compare all methods on all bundled scenes: out/bench/index.html (half an hour to three quarters)
+# make figures set everything up, then measure all figures of docs/results.md anew (half an hour)
 # make lint     set everything up, then check style, layout and type hints
 # make gallery  set everything up, then render the pictures of docs/ (minutes)
 # make docs     set everything up, then build the documentation site: out/site/index.html
@@ -11,7 +12,7 @@ PYTHON ?= python3
 VENV := .venv
 SETUP := tools/setup.sh
 
-.PHONY: render test test-all mutants lint bench gallery docs clean
+.PHONY: render test test-all mutants lint bench figures gallery docs clean
 .DELETE_ON_ERROR:
 
 render: $(VENV)/installed
@@ -46,6 +47,10 @@ bench: $(VENV)/installed
 	$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check --editable '.[bench]'
 	$(VENV)/bin/python benchmarks/run.py references --out out/bench
 	$(VENV)/bin/python benchmarks/run.py page --out out/bench
+
+figures: $(VENV)/installed
+	$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check --editable '.[bench,denoise]'
+	$(VENV)/bin/python benchmarks/run.py figures
 
 $(VENV)/installed: pyproject.toml $(SETUP)
 	@$(SETUP) $(PYTHON) $(VENV)

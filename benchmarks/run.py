@@ -23,6 +23,7 @@ from experiments import (  # noqa: E402
     constants,
     converge,
     costs,
+    figures,
     freezing,
     multiview,
     opinions,
@@ -282,6 +283,12 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument(
         "--charts", action="store_true", help="draw the shifted densities (needs matplotlib)"
     )
+    command.add_argument(
+        "--no-shifts",
+        dest="shifts",
+        action="store_false",
+        help="do not count what each shift loses",
+    )
 
     command = _measuring(commands, "costs", costs)
     command.add_argument(
@@ -348,6 +355,41 @@ def _parser() -> argparse.ArgumentParser:
         help="count seconds of all processors together, for machines that do other work too",
     )
     references.add_options(command)
+
+    command = _measuring(commands, "figures", figures)
+    command.add_argument(
+        "--only",
+        nargs="+",
+        choices=figures.PARTS,
+        metavar="PART",
+        help=f"measure these anew, and keep the others: {' '.join(figures.PARTS)}",
+    )
+    command.add_argument(
+        "--file",
+        type=Path,
+        default=figures.FIGURES,
+        metavar="FILE.json",
+        help="where figures are kept; tables are written into FILE.md if there is one, and "
+        "pictures into images beside it (default: docs/results.json)",
+    )
+    command.add_argument(
+        "--page", action="store_true", help="only write the page's tables from the figures"
+    )
+    command.add_argument(
+        "--time",
+        type=_positive,
+        metavar="SECONDS",
+        help="of each render, in place of the parts' own: to try the command",
+    )
+    references.add_folder(command)
+    command.add_argument(
+        "--reference-time",
+        type=_positive,
+        default=30,
+        metavar="SECONDS",
+        help="rendering seconds at most of each of the two references (default: 30)",
+    )
+    command.set_defaults(parse=parser.parse_args, out=Path("out/figures"))
 
     command = _measuring(commands, "views", view_counts, scenes=False)
     _views(command, view_counts.COUNTS, 0.25, 3, 1)

@@ -491,13 +491,15 @@ def test_type_hints_are_right(tmp_path):
     assert result.returncode == 0, result.stdout
 
 
-def test_wheel_holds_every_file(tmp_path):
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory) -> Path:
     """Built without isolation: it needs no network, but a recent setuptools, which extra `test`
     brings."""
     setuptools = pytest.importorskip("setuptools")
     if int(setuptools.__version__.split(".")[0]) < 77:
         pytest.skip("setuptools is older than pyproject.toml asks for")
-    source = tmp_path / "source"
+    folder = tmp_path_factory.mktemp("wheel")
+    source = folder / "source"
     shutil.copytree(ROOT / "mis_integrators", source / "mis_integrators")
     for name in ("pyproject.toml", "README.md", "LICENSE", "mis_render.py"):
         shutil.copy(ROOT / name, source)
@@ -511,13 +513,17 @@ def test_wheel_holds_every_file(tmp_path):
             "--no-deps",
             "--no-build-isolation",
             "--wheel-dir",
-            tmp_path,
+            folder,
             source,
         ],
         check=True,
         timeout=300,
     )
-    (wheel,) = tmp_path.glob("*.whl")
+    (built,) = folder.glob("*.whl")
+    return built
+
+
+def test_wheel_holds_every_file(wheel):
     names = set(zipfile.ZipFile(wheel).namelist())
     assert {file.relative_to(ROOT).as_posix() for file in package_files()} | {
         "mis_render.py"
@@ -526,3 +532,39 @@ def test_wheel_holds_every_file(tmp_path):
     assert "mis-render = mis_render:main" in zipfile.ZipFile(wheel).read(entry_points).decode()
     assert any(name.endswith("licenses/LICENSE") for name in names)
     assert "mis_integrators/py.typed" in names
+
+
+@pytest.mark.extended
+def test_wheel_renders_without_the_checkout(wheel, tmp_path):
+    """Installed into an environment of its own, which has nothing of this checkout: the command
+    renders, and the doctor finds nothing wrong. Dependencies are those of this environment, so that
+    it needs no network."""
+    subprocess.run([sys.executable, "-m", "venv", tmp_path / "venv"], check=True, timeout=100)
+    programs = tmp_path / "venv" / "bin"
+    (packages,) = (tmp_path / "venv" / "lib").glob("python*/site-packages")
+    # Python reads no .pth files of folders that a .pth file names: not that of an editable install.
+    (packages / "dependencies.pth").write_text(f"{sysconfig.get_path('purelib')}\n")
+    clean = {k: v for k, v in os.environ.items() if not k.startswith("PYTHON")}
+
+    def run(*command) -> str:
+        result = subprocess.run(
+            [*map(str, command)],
+            cwd=tmp_path,
+            env=clean,
+            capture_output=True,
+            text=True,
+            timeout=200,
+        )
+        assert result.returncode == 0, result.stdout + result.stderr
+        return result.stdout
+
+    run(programs / "python", "-m", "pip", "install", "--quiet", "--no-index", "--no-deps", wheel)
+    where = (
+        "import mis_integrators, mis_render; print(mis_integrators.__file__, mis_render.__file__)"
+    )
+    assert run(programs / "python", "-c", where).count(str(packages)) == 2
+    shutil.copy(ROOT / "scenes" / "cornell_point.xml", tmp_path / "scene.xml")
+    small = "-D", "resx=16", "-D", "resy=16", "--spp", 1, "--quiet"
+    run(programs / "mis-render", "scene.xml", "-i", "bdpm", *small)
+    assert (tmp_path / "scene.exr").exists() and (tmp_path / "scene.png").exists()
+    run(programs / "python", "-m", "mis_integrators", "doctor")

@@ -71,8 +71,8 @@ def document(rows: Sequence[Row], settings: Mapping) -> dict:
 
 
 def commit() -> str | None:
-    """The commit of this checkout, with a "+" if files differ from it; ``None`` outside a
-    repository."""
+    """The commit of this checkout, with a "+" if files other than documentation differ from it;
+    ``None`` outside a repository."""
 
     def git(*arguments):
         return subprocess.run(
@@ -85,7 +85,9 @@ def commit() -> str | None:
 
     try:
         return git("rev-parse", "--short=12", "HEAD") + (
-            "+" if git("status", "--porcelain", "--untracked-files=no") else ""
+            "+"
+            if git("status", "--porcelain", "--untracked-files=no", ":/", ":(top,exclude)docs")
+            else ""
         )
     except (OSError, subprocess.CalledProcessError):
         return None

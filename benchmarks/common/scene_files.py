@@ -42,7 +42,7 @@ class OpenScene:
         """The file's name, or its folder's where all files are called ``scene.xml``."""
         if self.path is None:
             return self.title
-        return self.path.resolve().parent.name if self.path.stem == "scene" else self.path.stem
+        return name_of(self.path)
 
     @property
     def sensor(self) -> mi.Sensor:
@@ -68,6 +68,11 @@ class OpenScene:
     @property
     def pixels(self) -> int:
         return self.size[0] * self.size[1]
+
+
+def name_of(path: Path) -> str:
+    """What a scene's file is called, or its folder where all files are called ``scene.xml``."""
+    return path.resolve().parent.name if path.stem == "scene" else path.stem
 
 
 def bundled() -> list[Path]:

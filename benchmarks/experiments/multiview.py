@@ -120,9 +120,10 @@ def run(options: argparse.Namespace) -> None:
         rows += compare(path, options)
         show("Variance x time of volpath_multiview over that of volpath", rows)
         save(options.out, "multiview", rows, vars(options))
-    shares = [share for path in options.scenes for share in invalid_shifts(path, options)]
-    show("Connections of one iteration", shares)
-    save(options.out, "multiview_shifts", shares, vars(options))
+    if options.shifts:
+        shares = [share for path in options.scenes for share in invalid_shifts(path, options)]
+        show("Connections of one iteration", shares)
+        save(options.out, "multiview_shifts", shares, vars(options))
     if options.charts:
         draw_densities(options.out / "multiview_densities.png")
 

@@ -18,7 +18,7 @@ import numpy as np
 from ..core.session import Session
 from ..core.traits import unfinite_data
 from ..core.untrusted import Malformed
-from . import checkpoint, cluster, compare, denoising, loading, output, reproduce
+from . import checkpoint, cluster, compare, denoising, loading, output, reproduce, tev
 from .checkpoint import Checkpoint, CheckpointError
 from .options import parse, versions
 from .progress import Progress, complain
@@ -35,6 +35,10 @@ EXIT_OK, EXIT_SCENE, EXIT_USAGE, EXIT_OUTPUT, EXIT_CHECKPOINT, EXIT_CLUSTER, EXI
     5,
     130,
 )
+
+
+TEV_SECONDS = 1.0
+"""Between two images in tev."""
 
 
 class Failure(Exception):
@@ -59,7 +63,8 @@ def main(arguments: list[str] | None = None) -> int:
     except BaseException as error:
         # Libraries turn an interrupt that reaches them into errors of any kind.
         if interrupt.stopped or isinstance(error, KeyboardInterrupt):
-            complain(f"interrupted, nothing written{_about_earlier(options)}")
+            left = f"only the preview {interrupt.preview}" if interrupt.preview else "nothing"
+            complain(f"interrupted, {left} written{_about_earlier(options)}")
             return EXIT_INTERRUPTED
         if not isinstance(error, Failure):
             raise
@@ -126,7 +131,14 @@ def _render_alone(options: argparse.Namespace, interrupt: Interrupt) -> int:
                 threads = max(1, dr.thread_count() // options.workers) if options.workers else None
                 session = cluster.DistributedSession(client, opened, keep_variance, threads)
             kept, broken = _render(
-                session, opened.sensor, options, identity, clock, target, interrupt
+                session,
+                opened.sensor,
+                options,
+                identity,
+                clock,
+                target,
+                interrupt,
+                options.output.name,
             )
         except (Failure, MemoryError):
             raise
@@ -222,7 +234,14 @@ def _render_rival(
     as_long = {**vars(options), "time": seconds, "spp": None, "target_error": None}
     session, clock = rival.opened.session, Clock()
     _, broken = _render(
-        session, rival.opened.sensor, argparse.Namespace(**as_long), {}, clock, None, interrupt
+        session,
+        rival.opened.sensor,
+        argparse.Namespace(**as_long),
+        {},
+        clock,
+        None,
+        interrupt,
+        f"{options.output.name}, {options.compare}",
     )
     if broken:
         raise broken
@@ -333,9 +352,11 @@ def _render(
     clock: Clock,
     target: TargetError | None,
     interrupt: Interrupt,
+    title: str,
 ) -> tuple[Path | None, Exception | None]:
     """Iterate as long as the options say; returns the checkpoint that holds all of it, if there is
-    one, and the error that ended it after there was enough for an image, if one did."""
+    one, and the error that ended it after there was enough for an image, if one did. ``title``:
+    the image's name in tev."""
     width, height = sensor.film().crop_size()
     pixels = getattr(session, "pixels", width * height)
     if options.time and hasattr(session, "plan_time"):
@@ -355,22 +376,36 @@ def _render(
             )
         path = checkpoint.beside(options.output)
         keep = Chore(
-            str(path),
+            f"write {path}",
             options.checkpoint or math.inf,
             lambda: _keep(path, identity, session, clock),
             progress.warn,
         )
         preview = options.output.with_suffix(".preview.exr")
         show = Chore(
-            str(preview),
+            f"write {preview}",
             options.preview or math.inf,
-            lambda: _preview(session, options, preview),
+            lambda: _preview(session, options, preview, interrupt),
+            progress.warn,
+        )
+        viewer = tev.Viewer(options.tev, title) if options.tev else None
+        watch = Chore(
+            f"show the image in tev at {viewer.address}" if viewer else "",
+            (options.preview or TEV_SECONDS) if viewer else math.inf,
+            lambda: _show(session, options, viewer),
             progress.warn,
         )
         broken = None
         try:
             iterate(
-                session, planned, options.time, target, clock, [keep, show], progress, interrupt
+                session,
+                planned,
+                options.time,
+                target,
+                clock,
+                [keep, show, watch],
+                progress,
+                interrupt,
             )
         except Exception as error:
             if session.iterations < fewest_iterations(session):
@@ -378,6 +413,9 @@ def _render(
                     keep.now()
                 raise
             broken = error
+        if viewer:
+            watch.now()
+            viewer.close()
         if not options.checkpoint:
             return None, broken
         keep.now()
@@ -430,13 +468,30 @@ def _resume(options: argparse.Namespace, identity: dict[str, Any], session: Sess
     return Clock(found.seconds, found.compiling)
 
 
-def _preview(session: Any, options: argparse.Namespace, path: Path) -> None:
+def _preview(session: Any, options: argparse.Namespace, path: Path, interrupt: Interrupt) -> None:
     """Write the image so far, if there is one."""
-    if session.iterations < fewest_iterations(session):
+    image = _image_so_far(session, options)
+    if image is None:
         return
-    image = output.contact_sheet(session.view_images()) if options.all_views else session.image()
     output.write_exr(path, image, session.channels, {"iterations": session.iterations})
+    interrupt.preview = path
     output.write_png(path.with_suffix(".png"), image, session.channels)
+
+
+def _show(session: Any, options: argparse.Namespace, viewer: tev.Viewer | None) -> None:
+    """Show the image so far in the viewer, if there are both."""
+    if viewer:
+        viewer.connect()  # before an image is made for nobody
+        image = _image_so_far(session, options)
+        if image is not None:
+            viewer.show(image, session.channels)
+
+
+def _image_so_far(session: Any, options: argparse.Namespace) -> np.ndarray | None:
+    """The image, if there are iterations enough for one; all views on one sheet if so asked."""
+    if session.iterations < fewest_iterations(session):
+        return None
+    return output.contact_sheet(session.view_images()) if options.all_views else session.image()
 
 
 def _write(

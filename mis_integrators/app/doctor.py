@@ -220,7 +220,8 @@ def probe(variant: str, plugin: str) -> tuple[str, str | None]:
         )
     if done.returncode:
         return "a tiny picture cannot be rendered", _last_line(done.stderr)
-    brightness = float(done.stdout.split("brightness")[1])
+    # Libraries may end what they print with an escape sequence for the terminal's colours.
+    brightness = float(done.stdout.split("brightness")[1].split()[0])
     text = f"renders: a tiny picture with {plugin} has the brightness {brightness:.3f}"
     if abs(brightness - _EXPECTED) > _TOLERANCE * _EXPECTED:
         return (

@@ -18,6 +18,7 @@ MOST_SAMPLES = 2**31 - 1
 MOST_SENSORS = 2**16
 SMALLEST_NUMBER, LARGEST_NUMBER = 1e-9, 1e9
 """Of seconds, and of relative errors."""
+LARGEST_PORT = 2**16 - 1
 MOST_WORKERS = 2**10
 """Processes on this machine at most."""
 
@@ -207,6 +208,14 @@ def _what_is_kept(parser: argparse.ArgumentParser) -> None:
         help="write the image so far to FILE.preview.exr and .png every so many seconds, until "
         "the image is there",
     )
+    add(
+        "--tev",
+        type=_address,
+        metavar="HOST:PORT",
+        help="show the image so far in the viewer tev that listens there (its own default is "
+        "127.0.0.1:14158), every so many seconds as --preview says, else every second, and in "
+        "the end; the render goes on whether one listens or not",
+    )
 
 
 def _where(parser: argparse.ArgumentParser) -> None:
@@ -308,6 +317,15 @@ def _sensor(text: str) -> int:
 
 def _workers(text: str) -> int:
     return _integer_between(text, 1, MOST_WORKERS)
+
+
+def _address(text: str) -> tuple[str, int]:
+    """Host and port; an IPv6 address may stand in brackets."""
+    host, colon, port = text.rpartition(":")
+    host = host.removeprefix("[").removesuffix("]")
+    if not (host and colon and port.isascii() and port.isdigit()):
+        raise argparse.ArgumentTypeError(f"{shown(text)} is not of the form HOST:PORT")
+    return host, _integer_between(port, 1, LARGEST_PORT)
 
 
 def _positive_number(text: str) -> float:

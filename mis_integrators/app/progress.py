@@ -1,6 +1,7 @@
 """Show the progress of a render: a bar on a terminal, now and then a line elsewhere."""
 
 import contextlib
+import math
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -51,9 +52,16 @@ class Progress:
         """Print one line, even if all else is to be quiet."""
         complain(text)
 
-    def update(self, iterations: int, rendering: float, share: float | None = None) -> None:
+    def update(
+        self,
+        iterations: int,
+        rendering: float,
+        share: float | None = None,
+        error: float = math.inf,
+    ) -> None:
         """Show that so many iterations are done, after so many seconds of rendering; ``share`` of
-        the work, if that is known better than by those, is done."""
+        the work, if that is known better than by those, is done. ``error``: the estimated relative
+        error, infinite where there is no estimate."""
         done = max(
             rendering / self._seconds if self._seconds else 0.0,
             iterations / self._planned if self._planned else 0.0,
@@ -66,7 +74,8 @@ class Progress:
         )
         speed = iterations * self._paths() / max(rendering, 1e-9) / 1e6
         of = "" if self._seconds or not self._planned else f"/{self._planned}"
-        text = f"iteration {iterations}{of}, {speed:.2f} M samples/s, {left}"
+        noise = f"relative error {error:.3g}, " if math.isfinite(error) else ""
+        text = f"iteration {iterations}{of}, {speed:.2f} M samples/s, {noise}{left}"
         with _nobody_may_listen():
             self._bar.update(self._task, completed=min(done, 1.0), description=text)
         now = time.monotonic()

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import signal
 import sys
 import time
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import drjit as dr
 
@@ -25,6 +27,8 @@ class Interrupt:
         """Whether there are iterations enough for an image."""
         self.stopped = False
         """Whether an interrupt has stopped what was being done."""
+        self.preview: Path | None = None
+        """The latest preview that this render has written."""
 
     def __enter__(self) -> Interrupt:
         self._previous = {
@@ -85,9 +89,10 @@ class Chore:
     """
 
     def __init__(
-        self, name: str, seconds: float, action: Callable[[], None], complain: Callable[[str], None]
+        self, what: str, seconds: float, action: Callable[[], None], complain: Callable[[str], None]
     ):
-        self._name, self._seconds, self._action, self._complain = name, seconds, action, complain
+        """``what``: what it does, as in "write FILE"."""
+        self._what, self._seconds, self._action, self._complain = what, seconds, action, complain
         self._last = time.monotonic()
         self.failure: str | None = None
         """What went wrong the last time, or ``None``."""
@@ -103,7 +108,7 @@ class Chore:
             self._action()
             self.failure = None
         except OSError as error:
-            failure = f"cannot write {self._name}: {error.strerror or error}"
+            failure = f"cannot {self._what}: {error.strerror or error}"
             if failure != self.failure:
                 self._complain(failure)
             self.failure = failure
@@ -156,7 +161,10 @@ def iterate(
             for remark in getattr(session, "remarks", []):
                 progress.say(remark)
         progress.update(
-            session.iterations, clock.rendering, target.share_done() if target else None
+            session.iterations,
+            clock.rendering,
+            target.share_done() if target else None,
+            target.error if target else math.inf,
         )
         for chore in chores:
             chore.when_due()

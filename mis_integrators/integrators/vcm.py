@@ -140,7 +140,8 @@ class VCMSession(BDPTSession):
 
     def _choose_radius(self, spectral):
         """A share of the spread of the vertices that camera paths meet first: the diagonal, over
-        the root of three, of the box that leaves out 2 % of them at either end of each axis."""
+        the root of three, of the box that leaves out 2 % of them at either end of each axis. Of the
+        scene's bounds where they meet none."""
         self.radius = 1e-3 * float(dr.norm(self.traits.bounds.extents()))
         if not self.bidirectional:
             return
@@ -156,7 +157,10 @@ class VCMSession(BDPTSession):
             )
             if not self._grown("camera", count):
                 break
-        vertices = read_vertices(camera, dr.arange(mi.UInt32, int(count[0])), True, ("p", "number"))
+        found = int(count[0])
+        if not found:
+            return
+        vertices = read_vertices(camera, dr.arange(mi.UInt32, found), True, ("p", "number"))
         points = to_numpy(vertices["p"])[:, np.array(vertices["number"]) == 0]
         if points.shape[1]:
             low, high = np.percentile(points, [2, 98], axis=1)

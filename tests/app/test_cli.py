@@ -606,6 +606,23 @@ def test_second_interrupt_names_the_earlier_checkpoint(scene, tmp_path, capsys, 
     )
 
 
+def test_second_interrupt_names_the_preview(scene, tmp_path, use, capsys):
+    """One that this render has written, and no other."""
+
+    def interrupt(iterations):
+        if iterations == 2:
+            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(signal.SIGINT)
+
+    preview = tmp_path / "a.preview.exr"
+    arguments = "-o", tmp_path / "a.exr", "--quiet", "--preview"
+    for seconds, left in (1e-6, f"only the preview {preview}"), (1e6, "nothing"):
+        use(FakeSession(on_iteration=interrupt))
+        assert render(scene, *arguments, seconds) == 130
+        assert capsys.readouterr().err == f"mis-render: interrupted, {left} written\n"
+        assert preview.exists() and not (tmp_path / "a.exr").exists()
+
+
 def test_interrupt_before_the_first_iteration_writes_nothing(scene, tmp_path, use, capsys):
     use(FakeSession(on_iteration=lambda _: signal.raise_signal(signal.SIGINT)))
     assert render(scene, "-o", tmp_path / "a.exr") == 130

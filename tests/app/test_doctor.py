@@ -64,6 +64,7 @@ def test_library_that_does_not_exist(tmp_path):
         ("print('brightness', 1.7)", "but 2.000 is right", "report"),
         ("raise ValueError('no such thing')", "cannot be rendered", "ValueError: no such thing"),
         ("print('brightness', 1.98)", "brightness 1.980", None),
+        (r"print('brightness', 1.98, '\n\x1b[0m')", "brightness 1.980", None),
     ],
 )
 def test_what_a_render_may_come_to(monkeypatch, code, text, advice):

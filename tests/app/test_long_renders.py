@@ -3,6 +3,7 @@ rendered is lost, and nothing is summed twice."""
 
 import errno
 import os
+import re
 import resource
 import signal
 import subprocess
@@ -617,6 +618,17 @@ def test_estimated_error_is_the_error(scene, plugin, parameters):
         error = (images[seed] - others) ** 2 * 12 / 13
         ratios.append(stopping.relative_error(others, error) / estimate)
     assert abs(np.mean(ratios) - 1) < 0.25, ratios
+
+
+def test_progress_has_the_estimated_error(scene, tmp_path, capsys, monkeypatch):
+    """From the first estimate on; it falls, and the last one is that before the image's own."""
+    monkeypatch.setattr("mis_integrators.app.progress.SECONDS_BETWEEN_LINES", 0.0)
+    assert render(scene, "-o", tmp_path / "a.exr", "--target-error", 0.02) == 0
+    *lines, last = capsys.readouterr().err.splitlines()
+    found = [re.search(r"relative error ([\d.]+)", line) for line in (*lines, last)]
+    assert found[0] is None and all(found[stopping.FEWEST_ITERATIONS :])
+    first, *_, shown, final = (float(match[1]) for match in found if match)
+    assert first > shown > final > shown / stopping.LARGEST_STEP
 
 
 def test_target_error_stops_the_render(scene, tmp_path, capsys):

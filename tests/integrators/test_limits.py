@@ -7,6 +7,7 @@ from mis_integrators.core.traits import UnsupportedScene
 from mis_integrators.paths.camera import film_sample_count
 
 import mitsuba as mi
+import numpy as np
 import pytest
 
 MOST_LIGHT_PATHS = 2**28
@@ -199,3 +200,29 @@ def test_huge_number_that_fits_a_float(rgb):
         and type(loading.parse_value("1" + 20 * "0")) is float
     )
     assert loading.parse_value(str(2**63 - 1)) == 2**63 - 1
+
+
+# --- Scenes with nothing to gather at -----------------------------------------
+
+MIRROR = {"ball": {"type": "sphere", "bsdf": {"type": "conductor", "material": "none"}}}
+
+
+@pytest.mark.parametrize("shapes", [{}, MIRROR], ids=["none", "a mirror"])
+@pytest.mark.parametrize("plugin", _plugins.PLUGINS)
+def test_scene_without_smooth_surfaces(rgb, plugin, shapes):
+    """A sky of one radiance, and nothing else but perhaps a perfect mirror: every pixel has it."""
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "sky": {"type": "constant", "radiance": {"type": "rgb", "value": [0.25, 0.5, 2]}},
+            "integrator": {"type": plugin, "max_depth": 4},
+            "sensor": {
+                "type": "perspective",
+                "to_world": mi.ScalarTransform4f().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0]),
+                "film": {"type": "hdrfilm", "width": 8, "height": 6, "rfilter": {"type": "box"}},
+            },
+            **shapes,
+        }
+    )
+    image = np.array(mi.render(scene, spp=4))[..., :3]
+    np.testing.assert_allclose(image, np.broadcast_to([0.25, 0.5, 2], (6, 8, 3)), rtol=1e-4)

@@ -33,7 +33,7 @@ def _rgb(rgb):
 
 def test_kernels_do_not_know_where_numpy_keeps_numbers():
     """Arrays that begin at other addresses, modulo the alignment that vector loads want, are read
-    by one kernel."""
+    by one kernel, which is that of Dr.Jit's own arrays."""
     numbers, kernels = np.arange(1000, dtype=np.float32), set()
     for offset in range(16):
         array = packing.from_numpy(mi.Float, numbers[offset : offset + 400])
@@ -42,7 +42,22 @@ def test_kernels_do_not_know_where_numpy_keeps_numbers():
         np.testing.assert_array_equal(
             packing.to_numpy(records).T.ravel(), numbers[offset : offset + 400] + 1
         )
+    own = dr.arange(mi.Float, 400) + dr.opaque(mi.Float, 1)
+    dr.eval(own)
+    records = dr.gather(mi.Vector4f, own, dr.arange(mi.UInt32, 100)) + 1
+    kernels |= kernels_of(lambda: dr.eval(records))
     assert len(kernels) == 1
+
+
+def test_numbers_from_numpy_are_a_copy():
+    """What becomes of NumPy's array is of no consequence, though Dr.Jit may not have read it."""
+    numbers = np.arange(400, dtype=np.float32)
+    array = packing.from_numpy(mi.Float, numbers)
+    numbers[:] = -1
+    del numbers
+    junk = [np.full(500, -1, np.float32) for _ in range(100)]
+    np.testing.assert_array_equal(np.array(array + 0), np.arange(400))
+    assert len(junk) == 100
 
 
 def query_counts(photons, queries, radii, cell, capacity=None, low=None, high=None):
