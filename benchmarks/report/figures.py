@@ -30,6 +30,25 @@ def draw_convergence_of_samplers(path: Path, rows: Sequence[Mapping]) -> None:
     charts.save(charts.convergence_of_samplers(rows), path)
 
 
+def draw_mape_over_time(path: Path, rows: Sequence[Mapping]) -> None:
+    """MAPE of several methods against rendering seconds: rows as of
+    `experiments.published.over_time`."""
+    import matplotlib.pyplot as plt
+
+    figure, axis = plt.subplots(figsize=(7, 4.5))
+    for method in dict.fromkeys(row["method"] for row in rows):
+        mine = [row for row in rows if row["method"] == method]
+        axis.loglog(
+            [row["seconds"] for row in mine], [row["MAPE"] for row in mine], "o-", label=method
+        )
+    axis.set(xlabel="rendering time [s]", ylabel="MAPE", title=rows[0]["scene"])
+    axis.legend(fontsize=7)
+    figure.tight_layout()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=130)
+    plt.close(figure)
+
+
 def draw_densities(path: Path) -> None:
     """Figure 3 of the paper: densities of interactions shifted from a segment on [0, 9] to one on
     [0, 3], next to the target's own: tentative, null and real."""
