@@ -303,6 +303,11 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument(
         "--charts", action="store_true", help="draw the shifted densities (needs matplotlib)"
     )
+    command.add_argument(
+        "--shifts",
+        action="store_true",
+        help="compare the six shifts instead: variance, seconds, lost shares",
+    )
 
     command = _measuring(commands, "costs", costs)
     command.add_argument(

@@ -4,7 +4,8 @@ shifts.
 
 Variances are those of whole renders under different seeds, so they need no reference; each is
 divided by the squared mean + 0.01 before it is averaged over pixels. With `--charts`, Figure 3 of
-the paper is drawn: shifted densities.
+the paper is drawn: shifted densities. With `--shifts` the six shifts are compared instead of the
+weights.
 """
 
 from __future__ import annotations
@@ -115,6 +116,13 @@ class Apart:
 
 def run(options: argparse.Namespace) -> None:
     """The sub-command ``multiview``."""
+    if options.shifts:
+        table: list[Row] = []
+        for path in options.scenes:
+            table += compare_shifts(path, options)
+            show("Shifts: ratios to volpath, and lost shares", table)
+            save(options.out, "multiview_shift_table", table, vars(options))
+        return
     rows: list[Row] = []
     for path in options.scenes:
         rows += compare(path, options)
@@ -209,6 +217,36 @@ def compare(path: Path, options: argparse.Namespace) -> list[Row]:
             }
         )
     return rows
+
+
+def compare_shifts(path: Path, options: argparse.Namespace) -> list[Row]:
+    """A row for each shift: variance of a camera path, seconds of one, and their product, over
+    those of `volpath`; the share of connections that the shift loses, of those that see the
+    pivot."""
+    scene, parameters = load(path, options.scale)
+    methods = {shift: {"shift": shift} for shift in SHIFTS}
+    run = race(scene, parameters, methods, path.stem, options)
+    lost = {row["shift"]: row["invalid"] for row in invalid_shifts(path, options)}
+
+    def variance(name: str) -> float:
+        return float(run.noise(name).mean()) * run.samples(name)
+
+    def seconds(name: str) -> float:
+        return run.seconds(name) / run.samples(name)
+
+    return [
+        {
+            "scene": path.stem,
+            "views": run.views,
+            "shift": shift,
+            "variance": variance(shift) / variance("volpath"),
+            "seconds": seconds(shift) / seconds("volpath"),
+            "variance x time": run.cost(shift) / run.cost("volpath"),
+            "lost": lost[shift],
+            "mean ratio": float(np.mean(run.images[shift]) / run.mean.mean()),
+        }
+        for shift in SHIFTS
+    ]
 
 
 def equal_time(contenders: dict, seed: int, seconds: float) -> dict[str, float]:
