@@ -27,7 +27,14 @@ import numpy as np
 from common.races import Race
 from common.rows import Row, save, show, tell
 from common.scene_files import BUNDLED
-from report.figures import draw_densities
+from report.figures import (
+    BASE_MAJORANTS,
+    STRETCHES,
+    TARGET,
+    base_segment,
+    draw_densities,
+    own_densities,
+)
 
 SCENES = sorted((BUNDLED / "multiview").glob("*.xml"))
 SLICE_SECONDS = 0.3
@@ -133,6 +140,40 @@ def run(options: argparse.Namespace) -> None:
     save(options.out, "multiview_shifts", shares, vars(options))
     if options.charts:
         draw_densities(options.out / "multiview_densities.png")
+        distances = density_distances()
+        show("Distance of shifted densities from the target's own", distances)
+        save(options.out, "multiview_densities", distances, vars(options))
+
+
+def density_distances() -> list[Row]:
+    """Total variation distances, in the figure of the shifted densities, of the density that a
+    stretch brings to the target from the target's tentative, null and real ones; all of them
+    normalised."""
+    grid = np.linspace(0, 3, 3001)
+    middle, step = 0.5 * (grid[1:] + grid[:-1]), grid[1] - grid[0]
+    tentative, null, real = (
+        density / (density.sum() * step) for density in own_densities(TARGET, 3.0, middle)
+    )
+    rows: list[Row] = []
+    for majorant in BASE_MAJORANTS:
+        base = base_segment(majorant)
+        t = np.linspace(1e-4, 9 - 1e-4, 200_000)
+        first = own_densities(base, 9.0, t)[0]
+        for name in STRETCHES:
+            at = SHIFTS[name](base, TARGET, t).t
+            shifted = np.histogram(at, grid, weights=first)[0]
+            shifted = shifted / (shifted.sum() * step)
+            rows.append(
+                {
+                    "base majorant": 1.5 * majorant,
+                    "stretch": name,
+                    **{
+                        what: float(0.5 * np.abs(shifted - own).sum() * step)
+                        for what, own in (("tentative", tentative), ("null", null), ("real", real))
+                    },
+                }
+            )
+    return rows
 
 
 def load(path: Path, scale: float, count: int | None = None):

@@ -104,9 +104,11 @@ def over_time(opened: OpenScene, references: References, options: argparse.Names
             )
     rows: list[Row] = []
     for label, runs in found.items():
-        for number in range(min(len(run) for run in runs)):
+        # A slow start may leave out the first mark: renders are paired from the end.
+        common = min(len(run) for run in runs)
+        for number in range(-common, 0):
             at = [run[number] for run in runs]
-            last = number == min(len(run) for run in runs) - 1
+            last = number == -1
             ratio = ratio_interval(
                 [run[-1][1] for run in runs], [run[-1][1] for run in found[BASE]]
             )

@@ -10,6 +10,25 @@ from mis_integrators.volume.shifts import SHIFTS, Sections, majorant_at, optical
 
 import numpy as np
 
+STRETCHES = "majorant_optical_depth", "raw_depth", "primary_sample"
+TARGET = Sections([0.0], [3.0], [2.0])
+"""The target segment of the paper's Figure 3, on [0, 3]."""
+BASE_MAJORANTS = 0.2, 0.7, 2.0
+"""Mean majorants of the base segments [1/m]."""
+
+
+def base_segment(majorant: float) -> Sections:
+    """A base segment, on [0, 9], whose majorant falls to a third in its middle."""
+    return Sections([0.0, 4.5], [4.5, 9.0], [majorant * 1.5, majorant * 0.5])
+
+
+def own_densities(sections: Sections, end: float, t: np.ndarray) -> list[np.ndarray]:
+    """Densities at t of the first tentative interaction on a segment of length `end`, and of its
+    being null and real, for an extinction that varies below the majorant."""
+    tentative = majorant_at(sections, t) * np.exp(-optical_depth(sections, t))
+    real = 0.5 + 0.4 * np.sin(7.5 * t / end)  # extinction over majorant
+    return [tentative, tentative * (1 - real), tentative * real]
+
 
 def draw_variance_maps(
     path: Path, labels: Sequence[str], images: Sequence, maps: Sequence, ratios: Sequence[float]
@@ -55,22 +74,21 @@ def draw_densities(path: Path) -> None:
     on the target, and those that the shifts bring there; S(t); |S'(t)|."""
     import matplotlib.pyplot as plt
 
-    target = Sections([0.0], [3.0], [2.0])
     rows = ("densities on the base [1/m]", "densities on the target [1/m]", "S(t) [m]", "|S'(t)|")
     figure, axes = plt.subplots(len(rows), 3, figsize=(12, 12), sharey="row")
     for axis, name in zip(axes[:, 0], rows):
         axis.set_ylabel(name)
-    for column, majorant in zip(axes.T, (0.2, 0.7, 2.0)):
-        base = Sections([0.0, 4.5], [4.5, 9.0], [majorant * 1.5, majorant * 0.5])
+    for column, majorant in zip(axes.T, BASE_MAJORANTS):
+        base = base_segment(majorant)
         on_base, on_target, place, derivative = column
         on_base.set_title(f"base majorant {1.5 * majorant:.2g}, then {0.5 * majorant:.2g} [1/m]")
         _draw_own_densities(on_base, base, 9.0)
-        _draw_own_densities(on_target, target, 3.0)
+        _draw_own_densities(on_target, TARGET, 3.0)
         t = np.linspace(1e-4, 9 - 1e-4, 4000)
         t = t[np.abs(t - 4.5) > 2e-3]  # at the jump of the majorant
-        free_flight = majorant_at(base, t) * np.exp(-optical_depth(base, t))
-        for name in ("raw_depth", "majorant_optical_depth", "primary_sample"):
-            shifted, label = SHIFTS[name](base, target, t), name.replace("_", " ")
+        free_flight = own_densities(base, 9.0, t)[0]
+        for name in STRETCHES:
+            shifted, label = SHIFTS[name](base, TARGET, t), name.replace("_", " ")
             # Density at t' of the first interaction that the base places: p(t) / |S'|.
             on_target.plot(shifted.t, free_flight / shifted.jacobian, label=label)
             place.plot(t, shifted.t, label=label)
@@ -88,11 +106,8 @@ def draw_densities(path: Path) -> None:
 
 
 def _draw_own_densities(axis, sections: Sections, end: float) -> None:
-    """Densities of the first tentative interaction on a segment, and of its being null and real,
-    for an extinction that varies below the majorant."""
+    """The curves of `own_densities`."""
     t = np.linspace(1e-4, end - 1e-4, 1200)
-    tentative = majorant_at(sections, t) * np.exp(-optical_depth(sections, t))
-    real = 0.5 + 0.4 * np.sin(7.5 * t / end)  # extinction over majorant
-    axis.plot(t, tentative, "k", label="tentative")
-    axis.plot(t, tentative * (1 - real), "k--", label="null")
-    axis.plot(t, tentative * real, "k:", label="real")
+    names = "tentative", "null", "real"
+    for name, style, density in zip(names, ("k", "k--", "k:"), own_densities(sections, end, t)):
+        axis.plot(t, density, style, label=name)
