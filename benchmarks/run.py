@@ -196,6 +196,27 @@ def _parser() -> argparse.ArgumentParser:
     command.set_defaults(scenes=[path for path in bundled() if path.stem == "door"])
     _resampling(command, 2.0)
     command.add_argument("--coarse", action="store_true", help="only every other value of a sweep")
+    command.add_argument(
+        "--published",
+        action="store_true",
+        help="the papers' own weights, in these sweeps, and the papers' other experiments",
+    )
+    command.add_argument(
+        "--published-parts",
+        nargs="*",
+        choices=["time", "Q", "ladder"],
+        default=["time", "Q", "ladder"],
+        metavar="PART",
+        help="MAPE over time, the spread of the estimates of Q, and the changes of the bounded "
+        "form one at a time (default: time Q ladder)",
+    )
+    command.add_argument(
+        "--published-time",
+        type=_positive,
+        default=60,
+        metavar="SECONDS",
+        help="seconds of MAPE over time (default: 60)",
+    )
     references.add_options(command)
 
     command = _measuring(commands, "radius", radius)
@@ -284,8 +305,13 @@ def _parser() -> argparse.ArgumentParser:
         "--charts", action="store_true", help="draw the shifted densities (needs matplotlib)"
     )
     command.add_argument(
-        "--no-shifts",
-        dest="shifts",
+        "--shifts",
+        action="store_true",
+        help="compare the six shifts instead: variance, seconds, lost shares",
+    )
+    command.add_argument(
+        "--no-lost-shares",
+        dest="lost_shares",
         action="store_false",
         help="do not count what each shift loses",
     )

@@ -1,5 +1,5 @@
 """Write the meshes (PLY), textures (PNG) and the sky (EXR) of the bundled scenes, and the scenes
-with several views.
+with several views and outdoors.
 
     python scenes/generate.py
 
@@ -11,6 +11,7 @@ the images.
 from pathlib import Path
 
 import generate_multiview
+import generate_outdoor
 import mitsuba as mi
 import numpy as np
 
@@ -359,6 +360,7 @@ def main():
     patina()
     sky()
     generate_multiview.main()
+    generate_outdoor.main(write_ply)
 
 
 if __name__ == "__main__":

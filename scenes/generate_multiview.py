@@ -81,6 +81,24 @@ SMOKE = """  <medium type="heterogeneous" id="smoke">
 """
 
 
+CLOUD = """  <medium type="heterogeneous" id="smoke_{name}">
+    <volume type="gridvolume" name="sigma_t">
+      <string name="filename" value="smoke.vol"/>
+      <transform name="to_world"><translate x="-0.5" y="-0.5" z="-0.5"/>\
+<scale value="1.1"/><translate x="{x}" y="0.75"/></transform>
+    </volume>
+    <volume type="constvolume" name="albedo"><rgb name="value" value="{albedo}"/></volume>
+    <float name="scale" value="{scale}"/>
+    <phase type="hg"><float name="g" value="{g}"/></phase>
+  </medium>
+  <shape type="cube" id="container_{name}">
+    <transform name="to_world"><scale value="0.55"/><translate x="{x}" y="0.75"/></transform>
+    <bsdf type="null"/>
+    <ref name="interior" id="smoke_{name}"/>
+  </shape>
+"""
+
+
 def numbers(values):
     return ", ".join(f"{float(x):.5g}" for x in values)
 
@@ -237,6 +255,36 @@ def main():
         (64, 64),
         64,
         [thick, *flight(), FLOOR, lamp, sky],
+    )
+    write(
+        "three_media",
+        [
+            "Three clouds in a row, majorants apart by factors of six: thin, middling, dense.",
+            "",
+            "Views from both ends look through all three of them, those across through one:",
+            "raw depth and majorant optical depth then put null interactions to different places.",
+        ],
+        (512, 64),
+        32,
+        [
+            batch(
+                [
+                    camera(f"view{i}", (4.2 * np.sin(a), 1.3, 4.2 * np.cos(a)), (0, 0.6, 0), 46)
+                    for i, a in enumerate(np.radians([-95, -75, -45, -10, 15, 50, 80, 100]))
+                ]
+            ),
+            *(
+                CLOUD.format(name=name, x=x, scale=scale, albedo=albedo, g=g)
+                for name, x, scale, albedo, g in (
+                    ("thin", -1.3, 0.6, "0.95, 0.9, 0.85", 0.0),
+                    ("middling", 0.0, 3.6, "0.95, 0.94, 0.92", 0.4),
+                    ("dense", 1.3, 21.6, "0.85, 0.9, 0.95", 0.2),
+                )
+            ),
+            FLOOR,
+            lamp,
+            sky,
+        ],
     )
     write(
         "apart",

@@ -31,10 +31,10 @@ def test_mutation_can_be_made(mutation):
 
 
 def test_mutations_are_spread():
-    """Three at least in each of ten packages, and no two alike."""
+    """Three at least in each of eleven packages, and no two alike."""
     counts = Counter(m.file.partition("/")[0] for m in MUTATIONS)
-    assert len(counts) == 10 and min(counts.values()) >= 3
-    assert len(MUTATIONS) == 40 and len({m.name for m in MUTATIONS}) == 40
+    assert len(counts) == 11 and min(counts.values()) >= 3
+    assert len(MUTATIONS) >= 40 and len({m.name for m in MUTATIONS}) == len(MUTATIONS)
 
 
 def test_text_that_is_gone_is_said():

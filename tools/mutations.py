@@ -1,4 +1,4 @@
-"""Forty errors that the tests must find, one change of one line each: `mutants.py` makes them.
+"""Errors that the tests must find, one change of one line each: `mutants.py` makes them.
 
 Each is really wrong: it moves a mean, a density, a law or a promise, none is the same program in
 other words. `tests` are what should find it, as pytest takes them.
@@ -68,6 +68,13 @@ MUTATIONS = [
     ),
     Mutation(
         "weights/resampling.py",
+        "return integrate(conditional / p_camera)",
+        "return integrate(conditional)",
+        "the variance over camera paths forgets how likely each of them is",
+        RESAMPLING,
+    ),
+    Mutation(
+        "weights/resampling.py",
         "x = at_most(ratio, LARGEST_RATIO) * (N / M)",
         "x = at_most(ratio, LARGEST_RATIO) / M",
         "several draws count as one",
@@ -101,6 +108,34 @@ MUTATIONS = [
         "return [dr.select(density > 0, theory.reciprocal(density), 0)",
         "light sub-paths' later vertices do not know of the resampling",
         f"{RIS}::test_weights_sum_to_one",
+    ),
+    Mutation(
+        "mis/published.py",
+        "return [*after[:-1], state[2]]",
+        "return [*after[:-1], after[2]]",
+        "what a light vertex sends to cache points holds its own scattering twice",
+        f"{RIS}::test_weights_sum_to_one",
+    ),
+    Mutation(
+        "integrators/resampled.py",
+        "before = iteration - 1 if iteration > 0 else PILOT",
+        "before = iteration",
+        "published weights depend on the light sub-paths that are drawn from",
+        f"{RIS}::test_iterations_in_any_order",
+    ),
+    Mutation(
+        "integrators/resampled.py",
+        'return self.grid.row(z["p"], z["n"] if self.integrator.published else seen_normal(z))',
+        'return self.grid.row(z["p"], seen_normal(z))',
+        "published weights ask other cache points than those that draw",
+        f"{RIS}::test_weights_sum_to_one",
+    ),
+    Mutation(
+        "integrators/resampled.py",
+        "taken = dr.maximum(chance * probability, 1e-20)",
+        "taken = dr.maximum(probability, 1e-20)",
+        "a draw forgets that its cache point was one of several",
+        f"{RIS}::test_point_in_sphere",
     ),
     # ------------------------------------------------------------------ paths
     Mutation(
@@ -220,6 +255,27 @@ MUTATIONS = [
         PATHS,
     ),
     # ------------------------------------------------------------------ resampling
+    Mutation(
+        "resampling/cache_targets.py",
+        "dr.ReduceOp.Add, Q_s, r * (1 / M),",
+        "dr.ReduceOp.Add, Q_s, r,",
+        "Q is a sum over light sub-paths and not their mean",
+        f"{RIS}::test_integrals_in_a_sphere",
+    ),
+    Mutation(
+        "resampling/cache_targets.py",
+        'return dr.select(unblocked(self.scene, z["p"], z["n"], d, distance, active), r, 0)',
+        "return dr.select(active, r, 0)",
+        "weights leave out what stands between a cache point and a light vertex",
+        f"{RIS}::test_weights_sum_to_one",
+    ),
+    Mutation(
+        "resampling/cache_pmfs.py",
+        "drawn = ~real | (dr.gather(mi.Float, self.totals, point, real) > 0)",
+        "drawn = ~real | (dr.gather(mi.Float, self.totals, point, real) >= 0)",
+        "cache points without light draw a light vertex all the same",
+        CACHE,
+    ),
     Mutation(
         "resampling/proposals.py",
         "mean += (1 - share) * dr.maximum(upper - lower, 0)",

@@ -134,7 +134,7 @@ PARTS = {
         bundled=("cornell_point", "cornell_glossy"),
     ),
     "multiview": Part(
-        "multiview --time 3 --seeds 3 --weights mis --no-shifts",
+        "multiview --time 3 --seeds 3 --weights mis --no-lost-shares",
         "multiview",
         ("weights", "views", "ratio", "best view", "worst view"),
     ),

@@ -4,7 +4,8 @@ shifts.
 
 Variances are those of whole renders under different seeds, so they need no reference; each is
 divided by the squared mean + 0.01 before it is averaged over pixels. With `--charts`, Figure 3 of
-the paper is drawn: shifted densities.
+the paper is drawn: shifted densities. With `--shifts` the six shifts are compared instead of the
+weights.
 """
 
 from __future__ import annotations
@@ -26,7 +27,14 @@ import numpy as np
 from common.races import Race
 from common.rows import Row, save, show, tell
 from common.scene_files import BUNDLED
-from report.figures import draw_densities
+from report.figures import (
+    BASE_MAJORANTS,
+    STRETCHES,
+    TARGET,
+    base_segment,
+    draw_densities,
+    own_densities,
+)
 
 SCENES = sorted((BUNDLED / "multiview").glob("*.xml"))
 SLICE_SECONDS = 0.3
@@ -115,17 +123,58 @@ class Apart:
 
 def run(options: argparse.Namespace) -> None:
     """The sub-command ``multiview``."""
+    if options.shifts:
+        table: list[Row] = []
+        for path in options.scenes:
+            table += compare_shifts(path, options)
+            show("Shifts: ratios to volpath, and lost shares", table)
+            save(options.out, "multiview_shift_table", table, vars(options))
+        return
     rows: list[Row] = []
     for path in options.scenes:
         rows += compare(path, options)
         show("Variance x time of volpath_multiview over that of volpath", rows)
         save(options.out, "multiview", rows, vars(options))
-    if options.shifts:
+    if options.lost_shares:
         shares = [share for path in options.scenes for share in invalid_shifts(path, options)]
         show("Connections of one iteration", shares)
         save(options.out, "multiview_shifts", shares, vars(options))
     if options.charts:
         draw_densities(options.out / "multiview_densities.png")
+        distances = density_distances()
+        show("Distance of shifted densities from the target's own", distances)
+        save(options.out, "multiview_densities", distances, vars(options))
+
+
+def density_distances() -> list[Row]:
+    """Total variation distances, in the figure of the shifted densities, of the density that a
+    stretch brings to the target from the target's tentative, null and real ones; all of them
+    normalised."""
+    grid = np.linspace(0, 3, 3001)
+    middle, step = 0.5 * (grid[1:] + grid[:-1]), grid[1] - grid[0]
+    tentative, null, real = (
+        density / (density.sum() * step) for density in own_densities(TARGET, 3.0, middle)
+    )
+    rows: list[Row] = []
+    for majorant in BASE_MAJORANTS:
+        base = base_segment(majorant)
+        t = np.linspace(1e-4, 9 - 1e-4, 200_000)
+        first = own_densities(base, 9.0, t)[0]
+        for name in STRETCHES:
+            at = SHIFTS[name](base, TARGET, t).t
+            shifted = np.histogram(at, grid, weights=first)[0]
+            shifted = shifted / (shifted.sum() * step)
+            rows.append(
+                {
+                    "base majorant": 1.5 * majorant,
+                    "stretch": name,
+                    **{
+                        what: float(0.5 * np.abs(shifted - own).sum() * step)
+                        for what, own in (("tentative", tentative), ("null", null), ("real", real))
+                    },
+                }
+            )
+    return rows
 
 
 def load(path: Path, scale: float, count: int | None = None):
@@ -210,6 +259,36 @@ def compare(path: Path, options: argparse.Namespace) -> list[Row]:
             }
         )
     return rows
+
+
+def compare_shifts(path: Path, options: argparse.Namespace) -> list[Row]:
+    """A row for each shift: variance of a camera path, seconds of one, and their product, over
+    those of `volpath`; the share of connections that the shift loses, of those that see the
+    pivot."""
+    scene, parameters = load(path, options.scale)
+    methods = {shift: {"shift": shift} for shift in SHIFTS}
+    run = race(scene, parameters, methods, path.stem, options)
+    lost = {row["shift"]: row["invalid"] for row in invalid_shifts(path, options)}
+
+    def variance(name: str) -> float:
+        return float(run.noise(name).mean()) * run.samples(name)
+
+    def seconds(name: str) -> float:
+        return run.seconds(name) / run.samples(name)
+
+    return [
+        {
+            "scene": path.stem,
+            "views": run.views,
+            "shift": shift,
+            "variance": variance(shift) / variance("volpath"),
+            "seconds": seconds(shift) / seconds("volpath"),
+            "variance x time": run.cost(shift) / run.cost("volpath"),
+            "lost": lost[shift],
+            "mean ratio": float(np.mean(run.images[shift]) / run.mean.mean()),
+        }
+        for shift in SHIFTS
+    ]
 
 
 def equal_time(contenders: dict, seed: int, seconds: float) -> dict[str, float]:

@@ -1,9 +1,10 @@
 """Does resampling pay: light sub-paths M, draws N, cache points N_c and the target distribution,
-beside `bdpt`, at equal time."""
+beside `bdpt`, at equal time. With `--published` the papers' own weights, and their experiments."""
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 
 from mis_integrators.analysis.confidence import ratio_interval
@@ -17,6 +18,7 @@ from common.references import colours, find_references
 from common.rows import Row, console, save, show, tell
 from common.scene_files import OpenScene, open_scene, scaled_size
 from common.turns import Contender, take_turns
+from experiments import published
 from experiments.sweeps import Sweep
 from report import sections
 from report.page import Page
@@ -41,42 +43,58 @@ COLUMNS = ("sweep", "value", "method", "iterations", *MEASURES, "relMSE ratio")
 def run(options: argparse.Namespace) -> None:
     """The sub-command ``resampling``."""
     page = Page("Resampled connections", options.out / "resampling.html")
-    page.add(section(options.scenes, options))
+    methods = published.METHODS if options.published else METHODS
+    if options.published:
+        for path in options.scenes:
+            opened = open_scene(path, scaled_size(path, options.resampling_scale))
+            published.run_scene(opened, find_references(opened, options, tell), options)
+    if options.parameters:
+        page.add(section(options.scenes, options, methods))
     page.write()
     console.print(f"page: {page.path}")
 
 
-def section(scenes: list[Path], options: argparse.Namespace) -> str:
+def section(
+    scenes: list[Path], options: argparse.Namespace, methods: Sequence[str] = METHODS
+) -> str:
     """The charts of all scenes; the table, CSV and JSON on the way."""
     rows: list[Row] = []
     for path in scenes:
         opened = open_scene(path, scaled_size(path, options.resampling_scale))
-        found = sweep_scene(opened, find_references(opened, options, tell), options)
-        show(f"{opened.name}: ratios to {BASE}, {options.draw_time:g} s each", found, COLUMNS)
+        found = sweep_scene(opened, find_references(opened, options, tell), options, methods)
+        show(f"{opened.name}: ratios to {methods[0]}, {options.draw_time:g} s each", found, COLUMNS)
         rows += found
         save(options.out, "resampling", rows, vars(options))
     parameters = {sweep.name: sweep.what for sweep in SWEEPS}
-    return sections.resampling(rows, METHODS, MEASURES, parameters, options.out)
+    return sections.resampling(rows, methods, MEASURES, parameters, options.out)
 
 
 def sweep_scene(
-    opened: OpenScene, references: References, options: argparse.Namespace
+    opened: OpenScene,
+    references: References,
+    options: argparse.Namespace,
+    methods: Sequence[str] = METHODS,
 ) -> list[Row]:
     """One row a sweep, value and method."""
     rows: list[Row] = []
     for sweep in SWEEPS:
         if sweep.name in options.parameters:
             for value in sweep.chosen(options.coarse):
-                rows += measure_value(opened, references, sweep, value, options)
+                rows += measure_value(opened, references, sweep, value, options, methods)
     return rows
 
 
 def measure_value(
-    opened: OpenScene, references: References, sweep: Sweep, value: int, options: argparse.Namespace
+    opened: OpenScene,
+    references: References,
+    sweep: Sweep,
+    value: int,
+    options: argparse.Namespace,
+    labels: Sequence[str] = METHODS,
 ) -> list[Row]:
     """Rows of one value: every method renders `draw_time` seconds a seed, side by side; first
     iterations, with the pilots of pmfs, are free."""
-    methods = [with_value(parse_method(label), sweep.parameter, value) for label in METHODS]
+    methods = [with_value(parse_method(label), sweep.parameter, value) for label in labels]
     makers = {}
     for method in methods:
         tell(f"{opened.name}: {sweep.name} = {value:g}: compiling {method.label}")
@@ -97,18 +115,20 @@ def measure_value(
         )
         for contender in contenders:
             figures[contender.label].append(judge(contender, references))
-    if BASE not in figures:
+    if labels[0] not in figures:
         return []
     return [
-        row(opened, sweep, value, label, mine, figures[BASE]) for label, mine in figures.items()
+        row(opened, sweep, value, label, mine, figures[labels[0]])
+        for label, mine in figures.items()
     ]
 
 
 def with_value(method: Method, parameter: str, value: int) -> Method:
-    """The method with a parameter set, under its own name; `BASE` as it is."""
+    """The method with a parameter set, under its own name; `bdpt`, which has none of them, as it
+    is."""
     return (
         method
-        if method.label == BASE
+        if method.plugin == BASE
         else Method(method.label, method.plugin, {**method.parameters, parameter: int(value)})
     )
 

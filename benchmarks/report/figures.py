@@ -10,6 +10,25 @@ from mis_integrators.volume.shifts import SHIFTS, Sections, majorant_at, optical
 
 import numpy as np
 
+STRETCHES = "majorant_optical_depth", "raw_depth", "primary_sample"
+TARGET = Sections([0.0], [3.0], [2.0])
+"""The target segment of the paper's Figure 3, on [0, 3]."""
+BASE_MAJORANTS = 0.2, 0.7, 2.0
+"""Mean majorants of the base segments [1/m]."""
+
+
+def base_segment(majorant: float) -> Sections:
+    """A base segment, on [0, 9], whose majorant falls to a third in its middle."""
+    return Sections([0.0, 4.5], [4.5, 9.0], [majorant * 1.5, majorant * 0.5])
+
+
+def own_densities(sections: Sections, end: float, t: np.ndarray) -> list[np.ndarray]:
+    """Densities at t of the first tentative interaction on a segment of length `end`, and of its
+    being null and real, for an extinction that varies below the majorant."""
+    tentative = majorant_at(sections, t) * np.exp(-optical_depth(sections, t))
+    real = 0.5 + 0.4 * np.sin(7.5 * t / end)  # extinction over majorant
+    return [tentative, tentative * (1 - real), tentative * real]
+
 
 def draw_variance_maps(
     path: Path, labels: Sequence[str], images: Sequence, maps: Sequence, ratios: Sequence[float]
@@ -30,40 +49,65 @@ def draw_convergence_of_samplers(path: Path, rows: Sequence[Mapping]) -> None:
     charts.save(charts.convergence_of_samplers(rows), path)
 
 
-def draw_densities(path: Path) -> None:
-    """Figure 3 of the paper: densities of interactions shifted from a segment on [0, 9] to one on
-    [0, 3], next to the target's own: tentative, null and real."""
+def draw_mape_over_time(path: Path, rows: Sequence[Mapping]) -> None:
+    """MAPE of several methods against rendering seconds: rows as of
+    `experiments.published.over_time`."""
     import matplotlib.pyplot as plt
 
-    target = Sections([0.0], [3.0], [2.0])
-
-    def real(t):  # extinction on the target
-        return 1.0 + 0.8 * np.sin(2.5 * t)
-
-    grid = np.linspace(1e-4, 3 - 1e-4, 600)
-    own = 2.0 * np.exp(-optical_depth(target, grid))
-    rng = np.random.default_rng(0)
-    figure, axes = plt.subplots(1, 3, figsize=(12, 3.6), sharey=True)
-    for axis, majorant in zip(axes, (0.2, 0.7, 2.0)):
-        base = Sections([0.0, 4.5], [4.5, 9.0], [majorant * 1.5, majorant * 0.5])
-        axis.plot(grid, own, "k", label="tentative")
-        axis.plot(grid, own * (1 - real(grid) / 2), "k--", label="null")
-        axis.plot(grid, own * real(grid) / 2, "k:", label="real")
-        for name in ("raw_depth", "majorant_optical_depth", "primary_sample"):
-            # Density of one interaction at t' if the base places the first one: p(t) / |S'|, p the
-            # free flight of the base.
-            t = np.sort(rng.uniform(0, 9, 4000))
-            shifted = SHIFTS[name](base, target, t)
-            density = majorant_at(base, t) * np.exp(-optical_depth(base, t)) / shifted.jacobian
-            axis.plot(shifted.t, density, label=name.replace("_", " "))
-        axis.set(
-            title=f"base majorant {1.5 * majorant:.2g}, then {0.5 * majorant:.2g} [1/m]",
-            xlabel="t' [m]",
-            ylim=(0, 2.6),
+    figure, axis = plt.subplots(figsize=(7, 4.5))
+    for method in dict.fromkeys(row["method"] for row in rows):
+        mine = [row for row in rows if row["method"] == method]
+        axis.loglog(
+            [row["seconds"] for row in mine], [row["MAPE"] for row in mine], "o-", label=method
         )
-    axes[0].set_ylabel("density [1/m]")
-    axes[-1].legend(fontsize=7)
+    axis.set(xlabel="rendering time [s]", ylabel="MAPE", title=rows[0]["scene"])
+    axis.legend(fontsize=7)
     figure.tight_layout()
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=130)
     plt.close(figure)
+
+
+def draw_densities(path: Path) -> None:
+    """Figure 3 of the paper, and the supplement's: a base segment on [0, 9] whose extinction
+    varies, and a target on [0, 3]. Row by row: densities on the base (tentative, null, real); those
+    on the target, and those that the shifts bring there; S(t); |S'(t)|."""
+    import matplotlib.pyplot as plt
+
+    rows = ("densities on the base [1/m]", "densities on the target [1/m]", "S(t) [m]", "|S'(t)|")
+    figure, axes = plt.subplots(len(rows), 3, figsize=(12, 12), sharey="row")
+    for axis, name in zip(axes[:, 0], rows):
+        axis.set_ylabel(name)
+    for column, majorant in zip(axes.T, BASE_MAJORANTS):
+        base = base_segment(majorant)
+        on_base, on_target, place, derivative = column
+        on_base.set_title(f"base majorant {1.5 * majorant:.2g}, then {0.5 * majorant:.2g} [1/m]")
+        _draw_own_densities(on_base, base, 9.0)
+        _draw_own_densities(on_target, TARGET, 3.0)
+        t = np.linspace(1e-4, 9 - 1e-4, 4000)
+        t = t[np.abs(t - 4.5) > 2e-3]  # at the jump of the majorant
+        free_flight = own_densities(base, 9.0, t)[0]
+        for name in STRETCHES:
+            shifted, label = SHIFTS[name](base, TARGET, t), name.replace("_", " ")
+            # Density at t' of the first interaction that the base places: p(t) / |S'|.
+            on_target.plot(shifted.t, free_flight / shifted.jacobian, label=label)
+            place.plot(t, shifted.t, label=label)
+            derivative.plot(t, shifted.jacobian, label=label)
+        on_base.set(xlabel="t [m]", ylim=(0, 2.6))
+        on_target.set(xlabel="t' [m]", ylim=(0, 2.6))
+        place.set(xlabel="t [m]", ylim=(0, 3.1))
+        derivative.set(xlabel="t [m]", yscale="log", ylim=(1e-3, 30))
+    axes[1, -1].legend(fontsize=7)
+    axes[2, -1].legend(fontsize=7)
+    figure.tight_layout()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=130)
+    plt.close(figure)
+
+
+def _draw_own_densities(axis, sections: Sections, end: float) -> None:
+    """The curves of `own_densities`."""
+    t = np.linspace(1e-4, end - 1e-4, 1200)
+    names = "tentative", "null", "real"
+    for name, style, density in zip(names, ("k", "k--", "k:"), own_densities(sections, end, t)):
+        axis.plot(t, density, style, label=name)

@@ -14,14 +14,15 @@ class PCBPT(ResampledIntegrator):
 
     .. pluginparameters::
 
-     * - light_paths, resamples, cache_neighbors, target, light_tracing, camera_paths, variance,
-         aovs, max_depth, rr_depth, hide_emitters, sampler
+     * - light_paths, resamples, cache_neighbors, target, weights, light_tracing, camera_paths,
+         variance, aovs, max_depth, rr_depth, hide_emitters, sampler
        -
        - As of :monosp:`bdpt_ris`.
 
     The connections of :monosp:`bdpt_ris` (Popov, Ramamoorthi, Durand and Drettakis 2015) under
     weights that know nothing of the resampling: the balance heuristic of the densities with which a
-    light sub-path and a camera sub-path make a path. For comparison.
+    light sub-path and a camera sub-path make a path. For comparison. The value ``published`` of
+    ``weights`` here stands for the pmfs of that form.
 
     .. tabs::
         .. code-tab:: xml
@@ -64,6 +65,12 @@ class BDPTRIS(ResampledIntegrator):
        - What the pmfs are proportional to: ``f_y_rho_g_v`` is a light vertex's light at the cache
          point, visibility included; ``f_y_f_yz`` also has the BSDF there. (Default:
          ``f_y_rho_g_v``)
+     * - weights
+       - |string|
+       - ``bounded``: pmfs that also hold light which a cache point does not see, and an estimate of
+         each connection's weight; weights that take a draw for one to two connections.
+         ``published``: pmfs and weights as Nabata et al. have them, without any bound. (Default:
+         ``bounded``)
      * - light_tracing
        - |float|
        - Light sub-paths that are joined to the sensor, for each camera path (N_t); from 0.125 to 8.

@@ -21,6 +21,7 @@ from ..core.recording import lanes, recorder
 from ..core.spectra import channel_mean
 from ..core.traits import SceneTraits
 from ..lights.lights import Lights
+from ..mis.published import PublishedWeights, published_tables, unknown_tables
 from ..mis.resampling import (
     LENGTHS,
     ResampledWeights,
@@ -44,9 +45,12 @@ from ..paths.subpaths import (
     vertex_bsdf_of,
 )
 from ..paths.vertex import scattered_mean
+from ..resampling.cache_pmfs import CachePmfs, cumulative_pmfs
 from ..resampling.cache_points import CacheGrid
+from ..resampling.cache_targets import TARGETS, CacheTargets, integrals
 from ..resampling.light_vertices import END, LightVertices, list_light_vertices
 from ..resampling.proposals import Proposals, cumulative_sums
+from ..weights import resampling
 from .common import IterativeIntegrator, IterativeSession
 
 CHUNK = 1 << 18
@@ -69,6 +73,11 @@ KNOWN_PATHS, MOST_KNOWN_SETS = 200, 8
 at most so many sets."""
 
 
+WEIGHTS = "bounded", "published"
+"""Values of the parameter `weights`: pmfs with blind and uniform shares, and weights with bounds;
+those of the papers."""
+
+
 class ResampledIntegrator(IterativeIntegrator):
     """Parameters of both plugins; `aware` tells them apart."""
 
@@ -76,13 +85,19 @@ class ResampledIntegrator(IterativeIntegrator):
     LAYERS = *CHANNELS, *SPLIT
     aware = True
 
+    @property
+    def published(self):
+        """Whether pmfs and weights are those of the papers."""
+        return self.weights == WEIGHTS[1]
+
     def read_parameters(self, parameters):
         self.resampled_light_paths = parameters.integer(
             "light_paths", 200, 1, "from 1 to 100000", high=100000
         )
         self.resamples = parameters.integer("resamples", 1, 1, "from 1 to 1024", high=1024)
         self.cache_neighbors = parameters.integer("cache_neighbors", 3, 1, "from 1 to 16", high=16)
-        self.target = parameters.choice("target", "f_y_rho_g_v", ("f_y_rho_g_v", "f_y_f_yz"))
+        self.target = parameters.choice("target", TARGETS[0], TARGETS)
+        self.weights = parameters.choice("weights", WEIGHTS[0], WEIGHTS)
         given = parameters.number(
             "light_tracing",
             LIGHT_TRACING,
@@ -98,6 +113,7 @@ class ResampledIntegrator(IterativeIntegrator):
             "resamples": self.resamples,
             "cache_neighbors": self.cache_neighbors,
             "target": self.target,
+            "weights": self.weights,
             "light_tracing": self.light_tracing,
         }
 
@@ -152,6 +168,7 @@ class ResampledSession(IterativeSession):
         self.grid = CacheGrid(mi.Point3f(0), mi.Normal3f(0, 0, 1), integrator.cache_neighbors)
         self.records, self.shares = uniform_tables(self.grid)
         self.cache = self.known = self.first_light = None
+        self.published_tables, self.next_tables = unknown_tables(1), {}
         self._freeze()
 
     def _share_light(self):
@@ -178,13 +195,37 @@ class ResampledSession(IterativeSession):
             self.records,
             self.shares,
             self.ratio,
+            self.published_tables,
+            self.cache or {},
             *self.grid.tables(),
             *self.lights.tables(),
         ]
 
-    def weights(self):
-        """The weights of this session."""
+    def _cache_targets(self, wavelengths):
+        return CacheTargets(
+            self.scene,
+            self.traits,
+            self.lights,
+            self.cache,
+            self.grid,
+            self.integrator.target,
+            mi.Float(self.sensor.shutter_open()),
+            wavelengths,
+            self.reach,
+        )
+
+    def weights(self, wavelengths=()):
+        """The weights of this session; those of the papers as soon as there are cache points."""
         integrator = self.integrator
+        if integrator.published and integrator.aware and self.cache is not None:
+            return PublishedWeights(
+                self.lights,
+                self._cache_targets(wavelengths),
+                *self.published_tables,
+                integrator.resampled_light_paths,
+                integrator.resamples,
+                self.ratio,
+            )
         return ResampledWeights(
             self.lights,
             self.grid,
@@ -192,7 +233,7 @@ class ResampledSession(IterativeSession):
             self.shares,
             integrator.resampled_light_paths,
             integrator.resamples,
-            integrator.aware,
+            integrator.aware and not integrator.published,
             self.ratio,
         )
 
@@ -204,7 +245,7 @@ class ResampledSession(IterativeSession):
             self.world,
             self.limits,
             light_pass,
-            self.weights(),
+            self.weights(spectral["wavelengths"]),
             self.capacity["light"],
             self.integrator.splits_light,
         )
@@ -215,7 +256,7 @@ class ResampledSession(IterativeSession):
             self.world,
             self.limits,
             self.describe_camera_pass(sensor, sequence, first, spectral),
-            self.weights(),
+            self.weights(spectral["wavelengths"]),
             self.ratio,
             self.capacity["camera"],
             self.capacity["hits"],
@@ -257,9 +298,11 @@ class ResampledSession(IterativeSession):
         sent = ends.send(
             z["p"], end, mi.Float(sensor.shutter_open()), spectral["wavelengths"], active
         )
-        if self.integrator.max_depth > 0:
+        if self.integrator.max_depth > 0 and not self.integrator.published:
             active &= z["depth"] + sent.vertices <= self.integrator.max_depth
-        if target == "f_y_rho_g_v":
+        if self.integrator.published:
+            r = sent.mean * self._cache_targets(spectral["wavelengths"]).received(z, sent.d, active)
+        elif target == TARGETS[0]:
             cosine = dr.dot(seen_normal(z), sent.d)
             cosine = dr.select(z["through"], dr.abs(cosine), dr.maximum(cosine, 0))
             r = channel_mean(sent.light) * cosine
@@ -278,15 +321,15 @@ class ResampledSession(IterativeSession):
             starts,
             places,
             found,
-            sent.vertices,
+            dr.select(end < dr.gather(mi.UInt32, ends.count, 0), sent.vertices, 0),
             guessed_weight(z, sent),
         )
 
     def _own_targets(self, scene, sensor, tables, sequence, subpaths, cache, spectral):
         """What pmfs are made of: q*/p of the first M sub-paths for the target at hand, times the
-        guessed weight; then as of `_targets`."""
+        guessed weight (but for the papers' pmfs); then as of `_targets`."""
         target = self.integrator.target
-        r, *others, _, guess = self._targets(
+        r, *others, vertices, guess = self._targets(
             scene,
             sensor,
             tables,
@@ -297,7 +340,9 @@ class ResampledSession(IterativeSession):
             spectral,
             target,
         )
-        return dr.select(r > 0, r * guess, 0), *others
+        if self.integrator.published:
+            return r, *others, vertices
+        return dr.select(r > 0, r * guess, 0), *others, vertices
 
     def _pilot_targets(self, scene, sensor, tables, sequence, subpaths, first, cache, spectral):
         return self._targets(
@@ -313,8 +358,14 @@ class ResampledSession(IterativeSession):
         )
 
     def _pmfs(self, r, seen, found):
-        """The cache points' pmfs as of `cumulative_sums`."""
+        """The cache points' pmfs as of `cumulative_sums`, or the papers' as of `cumulative_pmfs`
+        and what they are made of."""
         M, room = self.integrator.resampled_light_paths, self.capacity["ends"]
+        if self.integrator.published:
+            r = dr.select(seen, r, 0)
+            pmfs = *cumulative_pmfs(r, M + room), r
+            dr.eval(pmfs)
+            return pmfs
         pmfs = cumulative_sums(r, seen, dr.minimum(found, room) + M, M + room)
         dr.eval(pmfs)  # a recording cannot make it
         return pmfs
@@ -336,9 +387,10 @@ class ResampledSession(IterativeSession):
         light sub-paths added, and the entries of its classes (None where light is not split).
         `proposals`: as of `_proposals`."""
         light, starts, places, found, pmfs = proposals
-        integrator, weights = self.integrator, self.weights()
+        integrator, weights = self.integrator, self.weights(spectral["wavelengths"])
         ends = self._ends(starts, light, places, found)
-        pmf = Proposals(
+        kind = CachePmfs if integrator.published else Proposals
+        pmf = kind(
             self.grid,
             *pmfs,
             ends.count,
@@ -347,13 +399,16 @@ class ResampledSession(IterativeSession):
         index = lanes(self.capacity["camera"] * integrator.resamples)
         slot = index // integrator.resamples
         active = slot < dr.gather(mi.UInt32, count, 0)
-        z = read_vertices(camera, slot, active, states=STEP)
+        z = read_vertices(camera, slot, active, states=(*STEP, *weights.kernels))
         number = (first + z["path"]) * integrator.resamples + index % integrator.resamples
         rng = sequence.of_paths(number).at(z["number"])
-        row = self.grid.row(z["p"], seen_normal(z))
-        drawn = pmf.draw(row, rng, active)
+        row = self._row_of(z)
+        which = None
+        if integrator.published:
+            which, drawn, active = pmf.draw(row, rng, active)
+        else:
+            drawn = pmf.draw(row, rng, active)
         active &= drawn < dr.gather(mi.UInt32, ends.count, 0)
-        probability = pmf.probability(row, drawn, active)
 
         sent = ends.send(
             z["p"], drawn, mi.Float(sensor.shutter_open()), spectral["wavelengths"], active
@@ -361,20 +416,16 @@ class ResampledSession(IterativeSession):
         segments = z["depth"] + sent.vertices
         if integrator.max_depth > 0:
             active &= segments <= integrator.max_depth
-        value, forward, back = vertex_bsdf_of(
-            self.traits, z, spectral["wavelengths"], active
-        ).f_and_pdfs(z["towards"], sent.d, active)
+        vertex_bsdf = vertex_bsdf_of(self.traits, z, spectral["wavelengths"], active)
+        value, forward, back = vertex_bsdf.f_and_pdfs(z["towards"], sent.d, active)
         carried = z["throughput"] * value * sent.light
         active &= (dr.max(carried) > 0) & dr.all(dr.isfinite(carried))
         active = ends.unblocked(scene, z["p"], z["n"], sent, active)
-        share = self._share(weights, camera, z, sent, value, forward, back, segments, active)
+        own, per = self._of_draw(weights, pmf, z, sent, row, which, drawn, active)
+        scattering = vertex_bsdf, value, forward, back
+        share = self._share(weights, own, camera, z, sent, scattering, segments, active)
         estimate = carried * (
-            share
-            * dr.rcp(
-                integrator.resampled_light_paths
-                * integrator.resamples
-                * dr.maximum(probability, 1e-20)
-            )
+            share * per * (1 / (integrator.resampled_light_paths * integrator.resamples))
         )
         total = radiance + dr.zeros(mi.Spectrum, self.chunk)  # radiance may be a single zero
         dr.scatter_reduce(dr.ReduceOp.Add, total, estimate, z["path"], active)
@@ -386,22 +437,56 @@ class ResampledSession(IterativeSession):
         classes.add("joined", z["path"], number, estimate, active)
         return total, classes.entries
 
-    def _share(self, weights, camera, z, sent, value, forward, back, segments, active):
-        """Weight w_t of a connection among all techniques of its joint path."""
+    def _row_of(self, z):
+        """Row of a camera vertex, whose cache points it draws from."""
+        return self.grid.row(z["p"], z["n"] if self.integrator.published else seen_normal(z))
+
+    def _of_draw(self, weights, pmf, z, sent, row, which, drawn, active):
+        """`(own, per)`: the gain of the techniques at a camera vertex that has drawn a light
+        vertex, and what their common weight is to be multiplied with.
+
+        That is one over the probability of the draw, whichever cache point made it. Published
+        weights take each cache point for a technique of its own: there it is the technique's share
+        of the gain, over the probability that this cache point is taken and makes the draw."""
+        if not self.integrator.published:
+            probability = pmf.probability(row, drawn, active)
+            return self._own_gain(weights, z, sent, active), dr.rcp(dr.maximum(probability, 1e-20))
+        chance = resampling.cache_point_probability(self.grid.neighbors)
+        probabilities = pmf.probabilities(row, drawn, active)
+        if not self.integrator.aware:
+            return mi.Float(1), dr.rcp(dr.maximum(chance * sum(probabilities), 1e-20))
+        gains = weights.gains(pmf.ratios(row, drawn, active), row, sent.vertices, active)
+        own = sum(gains)
+        mine, probability = gains[-1], probabilities[-1]
+        for number in range(self.grid.neighbors):
+            mine = dr.select(which == number, gains[number], mine)
+            probability = dr.select(which == number, probabilities[number], probability)
+        taken = dr.maximum(chance * probability, 1e-20) * dr.maximum(own, 1e-20)
+        return own, mine * dr.rcp(taken)
+
+    def _own_gain(self, weights, z, sent, active):
+        """Gain of the technique that joins a light vertex, which sends `sent`, to a camera
+        vertex."""
         cosine = dr.abs(dr.dot(z["n"], sent.d))
-        row = weights.row(z["p"], dr.mulsign(z["n"], dr.dot(z["n"], sent.d)))
-        own = weights.gain(
+        return weights.gain(
             sent.mean * weights.softened(cosine, dr.square(sent.distance)),
-            row,
+            weights.row(z["p"], z["n"], sent.d),
             sent.vertices,
             active,
         )
+
+    def _share(self, weights, own, camera, z, sent, scattering, segments, active):
+        """Weight w_t of a connection with the gain `own` among all techniques of its joint path.
+        `scattering`: the `VertexBSDF` at the camera vertex `z`, and what its `f_and_pdfs` says."""
+        vertex_bsdf, value, forward, back = scattering
+        cosine = dr.abs(dr.dot(z["n"], sent.d))
         end = LightEnd(
             sent.pdf_area * cosine,
             sent.mean * dr.rcp(dr.maximum(sent.pdf_area, 1e-20)),
             scattered_mean(value, z["n"], sent.d),
             back,
             segments,
+            weights.kernels_of_vertex(z["row"], z["p"], vertex_bsdf, sent.d, active),
         )
         nearer = sum_before(camera, z, z["parent"], end, weights, active)
         return own * dr.rcp(dr.maximum(own + forward * cosine * sent.mis_sum + nearer, 1e-20))
@@ -409,11 +494,15 @@ class ResampledSession(IterativeSession):
     def _meet(self, tables, radiance, camera, hits, hit_count, entries):
         """Radiance of camera paths with that of emission that they meet beyond the first vertex
         added, and the entries of its classes."""
+        weights = self.weights()
         index = lanes(self.capacity["hits"])
         active = index < dr.gather(mi.UInt32, hit_count, 0)
-        hit = hit_layout().read(hits, index, active)
-        end = LightEnd(hit["start"], hit["light_mean"], mi.Float(1), hit["across"], hit["depth"])
-        nearer = sum_before(camera, hit, hit["parent"], end, self.weights(), active)
+        hit = hit_layout(weights).read(hits, index, active)
+        kernels = [hit[name] for name in weights.light_kernels]
+        end = LightEnd(
+            hit["start"], hit["light_mean"], mi.Float(1), hit["across"], hit["depth"], kernels
+        )
+        nearer = sum_before(camera, hit, hit["parent"], end, weights, active)
         total = radiance + dr.zeros(mi.Spectrum, self.chunk)  # radiance may be a single zero
         value = hit["value"] * dr.rcp(1 + nearer)
         dr.scatter_reduce(dr.ReduceOp.Add, total, value, hit["path"], active)
@@ -480,12 +569,17 @@ class ResampledSession(IterativeSession):
         self.cache = self._cache_points(
             traced[3], vertices, max(min(wanted, MOST_PAIRS // (M + self.capacity["ends"])), 1)
         )
+        published = self.integrator.published
         self.grid = CacheGrid(
-            self.cache["p"], seen_normal(self.cache), self.integrator.cache_neighbors
+            self.cache["p"],
+            self.cache["n"] if published else seen_normal(self.cache),
+            self.integrator.cache_neighbors,
         )
         self.records, self.shares = uniform_tables(self.grid)
+        self.published_tables = unknown_tables(dr.width(self.cache["depth"]))
         self._freeze()
-        self.first_light = light
+        # Published weights are other ones than those that this light was traced with.
+        self.first_light = None if published else light
 
     def _take_weights(self, iteration):
         """Sets the weights of an iteration. They must not depend on its own light sub-paths: the
@@ -493,10 +587,34 @@ class ResampledSession(IterativeSession):
         tell of Q and Q_s."""
         if not self.integrator.aware:
             return
+        if self.integrator.published:
+            if iteration not in self.next_tables:
+                self._learn(iteration)
+            self.published_tables = self.next_tables.pop(iteration)
+            self._fill_tables()
+            return
         if iteration > 0 and self.known is None:
             self.known = tabulate(self.grid, *self._integrals(self.first_light, self._spectral(0)))
         self.records, self.shares = self.known if iteration > 0 else uniform_tables(self.grid)
         self._fill_tables()
+
+    def _learn(self, iteration):
+        """Makes the published weights' tables for an iteration from the light sub-paths of the one
+        before, as they are wherever that was rendered; for the first one from some of its own."""
+        before = iteration - 1 if iteration > 0 else PILOT
+        spectral = self._spectral(max(iteration - 1, 0))
+        r, seen, _, _, _, vertices = self._own_ends(
+            before, spectral, self._light(before, 0, spectral)
+        )
+        self._keep_tables(iteration, r, seen, vertices)
+
+    def _keep_tables(self, iteration, r, seen, vertices):
+        """Keeps the tables that targets of M light sub-paths (`_own_targets`) make for an
+        iteration."""
+        M = self.integrator.resampled_light_paths
+        width = M + self.capacity["ends"]
+        found = integrals(dr.select(seen, r, 0), vertices, LENGTHS, width, M)
+        self.next_tables = {iteration: published_tables(*found)}
 
     def _cache_points(self, camera, vertices, count):
         """`count` of the camera's vertices, at random (a single one in nothingness if there is
@@ -602,7 +720,14 @@ class ResampledSession(IterativeSession):
     def _proposals(self, iteration, spectral, light):
         """What all camera paths of an iteration draw from: the vertices and starts of M of the
         sub-paths `light`, and the pmfs."""
-        r, seen, *ends = self._ends_fit(
+        r, seen, *ends, vertices = self._own_ends(iteration, spectral, light)
+        if self.integrator.published and self.integrator.aware:
+            self._keep_tables(iteration + 1, r, seen, vertices)
+        return light[0], *ends, self._pmfs(r, seen, ends[-1])
+
+    def _own_ends(self, iteration, spectral, light):
+        """What `_own_targets` returns, of an iteration's M light sub-paths."""
+        return self._ends_fit(
             lambda: self._target_pass(
                 self.scene,
                 self.sensor,
@@ -613,7 +738,6 @@ class ResampledSession(IterativeSession):
                 spectral,
             )
         )
-        return light[0], *ends, self._pmfs(r, seen, ends[-1])
 
     def _radiance(self, iteration, chunk, traced, proposals, spectral):
         """Radiance of camera paths (`trace_camera_vertices`) with everything that they meet and are

@@ -53,10 +53,13 @@ class VolpathMultiview(IterativeIntegrator):
          names with ``_copy`` keep it. (Default: ``majorant_optical_depth``)
      * - weights
        - |string|
-       - ``mis`` (balance heuristic), ``power`` (power heuristic, exponent 2), ``mwis`` (``mis``
-         divided by the sum of the weights that arrived at each pixel: consistent, biased at few
-         samples), or ``none`` (the same weight for every view that can make the path: unbiased and
-         noisy, for comparison). (Default: ``mis``)
+       - ``mis`` (balance heuristic), ``power`` (power heuristic, exponent ``beta``), ``mwis``
+         (``mis`` divided by the sum of the weights that arrived at each pixel: consistent, biased
+         at few samples), or ``none`` (the same weight for every view that can make the path:
+         unbiased and noisy, for comparison). (Default: ``mis``)
+     * - beta
+       - |float|
+       - Exponent of ``weights`` = ``power``, from 1 to 8; with other weights an error. (Default: 2)
      * - add_nulls
        - |bool|
        - Add null interactions to first segments until all views that see a pivot expect equally
@@ -94,8 +97,8 @@ class VolpathMultiview(IterativeIntegrator):
     sees it joins there: the null interactions of the first segment are shifted onto its own line of
     sight, and all views share the rest of the path.
 
-    With the weights ``mis`` the result is unbiased. Perspective and thin lens sensors are
-    supported; polarised variants, gradients and the film ``specfilm`` are refused by name.
+    With the weights ``mis`` the result is unbiased. Perspective, thin lens and orthographic sensors
+    are supported; polarised variants, gradients and the film ``specfilm`` are refused by name.
 
     .. tabs::
         .. code-tab:: xml
@@ -117,6 +120,11 @@ class VolpathMultiview(IterativeIntegrator):
     def read_parameters(self, parameters):
         self.shift = parameters.choice("shift", "majorant_optical_depth", tuple(SHIFTS))
         self.weights = parameters.choice("weights", "mis", HEURISTICS)
+        self.beta = 2.0
+        if self.weights == "power":
+            self.beta = parameters.number("beta", 2.0, lambda x: 1 <= x <= 8, "from 1 to 8")
+        else:
+            parameters.refuse("beta", 'only weights = "power" have an exponent')
         self.add_nulls = parameters.boolean("add_nulls", True)
 
     def read_layers(self, parameters):
@@ -130,6 +138,7 @@ class VolpathMultiview(IterativeIntegrator):
             **settings,
             "shift": self.shift,
             "weights": self.weights,
+            **({"beta": self.beta} if self.weights == "power" else {}),
             "add_nulls": self.add_nulls,
         }
 
@@ -319,7 +328,7 @@ class MultiViewSession(IterativeSession):
             scene,
             self.lights,
             self.traits,
-            partial(summand, integrator.weights),
+            partial(summand, integrator.weights, exponent=integrator.beta),
             pivot,
             connections,
             number,

@@ -51,6 +51,9 @@ class ResampledWeights:
     sub-paths that are joined to the sensor over camera paths, of all the film."""
 
     states = END
+    kernels: tuple[str, ...] = ()
+    light_kernels: tuple[str, ...] = ()
+    """What vertices and hits keep besides (`paths.camera_vertices`): nothing."""
 
     def __init__(self, lights, grid, records, shares, M, N, aware, ratio):
         self.lights, self.grid, self.records, self.shares = lights, grid, records, shares
@@ -58,9 +61,24 @@ class ResampledWeights:
 
     # ------------------------------------------------------------------ resampling
 
-    def row(self, p, n):
-        """Row of a place, `n` its normal on the light's side."""
-        return self.grid.row(p, n) if self.aware else mi.UInt32(0)
+    def row(self, p, n, d):
+        """Row of a place with the geometric normal `n`, from which the light is in direction
+        `d`."""
+        return self.grid.row(p, dr.mulsign(n, dr.dot(n, d))) if self.aware else mi.UInt32(0)
+
+    @staticmethod
+    def kernels_of_vertex(row, p, vertex_bsdf, to_light, active):
+        return []
+
+    @staticmethod
+    def kernels_of_light(row, ds, mean, active):
+        return []
+
+    @staticmethod
+    def sent(strength, scattered, kernels):
+        """r = q*/p of a light sub-path with `strength`, whose end has `scattered`, its BSDF times
+        the geometric term."""
+        return strength * scattered
 
     def softened(self, geometry, squared):
         """The geometric term without its pole; unchanged for lights infinitely far away."""
@@ -90,8 +108,7 @@ class ResampledWeights:
 
     # --- light sub-paths -------------------------------------------------------------------------
 
-    @staticmethod
-    def blank(width):
+    def blank(self, width):
         return [dr.zeros(mi.Float, width) for _ in range(3)]
 
     def init_light(self, si, source, reachable, active, flux):
@@ -106,13 +123,7 @@ class ResampledWeights:
             self.lights.total_power,
             channel_mean(flux),
         )
-        row = self.row(si.p, dr.mulsign(si.n, dr.dot(si.n, ds.d)))
-        better = self.gain(
-            strength * self.softened(made, dr.select(infinite, dr.inf, dr.square(ds.dist))),
-            row,
-            mi.UInt32(1),
-            active,
-        )
+        better = self.gain_of_start(si, ds, made, strength, active)
         met = self.lights.can_be_met(ds.emitter, active)
         return [
             dr.select(reachable, better * theory.reciprocal(made), 0),
@@ -120,8 +131,25 @@ class ResampledWeights:
             strength,
         ]
 
+    def gain_of_start(self, si, ds, made, strength, active):
+        """Gain of joining the point of a light, which `si` sees as `ds`, to `si`. `made` [1/m^2]:
+        density with which a light sub-path from there makes `si`."""
+        infinite = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
+        r = strength * self.softened(made, dr.select(infinite, dr.inf, dr.square(ds.dist)))
+        return self.gain(r, self.row(si.p, si.n, ds.d), mi.UInt32(1), active)
+
+    def gain_of_vertex(self, state, density, si, squared, s):
+        """Gain of joining a light sub-path of `s` vertices to `si`, where it went on to with
+        `density` [1/m^2], over the squared distance `squared`; `state`: before `si`."""
+        row = self.row(si.p, si.n, si.to_world(si.wi))
+        return self.gain(state[2] * self.softened(density, squared), row, s)
+
+    @staticmethod
+    def depart(state, si, mask):
+        return state
+
     def scatter(self, state, p_forward, p_back, delta, scattered):
-        d_vcm, d_vc, strength = state
+        d_vcm, d_vc, strength, *others = state
         return [
             d_vcm,
             dr.select(delta, d_vc, theory.d_vc_of(d_vcm + p_back * d_vc, p_forward)),
@@ -132,12 +160,12 @@ class ResampledWeights:
                     strength * scattered * theory.reciprocal(p_forward), theory.LARGEST_RATIO
                 ),
             ),
+            *others,
         ]
 
     def propagate(self, state, density, si, squared, depth):
-        row = self.row(si.p, dr.mulsign(si.n, dr.dot(si.n, si.to_world(si.wi))))
-        better = self.gain(state[2] * self.softened(density, squared), row, depth)
-        return [dr.select(density > 0, better * theory.reciprocal(density), 0), state[1], state[2]]
+        better = self.gain_of_vertex(state, density, si, squared, depth)
+        return [dr.select(density > 0, better * theory.reciprocal(density), 0), *state[1:]]
 
     # ------------------------------------------------------------------ techniques
 

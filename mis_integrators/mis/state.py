@@ -63,6 +63,9 @@ class ConnectionState(Protocol):
         this side goes on, and with which the other side would go back; `delta`: a delta function
         scattered; `scattered` [1/sr]: mean of the BSDF over the channels."""
 
+    def depart(self, state: State, si: Any, mask: Array) -> State:
+        """After `scatter`, of light sub-paths: the state may keep the vertex that they leave."""
+
     def hit_emitter(self, state: State, direct: Array, emission: Array, sampled: Array) -> Array:
         """Weight of emission that a camera path meets, after `scatter`. `sampled`: density per
         solid angle of the direction (zero: a delta function); `direct`: that of next-event

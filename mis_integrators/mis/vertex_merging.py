@@ -70,6 +70,10 @@ class ConnectionWeights:
             dr.select(delta, d_vc, theory.d_vc_of(self._nearer(state, p_back), p_forward)),
         ]
 
+    @staticmethod
+    def depart(state, si, mask):
+        return state
+
     def propagate(self, state, density, si=None, squared=None, depth=None):
         return [dr.select(density > 0, theory.reciprocal(density), 0), state[1]]
 

@@ -7,7 +7,7 @@ A vertex remembers the step that led to it, from the last vertex that scattered 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import drjit as dr
 import mitsuba as mi
@@ -28,14 +28,17 @@ scattered on the way); the geometric term [1/m^2] (hits: the cosine at the paren
 leaves it; densities per projected solid angle at the parent, of the camera's side for this step and
 of the light's for the one before; the parent's BSDF, channel mean [1/sr]; its row (see
 `soften`)."""
+LEFT = 5
+"""Entries of what `leave` returns before those that `soften` adds."""
 HIT = ("light_mean", "start", "across")
 """What a hit knows besides: `Lights.pdf_emission_origin` and `pdf_emission_area` of the emitter's
 point, and its light, channel mean, over the former."""
 
 
-def hit_layout():
+def hit_layout(soften):
     """Fields of a hit of an emitter beyond the first vertex: `value` (throughput included), number
-    of the path, `depth` in segments, `parent`, and the fields of `STEP` and `HIT`."""
+    of the path, `depth` in segments, `parent`, the fields of `STEP` and `HIT`, and the kernels of
+    `soften`: those of the parent, and those of the emitter."""
     return Layout(
         {
             "value": mi.Spectrum,
@@ -43,45 +46,47 @@ def hit_layout():
             **dict.fromkeys(STEP, mi.Float),
             "depth": mi.UInt32,
             "parent": mi.UInt32,
-            **dict.fromkeys(HIT, mi.Float),
+            **dict.fromkeys((*HIT, *soften.kernels, *soften.light_kernels), mi.Float),
         }
     )
 
 
-def not_left(width):
+def not_left(soften, width):
     """What `leave` returns before anything was left: densities of both sides, BSDF, row and cosine
-    of the last vertex that scattered smoothly."""
-    return [dr.ones(mi.Float, width), *[dr.zeros(mi.Float, width) for _ in range(4)]]
+    of the last vertex that scattered smoothly, and its kernels."""
+    others = LEFT - 1 + len(soften.kernels)
+    return [dr.ones(mi.Float, width), *[dr.zeros(mi.Float, width) for _ in range(others)]]
 
 
-def leave(soften, left, si, value, p_forward, p_back, wo, mask):
+def leave(soften, left, si, vertex_bsdf, value, p_forward, p_back, wo, mask):
     """After the lanes `mask` have scattered smoothly towards `wo`: what the next vertex must know
     of this one."""
-    cosine = dr.dot(si.n, wo)
-    row = mi.Float(soften.row(si.p, dr.mulsign(si.n, cosine)))
-    new = [p_forward, p_back, scattered_mean(value, si.n, wo), row, dr.abs(cosine)]
+    row = mi.Float(soften.row(si.p, si.n, wo))
+    new = [p_forward, p_back, scattered_mean(value, si.n, wo), row, dr.abs(dr.dot(si.n, wo))]
+    new += soften.kernels_of_vertex(left[3], si.p, vertex_bsdf, wo, mask)
     return [dr.select(mask, a, b) for a, b in zip(new, left)]
 
 
 def step_to_vertex(soften, left, density, cosine, squared):
-    """The fields of `STEP` at a vertex that was sampled with `density` per solid angle (zero: by a
-    delta function) and meets the ray under `cosine`."""
-    forward, back, scattered, row, there = left
+    """The fields of `STEP`, and the parent's kernels, at a vertex that was sampled with `density`
+    per solid angle (zero: by a delta function) and meets the ray under `cosine`."""
+    forward, back, scattered, row, there, *kernels = left
     d_vcm = dr.select(density > 0, squared * dr.rcp(dr.maximum(density * cosine, 1e-20)), 0)
     geometry = soften.softened(there * cosine * dr.rcp(squared), squared)
-    return [dr.minimum(d_vcm, 1e15), geometry, forward, back, scattered, row]
+    return [dr.minimum(d_vcm, 1e15), geometry, forward, back, scattered, row, *kernels]
 
 
 def step_to_hit(lights, soften, left, density, origin, ds, light, squared, mask):
-    """The fields of `STEP` and `HIT` of emission `light` met in the point or direction `ds`, seen
-    from the vertex `origin`."""
-    forward, back, scattered, row, there = left
+    """The fields of `STEP` and `HIT`, and the kernels, of emission `light` met in the point or
+    direction `ds`, seen from the vertex `origin`."""
+    forward, back, scattered, row, there, *kernels = left
     start = lights.pdf_emission_origin(origin, ds, mask)
     geometry = soften.softened(there, squared)
     d_vcm = dr.select(density > 0, dr.rcp(dr.maximum(density, 1e-20)), 0)
+    light_mean = channel_mean(light) * dr.rcp(dr.maximum(start, 1e-20))
     return dict(
         zip(
-            (*STEP, *HIT),
+            (*STEP, *HIT, *soften.kernels, *soften.light_kernels),
             (
                 d_vcm,
                 geometry,
@@ -89,9 +94,11 @@ def step_to_hit(lights, soften, left, density, origin, ds, light, squared, mask)
                 back,
                 scattered,
                 row,
-                channel_mean(light) * dr.rcp(dr.maximum(start, 1e-20)),
+                light_mean,
                 start,
                 lights.pdf_emission_area(origin, ds, mask),
+                *kernels,
+                *soften.kernels_of_light(row, ds, light_mean, mask),
             ),
         )
     )
@@ -110,12 +117,13 @@ class StepVisitor:
         self.scene, self.lights, self.traits = world.scene, world.lights, world.traits
         self.film, self.lens = sensor.film(), Lens(sensor)
         self.soften, self.ratio = soften, ratio
+        self.steps, self.hit = (*STEP, *soften.kernels), hit_layout(soften)
         self.hide_emitters = limits.hide_emitters
         self.store = Store(
-            vertices=new_vertices(self.traits, capacity, STEP),
+            vertices=new_vertices(self.traits, capacity, self.steps),
             room=dr.opaque(mi.UInt32, capacity),
             count=dr.zeros(mi.UInt32, 1),
-            hits=hit_layout().room(hit_capacity),
+            hits=self.hit.room(hit_capacity),
             hit_room=dr.opaque(mi.UInt32, hit_capacity),
             hit_count=dr.zeros(mi.UInt32, 1),
         )
@@ -123,7 +131,8 @@ class StepVisitor:
     def begin(self, n_paths, splat, aperture):
         self.inside, self.aperture = within_crop(self.film, splat), aperture
         origin = dr.zeros(mi.Interaction3f)
-        return [mi.UInt32(0), mi.UInt32(NO_PARENT), mi.Float(0), origin, not_left(n_paths)]
+        left = not_left(self.soften, n_paths)
+        return [mi.UInt32(0), mi.UInt32(NO_PARENT), mi.Float(0), origin, left]
 
     def emission(self, state, at, active):
         _, parent, density, origin, left = state
@@ -143,7 +152,7 @@ class StepVisitor:
             self.lights, self.soften, left, density, origin, ds, light, squared, met
         )
         values |= {"value": value, "path": at.path, "depth": at.depth, "parent": parent}
-        hit_layout().write(store.hits, values, slot, met)
+        self.hit.write(store.hits, values, slot, met)
         return dr.select(shown & (at.depth == 1), value, 0)
 
     def unfinished(self, state):
@@ -165,7 +174,7 @@ class StepVisitor:
         at.vertex_bsdf = VertexBSDF.at(self.traits, si, at.bsdf, smooth)
         wanted = smooth & (dr.max(at.throughput) > 0)
         at.slot = keep_vertex(
-            self.store, at, at.throughput, number, parent, dict(zip(STEP, step)), wanted
+            self.store, at, at.throughput, number, parent, dict(zip(self.steps, step)), wanted
         )
         number = dr.select(wanted, number + 1, number)
         return [number, parent, density, origin, left], mi.Spectrum(0)
@@ -175,7 +184,7 @@ class StepVisitor:
         si, wo, smoothly = at.si, at.si.to_world(bs.wo), active & ~delta
         value, p_forward, p_back = at.vertex_bsdf.f_and_pdfs(at.towards, wo, smoothly)
         parent = dr.select(smoothly, at.slot, parent)
-        left = leave(self.soften, left, si, value, p_forward, p_back, wo, smoothly)
+        left = leave(self.soften, left, si, at.vertex_bsdf, value, p_forward, p_back, wo, smoothly)
         density = dr.select(delta, 0, p_forward * dr.abs(dr.dot(si.n, wo)))
         return [number, parent, density, mi.Interaction3f(si), left], weight, active
 
@@ -197,9 +206,11 @@ def trace_camera_vertices(
     surplus is missing. The first vertex has one over the density of camera rays there, over the
     whole crop window, times `ratio`, as its `d_vcm`, and no parent.
 
-    `soften.row(p, n)` numbers places, with the normal on the side of the light;
-    `soften.softened(geometry, squared)` may change the geometric term of a step that starts there,
-    with its squared distance (infinite for environments).
+    `soften.row(p, n, d)` numbers places with geometric normals `n`, from which the light is in the
+    direction `d`; `soften.softened(geometry, squared)` may change the geometric term of a step that
+    starts there, with its squared distance (infinite for environments). `soften.kernels` and
+    `light_kernels` name more numbers that vertices keep of their parents, and hits of themselves;
+    `kernels_of_vertex` and `kernels_of_light` compute them (lists).
     """
     visitor = StepVisitor(world, limits, camera_pass.sensor, soften, ratio, capacity, hit_capacity)
     radiance, alpha, splat = trace_camera(world, limits, camera_pass, visitor)
@@ -214,7 +225,8 @@ class LightEnd:
 
     `p_made` [1/m^2]: the density with which the light's side makes that; `strength`: flux, over the
     density of that; `scattered`, `back`: BSDF there, and density per projected solid angle with
-    which the light's side goes on to the parent; `segments`: of the joint path.
+    which the light's side goes on to the parent; `segments`: of the joint path; `kernels`: as of
+    `kernels_of_vertex` or `kernels_of_light`.
     """
 
     p_made: mi.Float
@@ -222,6 +234,7 @@ class LightEnd:
     scattered: mi.Float
     back: mi.Float
     segments: mi.UInt32
+    kernels: list[mi.Float] = field(default_factory=list)
 
 
 @dr.syntax
@@ -231,13 +244,17 @@ def sum_before(vertices, step, parent, end: LightEnd, weights, active):
 
     `step`, `parent`: those of the vertex, or hit, at the camera's end. `weights.gain(r, row, s,
     active)`: what resampling makes of the technique that joins a light sub-path of s vertices,
-    which sends r = q*/p, to a vertex of that row. Joining to the sensor (the last step, without a
-    parent) has the gain one.
+    which sends r = q*/p (`weights.sent`), to a vertex of that row. Joining to the sensor (the last
+    step, without a parent) has the gain one.
     """
-    layout = vertex_layout(STEP)
+    names = (*STEP, *weights.kernels)
+    count = len(weights.kernels)
+    layout = vertex_layout(names)
     d_vcm, geometry, forward, back_there, scattered_there, row = (
         mi.Float(step[name]) for name in STEP
     )
+    kernels = [mi.Float(kernel) for kernel in end.kernels]
+    kernels_there = [mi.Float(step[name]) for name in weights.kernels]
     parent = mi.UInt32(parent)
     # What the loop reads must be plain variables: Dr.Jit would take a dataclass for its state.
     segments = end.segments
@@ -249,15 +266,17 @@ def sum_before(vertices, step, parent, end: LightEnd, weights, active):
     while dr.hint(active, label="techniques"):
         joined = parent != NO_PARENT
         depth = layout.read(vertices["words"], parent, active & joined, ("depth",))["depth"]
-        better = weights.gain(
-            strength * scattered * geometry, mi.UInt32(row), segments - depth, active & joined
-        )
+        sent = weights.sent(strength, scattered * geometry, kernels)
+        better = weights.gain(sent, mi.UInt32(row), segments - depth, active & joined)
         total = dr.select(active, total + ratio * d_vcm * dr.select(joined, better, 1), total)
         ratio = dr.minimum(ratio * (back * dr.rcp(dr.maximum(forward, 1e-20))), 1e15)
         strength = dr.minimum(strength * (scattered * dr.rcp(dr.maximum(back, 1e-20))), 1e15)
         back, scattered = mi.Float(back_there), mi.Float(scattered_there)
         active &= joined & (ratio > 0)
-        record = layout.read(vertices["words"], parent, active, STEP)
+        record = layout.read(vertices["words"], parent, active, names)
+        for number in dr.hint(range(count), mode="scalar"):
+            kernels[number] = mi.Float(kernels_there[number])
+            kernels_there[number] = record[names[number - count]]
         d_vcm, geometry, forward = record["d_vcm"], record["geometry"], record["forward"]
         back_there, scattered_there, row = record["back"], record["scattered"], record["row"]
         parent = dr.gather(mi.UInt32, vertices["parent"], parent, active)

@@ -255,6 +255,7 @@ class VertexVisitor:
         value, p_back, p_forward = at.vertex_bsdf.f_and_pdfs(away, at.towards, active & ~delta)
         mean = scattered_mean(value, si.n, at.towards)
         sums = _either(active, self.weights.scatter(sums, p_forward, p_back, delta, mean), sums)
+        sums = self.weights.depart(sums, si, active)
         density = dr.select(delta, 0, p_forward * facing(self.traits, si.n, away))
         mark = [dr.select(at.first, delta, before) for before in mark]
         return [number, parent, density, mi.Point3f(si.p), sums, mark]

@@ -79,18 +79,7 @@ class LightVertices:
 
         start = active & (index < self.paths)
         x = read_starts(self.starts, index, start)
-        reference = dr.zeros(mi.SurfaceInteraction3f, dr.width(p))
-        reference.p, reference.time, reference.wavelengths = p, time, wavelengths
-        ds, light = self.lights.emitted(reference, x["emitter"], x["p"], x["n"], x["uv"], start)
-        density = self.lights.pdf_emission_origin(reference, ds, start)
-        pdf_area = self.lights.pdf_emission_area(reference, ds, start)
-        per = dr.select(density > 0, dr.rcp(dr.maximum(density, 1e-20)), 0)
-        light *= per
-        mean = dr.select(
-            self.lights.has_unknown_pdf(ds.emitter, start),
-            self.lights.total_power * pdf_area,
-            channel_mean(light),
-        )
+        ds, per, light, mean, pdf_area = sent_by_starts(self.lights, x, p, time, wavelengths, start)
         met = start & self.lights.can_be_met(ds.emitter, start)
         return LightConnection(
             dr.select(start, ds.d, joined.d),
@@ -107,6 +96,27 @@ class LightVertices:
         """Whether nothing stands between points `p` (geometric normals `n`) and the ends that sent
         `joined`."""
         return unblocked(scene, p, n, joined.d, dr.minimum(joined.distance, self.reach), active)
+
+
+def sent_by_starts(lights, starts, p, time, wavelengths, active):
+    """What points of lights (`read_starts`) send to points `p`: `(ds, per, light, mean, pdf_area)`,
+    the direction sample, one over the density of the start, and the others as of
+    `LightConnection`."""
+    reference = dr.zeros(mi.SurfaceInteraction3f, dr.width(p))
+    reference.p, reference.time, reference.wavelengths = p, time, wavelengths
+    ds, light = lights.emitted(
+        reference, starts["emitter"], starts["p"], starts["n"], starts["uv"], active
+    )
+    density = lights.pdf_emission_origin(reference, ds, active)
+    pdf_area = lights.pdf_emission_area(reference, ds, active)
+    per = dr.select(density > 0, dr.rcp(dr.maximum(density, 1e-20)), 0)
+    light *= per
+    mean = dr.select(
+        lights.has_unknown_pdf(ds.emitter, active),
+        lights.total_power * pdf_area,
+        channel_mean(light),
+    )
+    return ds, per, light, mean, pdf_area
 
 
 def list_light_vertices(vertices, count, lengths, first, paths: int, capacity: int, room: int):

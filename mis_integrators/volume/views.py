@@ -12,7 +12,12 @@ import numpy as np
 from ..core.random import next_2d
 from ..core.traits import UnsupportedScene
 
-SENSORS = {"PerspectiveCamera": "perspective", "ThinLensCamera": "thinlens"}
+PARALLEL = "OrthographicCamera"
+SENSORS = {
+    "PerspectiveCamera": "perspective",
+    "ThinLensCamera": "thinlens",
+    PARALLEL: "orthographic",
+}
 MAX_VIEWS = 1024
 
 
@@ -68,15 +73,18 @@ CAMERA = (
     "focus",
     "near",
     "far",
+    "parallel",
 )
 
 
 @dataclass
 class Camera:
-    """A perspective or thin lens camera as vectors in world space. The film's image at unit depth
-    has the `corner` (from the `origin`) and the edges `across` and `down`, whose dual basis turns
-    points there into film coordinates in [0, 1]^2; it covers the `area`. `lens_x` and `lens_y` are
-    half axes of the lens, sharp at depth `focus`; `near` and `far` are depths.
+    """A perspective, thin lens or orthographic camera as vectors in world space. The film's image
+    at unit depth has the `corner` (from the `origin`) and the edges `across` and `down`, whose dual
+    basis turns points there into film coordinates in [0, 1]^2; it covers the `area`. `lens_x` and
+    `lens_y` are half axes of the lens, sharp at depth `focus`; `near` and `far` are depths.
+    `parallel` (0 or 1): whether all rays have the direction `forward` (orthographic cameras); then
+    the image is the same at all depths, and `corner` lies across `forward`.
 
     Mitsuba's sensors are not asked while rendering: calls through arrays of sensors reach the
     batch, too, which remembers what it last saw.
@@ -95,6 +103,7 @@ class Camera:
     focus: float
     near: float
     far: float
+    parallel: float = 0.0
 
     @staticmethod
     def of(sensor):
@@ -108,8 +117,14 @@ class Camera:
             mi.Point2f([0, 1, 0], [0, 0, 1]),
             mi.Point2f(0.5),
         )
-        d = np.array(ray.d, dtype=np.float64).reshape(3, 3)
-        corners = d / (axes[:, 2] @ d)
+        parallel = sensor.class_name() == PARALLEL
+        if parallel:
+            offset = np.array(ray.o, dtype=np.float64).reshape(3, 3) - matrix[:3, 3:4]
+            depth = axes[:, 2] @ offset
+            corners = offset - axes[:, 2:3] * depth
+        else:
+            d = np.array(ray.d, dtype=np.float64).reshape(3, 3)
+            corners = d / (axes[:, 2] @ d)
         across, down = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
         dual = np.linalg.pinv(np.stack([across, down], axis=1))
         parameters = mi.traverse(sensor)
@@ -117,6 +132,10 @@ class Camera:
             _number(parameters[name]) if name in parameters else value
             for name, value in (("aperture_radius", 0), ("focus_distance", 1))
         )
+        near, far = _number(parameters["near_clip"]), _number(parameters["far_clip"])
+        if parallel:  # its clipping planes are scaled with `to_world`
+            near = float(depth[0])
+            far = near + float(np.array(ray.maxt).ravel()[0])
         return Camera(
             matrix[:3, 3],
             axes[:, 2],
@@ -129,8 +148,9 @@ class Camera:
             lens * axes[:, 0],
             lens * axes[:, 1],
             focus,
-            _number(parameters["near_clip"]),
-            _number(parameters["far_clip"]),
+            near,
+            far,
+            float(parallel),
         )
 
 
@@ -197,6 +217,7 @@ class Views:
         }
         dr.make_opaque(self.table)
         self.needs_aperture = any(s.needs_aperture_sample() for s in sensors)
+        self.has_parallel = any(s.class_name() == PARALLEL for s in sensors)
         self.needs_time = any(s.shutter_open_time() > 0 for s in sensors)
 
     @staticmethod
@@ -278,6 +299,10 @@ class Views:
         )
         on_plane = corner + u * across + v * down
         d = dr.normalize(on_plane * focus - lens)
+        if self.has_parallel:
+            parallel = self._is_parallel(view, active)
+            d = dr.select(parallel, forward, d)
+            lens = dr.select(parallel, on_plane, lens)
         per_depth = dr.rcp(dr.dot(d, forward))
         near = self.read("near", view, active) * per_depth
         ray = mi.Ray3f(
@@ -294,6 +319,9 @@ class Views:
         splat = pixel + 0.5 if self.rfilter.is_box_filter() else position
         return view, ray, splat, aperture, in_window
 
+    def _is_parallel(self, view, active):
+        return self.read("parallel", view, active) > 0.5
+
     def _lens(self, view, aperture, active):
         """Offset on the lens of the sample `aperture` (world space)."""
         if not self.needs_aperture:
@@ -307,8 +335,8 @@ class Views:
         """The line from `p` to a view: `(d, distance, density, position)`, the direction to the
         sensor, the distance to its near plane, the density of the view's camera rays through `p`
         per area across them [1/m^2], for paths a pixel (zero where the view does not see that way:
-        density = pixels / (A cos^3 r^2), A the area of the film's image at unit depth), and the
-        position on the film in pixels."""
+        density = pixels / (A cos^3 r^2), A the area of the film's image at unit depth; of parallel
+        rays pixels / A), and the position on the film in pixels."""
         lens, forward = (
             self._lens(view, aperture, active),
             self.read_vector("forward", view, active),
@@ -323,6 +351,9 @@ class Views:
         on_plane = line * dr.rcp(dr.select(ahead, depth, 1)) + lens * dr.rcp(
             self.read("focus", view, active)
         )
+        if self.has_parallel:
+            parallel = self._is_parallel(view, active)
+            on_plane = dr.select(parallel, line - forward * depth, on_plane)
         from_corner = on_plane - self.read_vector("corner", view, active)
         u, v = (
             dr.dot(from_corner, self.read_vector(name, view, active))
@@ -335,11 +366,17 @@ class Views:
         density = self.read("pixels", view, active) * dr.rcp(
             self.read("area", view, active) * cosine * dr.square(depth)
         )
+        d = line * -dr.rcp(dr.maximum(length, 1e-30))
+        if self.has_parallel:
+            distance = dr.select(parallel, depth - self.read("near", view, active), distance)
+            seen = ahead & (u >= 0) & (u < 1) & (v >= 0) & (v < 1) & (distance > 0)
+            even = self.read("pixels", view, active) * dr.rcp(self.read("area", view, active))
+            density, d = dr.select(parallel, even, density), dr.select(parallel, -forward, d)
         position = mi.Point2f(
             u * self.read("width", view, active), v * self.read("height", view, active)
         )
         return (
-            line * -dr.rcp(dr.maximum(length, 1e-30)),
+            d,
             dr.select(seen, distance, 0),
             dr.select(seen, density, 0),
             position,

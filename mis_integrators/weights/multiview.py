@@ -13,14 +13,18 @@ f(x_j)/p_j(x_j) of the shifted path, a plain sample of view j.
 from __future__ import annotations
 
 from . import Array
+from .recursion import at_most
 
 HEURISTICS = ("mis", "power", "mwis", "none")
+LARGEST_SUMMAND = 1e36
+"""Stands for infinity: sums of a hundred are single precision numbers."""
 
 
-def summand(heuristic: str, ratio: Array) -> Array:
-    """What each view that can make the path adds to the sum that `gain` needs."""
+def summand(heuristic: str, ratio: Array, exponent: float = 2.0) -> Array:
+    """What each view that can make the path adds to the sum that `gain` needs; `exponent`: of the
+    power heuristic."""
     if heuristic == "power":
-        return ratio * ratio
+        return at_most(ratio, LARGEST_SUMMAND ** (1 / exponent)) ** exponent
     return 1.0 + 0 * ratio if heuristic == "none" else ratio
 
 
@@ -32,7 +36,7 @@ def gain(ratio: Array, total: Array) -> Array:
     included. Only there do heuristics differ:
     mis:   w = 1 / S_r with S_r = sum_k r_k (balance heuristic); mwis has the same numerator, and
            its weights (1 / S_r) p_jj / p_ij = r_j / S_r
-    are this very gain. power: w = 1 / sum_k r_k^2.
+    are this very gain. power: w = 1 / sum_k r_k^alpha.
     none:  w = 1 / (number of views that can make the path), whatever their densities.
     """
     return ratio / total

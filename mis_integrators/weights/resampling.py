@@ -83,6 +83,18 @@ def gain(ratio: Array, share: Array, M: int, N: int = 1) -> Array:
     return M * (x / at_least(x + bracket(share, M), SMALLEST_DENOMINATOR))
 
 
+def cache_point_probability(neighbors: int) -> float:
+    """P_c = 1/(N_c + 1): the N_c nearest cache points and the virtual one, whose pmf is uniform,
+    are chosen alike (section 5.2)."""
+    return 1 / (neighbors + 1)
+
+
+def uniform_density_ratio(ends: Array) -> Array:
+    """q/p of the virtual cache point: M P_r = 1/ends, where a light sub-path has `ends` vertices on
+    average."""
+    return 1 / at_least(ends, SMALLEST_DENOMINATOR)
+
+
 def resampled_density(p: Array, q: Array, share: Array, M: int, N: int = 1) -> Array:
     """p_t = (1/(M p) + (1 - Q_s/(M Q)) / (N q))^-1 for t in Lambda_RIS (the paper prints N = 1)."""
     return p * gain(proposal_weight(q, p), share, M, N)
@@ -147,3 +159,15 @@ def second_moment(
         integrate(a * a / resampled_density(b, c / Q, norm / Q, M, N))
         for a, b, c, norm in zip(g, p, q_star, Q_s)
     )
+
+
+def variance_over_camera_paths(
+    conditional: Array, expected: Array, p_camera: Array, integrate: Callable[[Array], Array] = sum
+) -> Array:
+    """V[I] = E_Z[V[I | Z]] + V_Z[E[I | Z]] (equations 29 to 32): integral of V[I | Z]/p(Z), and the
+    variance of one camera sub-path's E[I | Z] = (integral of g)/p(Z).
+
+    `conditional`: `estimate_variance`, for p(Z) = 1, of each camera sub-path; `expected`: the sum
+    over s of the integral of g there; `p_camera`: its density.
+    """
+    return integrate(conditional / p_camera) + sample_variance(expected, p_camera, integrate)

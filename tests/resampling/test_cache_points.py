@@ -1,6 +1,7 @@
 """Cache points: which ones a place listens to, and light vertices drawn from their pmfs."""
 
 from mis_integrators.core.random import streams
+from mis_integrators.resampling.cache_pmfs import CachePmfs, cumulative_pmfs
 from mis_integrators.resampling.cache_points import NORMAL_COST, CacheGrid
 from mis_integrators.resampling.proposals import (
     BLIND_SHARE,
@@ -116,3 +117,35 @@ def test_no_light_vertices(rgb):
     )
     assert np.all(np.array(drawn) == 0)
     assert np.all(np.isfinite(np.array(proposals.probability(dr.zeros(mi.UInt32, 100), drawn))))
+
+
+def test_draws_from_single_cache_points(rgb):
+    """Frequencies of (cache point, light vertex) against the pmfs computed apart, the uniform one
+    of the virtual cache point included; from a pmf without light nothing is drawn."""
+    p, n = box_points(40)
+    grid = CacheGrid(mi.Point3f(p), mi.Normal3f(n), 3)
+    count, width, rng = 21, 32, np.random.default_rng(3)
+    r = rng.exponential(1, (40, width)) * (rng.random((40, width)) < 0.5)
+    r[:, count:] = 0
+    table = np.array(grid.table).reshape(-1, 3)
+    row = 5
+    r[table[row, 1]] = 0
+    flat = mi.Float(r.ravel())
+    cumulative, totals = cumulative_pmfs(flat, width)
+    pmfs = CachePmfs(grid, cumulative, totals, flat, dr.opaque(mi.UInt32, count), width)
+    lanes = dr.arange(mi.UInt32, 400000)
+    which, vertex, drawn = (
+        np.array(x) for x in pmfs.draw(mi.UInt32(row), streams(lanes, mi.UInt32(0)))
+    )
+    sums = r[table[row]].sum(axis=1, keepdims=True)
+    expected = np.concatenate(
+        [r[table[row], :count] / np.maximum(sums, 1e-30), np.full((1, count), 1 / count)]
+    )
+    said = pmfs.probabilities(mi.UInt32(row), dr.arange(mi.UInt32, count))
+    assert np.allclose([np.array(x) * np.ones(count) for x in said], expected, atol=2e-7)
+    for k in (0, 2, 3):
+        found = np.bincount(vertex[(which == k) & drawn], minlength=count)
+        assert_frequencies(found, len(which) / 4 * expected[k])
+    assert not drawn[which == 1].any() and drawn[which != 1].all()
+    asked = pmfs.ratios(mi.UInt32(row), dr.arange(mi.UInt32, count))
+    assert np.allclose(asked, r[table[row], :count], rtol=1e-6)

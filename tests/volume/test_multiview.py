@@ -175,13 +175,20 @@ def test_shifts(rgb, shift):
         assert shares["lost"] > 0.005
 
 
-@pytest.mark.parametrize("weights", ["power", *extended("mwis")])
+@pytest.mark.parametrize(
+    "weights",
+    [
+        {"weights": "power", "beta": 3.0},
+        *extended({"weights": "power"}, {"weights": "mwis"}),
+    ],
+    ids=["power3", "power", "mwis"],
+)
 def test_weights(rgb, weights):
     """MWIS is consistent only: its bias is far below the resolution at the 32 samples a pixel used
     here. The phase function has a lobe: under power weights the direction of the suffix must be
     drawn from the mixture of the views' lobes, whoever's path it is (under the balance heuristic
     one's own would do, for paths of all views make up the mixture)."""
-    views_agree(multiview(weights=weights), reference(0.6), cloud(g=0.6), block=0.05)
+    views_agree(multiview(**weights), reference(0.6), cloud(g=0.6), block=0.05)
 
 
 @pytest.mark.extended
@@ -279,6 +286,97 @@ def test_surfaces(rgb, hide_emitters):
     views_agree(
         multiview(hide_emitters=hide_emitters), oracle, scene, whole=0.02, block=0.1, most=200
     )
+
+
+def flat(origin, half, target=(0, 0, 0), depth=1.0, **extra):
+    """An orthographic view of 2 `half` by 2 `half`; `depth`: scale of its third axis."""
+    sensor = view(origin, target, kind="orthographic", **extra)
+    del sensor["fov"]
+    sensor["to_world"] = sensor["to_world"] @ mi.ScalarTransform4f().scale([half, half, depth])
+    return sensor
+
+
+def test_orthographic_views(rgb):
+    """Beside a perspective one, media and surfaces at the pivots; one has its third axis scaled and
+    a near plane that cuts off the lamp."""
+    views = [
+        flat((0.5, 1.2, 4.5), 1.3),
+        flat((2.0, 1.0, 3.0), 1.1, depth=0.5, near_clip=3.0, far_clip=40.0),
+        view((0, 1.2, 4.5)),
+    ]
+    together, _ = views_agree(
+        multiview(), volpath(), smoky(batch(views)), whole=0.02, block=0.1, most=200
+    )
+    assert together.statistics["reached"] > 0.2 * together.statistics["tried"]
+
+
+def three_media(sensor):
+    """Three media in a row whose majorants differ by factors of five, with gaps between them."""
+    majorants = (0.3, 1.5, 7.5)
+    media = {
+        f"cloud{k}": container(grid(sparse if k else even, scale=majorant, seed=k), 0.45, (x, 0, 0))
+        for k, (majorant, x) in enumerate(zip(majorants, (-1.1, 0, 1.1)))
+    }
+    return mi.load_dict(
+        {
+            "type": "scene",
+            **media,
+            "sensor": sensor,
+            "lamp": lamp(),
+            "sky": {"type": "constant", "radiance": grey(0.2)},
+        }
+    )
+
+
+def in_a_row():
+    """Views that look along the row from both ends, and across it."""
+    return [
+        view((-3.6, 0.5, 0.8), (0.2, 0, 0), fov=40.0),
+        view((3.4, 0.4, 1.2), (0, 0, 0), fov=44.0),
+        view((0.4, 0.8, 3.6), (0, 0, 0), fov=48.0),
+    ]
+
+
+@functools.cache
+def reference_of_three():
+    """The three media by `volpath`: computed once."""
+    oracle = OracleBatches(volpath(max_depth=4), three_media(batch(in_a_row())), spp=128)
+    oracle.add(24)
+    return oracle.estimate()
+
+
+@pytest.mark.parametrize(
+    "shift", ["majorant_optical_depth", "raw_depth", *extended("primary_sample")]
+)
+def test_three_media(rgb, shift):
+    """Where majorants differ along a line of sight, so do raw depth and majorant optical depth;
+    every stretch gives what `volpath` gives."""
+    batches, _ = views_agree(
+        multiview(shift=shift, max_depth=4),
+        reference_of_three(),
+        three_media(batch(in_a_row())),
+        whole=0.02,
+        block=0.1,
+    )
+    assert batches.statistics["lost"] == 0
+    # most paths meet nothing but the sky
+    assert batches.statistics["reached"] > 0.03 * batches.statistics["tried"]
+
+
+def test_stretches_differ_where_majorants_do(rgb):
+    """The same paths under two stretches: other densities in three media, the same in a single
+    one, where both are one function."""
+
+    def first_images(scene):
+        images = []
+        for shift in ("majorant_optical_depth", "raw_depth"):
+            session = multiview(shift=shift, max_depth=2, camera_paths=4).session(scene, 0, 1, 0)
+            session.iterate()
+            images.append(session.image()[:, :, :3])
+        return np.abs(images[0] - images[1]).mean() / images[0].mean()
+
+    assert first_images(three_media(batch(in_a_row()))) > 0.005
+    assert first_images(cloud()) < 1e-4
 
 
 @pytest.mark.extended
@@ -836,6 +934,8 @@ def test_little_light(rgb, depth, lit):
     [
         ({"shift": "depth"}, ['"shift"', "majorant_optical_depth"]),
         ({"weights": "best"}, ['"weights"', "mwis"]),
+        ({"weights": "power", "beta": 0.5}, ['"beta"', "from 1 to 8"]),
+        ({"beta": 3.0}, ['"beta"', '"power"']),
         ({"bdd": 1}, ['"bdd"', "camera_paths"]),
         ({"max_depth": -2}, ['"max_depth"']),
     ],
@@ -855,7 +955,8 @@ def test_scenes_refused(rgb):
             mis_integrators.render_views(scene, integrator, spp=1)
         assert all(word in str(error.value) for word in words), error.value
 
-    refused(["volpath_multiview", "OrthographicCamera", "perspective"], s={"type": "orthographic"})
+    meter = {"type": "sphere", "sensor": {"type": "irradiancemeter", "film": film(1)}}
+    refused(["volpath_multiview", "IrradianceMeter", "perspective"], meter=meter)
     refused(
         ["reconstruction filter"],
         s=view((0, 0, 4)),

@@ -118,6 +118,36 @@ def test_variance_is_exact(world):
         assert enumerate_world(world) == pytest.approx((total, variance(world)), rel=1e-9)
 
 
+@pytest.mark.parametrize("M, N", [(1, 1), (2, 1), (2, 3)])
+def test_variance_over_camera_paths_is_exact(M, N):
+    """Three camera sub-paths with worlds of their own, of which one is drawn: equations 29 to 32
+    against the mean and second moment over every outcome."""
+    p_camera = np.array([0.2, 0.5, 0.3])
+    worlds = [random_world(seed, M, N, (3, 2)) for seed in (20, 21, 22)]
+    outcomes = np.array([enumerate_world(world) for world in worlds])
+    mean = outcomes[:, 0].sum()
+    # Each camera sub-path's estimate is divided by p(Z), and made with that probability.
+    square = np.sum((outcomes[:, 1] + outcomes[:, 0] ** 2) / p_camera)
+    found = resampling.variance_over_camera_paths(
+        np.array([variance(world) for world in worlds]),
+        np.array([sum(g.sum() for g in world["g"]) for world in worlds]),
+        p_camera,
+        np.sum,
+    )
+    assert found == pytest.approx(square - mean**2, rel=1e-9)
+
+
+def test_cache_points_share_one_technique():
+    """N_c cache points and the virtual one, all with the same target and pmf, are one technique:
+    their gains add up to that without cache points."""
+    neighbors, M, share, ends = 3, 20, 0.4, 2.5
+    ratio = resampling.uniform_density_ratio(ends)
+    assert ratio == pytest.approx(M * 1 / (M * ends))  # M P_r, of a uniform P_r
+    alone = resampling.gain(ratio, share, M)
+    chance = resampling.cache_point_probability(neighbors)
+    assert (neighbors + 1) * chance * alone == pytest.approx(alone)
+
+
 def test_densities_are_those_of_the_variance(world):
     """The variance is the integral of g^2/p_t less squares of integrals: that is where p_t comes
     from."""

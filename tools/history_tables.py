@@ -1,0 +1,68 @@
+#!/usr/bin/env python3
+"""Write the tables of docs/*.md that show recorded figures, from benchmarks/history/papers: between
+``<!-- rows: FILE.json: COLUMN, COLUMN, ... -->`` and ``<!-- end -->``.
+
+A column with ``~`` behind its name is shown with its interval (``NAME low``, ``NAME high``); what
+follows ``=`` is its heading. Rows without a figure in the last column are left out.
+``history_tables.py --check`` changes nothing, and exits with status 1 where a table is not what the
+file says.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+HISTORY = ROOT / "benchmarks" / "history" / "papers"
+PLACE = re.compile(r"(<!-- rows: ([\w.]+): ([^>]*?) -->\n).*?(<!-- end -->)", re.DOTALL)
+
+
+def figure(value: object) -> str:
+    """A cell: three digits of a number."""
+    if isinstance(value, float):
+        return f"{value:.3g}" if abs(value) < 1000 else f"{value:.0f}"
+    return f"`{value}`" if isinstance(value, str) and "=" in value else str(value)
+
+
+def cell(row: dict, name: str) -> str:
+    """The figure of a column, with its interval if its name ends with ``~``."""
+    bare = name.rstrip("~")
+    text = figure(row[bare])
+    if name.endswith("~"):
+        low, high = row[f"{bare} low"], row[f"{bare} high"]
+        if low is not None and low != high:
+            text += f" ({figure(low)} to {figure(high)})"
+    return text
+
+
+def table(file: str, columns: str) -> str:
+    """The Markdown table of the rows of a file."""
+    names, headings = [], []
+    for column in columns.split(","):
+        name, _, heading = (part.strip() for part in column.partition("="))
+        names.append(name)
+        headings.append(heading or name.rstrip("~"))
+    rows = json.loads((HISTORY / file).read_text())["rows"]
+    rows = [row for row in rows if row[names[-1].rstrip("~")] is not None]
+    lines = [headings, ["---"] * len(names), *([cell(row, name) for name in names] for row in rows)]
+    return "".join("| " + " | ".join(line) + " |\n" for line in lines)
+
+
+def main(arguments: list[str]) -> int:
+    stale = 0
+    for page in sorted((ROOT / "docs").rglob("*.md")):
+        before = page.read_text()
+        after = PLACE.sub(lambda m: m[1] + "\n" + table(m[2], m[3]) + "\n" + m[4], before)
+        if after != before:
+            stale += 1
+            print(f"{'stale' if '--check' in arguments else 'updated'}: {page.name}")
+            if "--check" not in arguments:
+                page.write_text(after)
+    return int(bool(stale) and "--check" in arguments)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
