@@ -15,9 +15,10 @@ import mitsuba as mi
 mi.set_variant("llvm_ad_rgb")
 
 from common import references  # noqa: E402
-from common.methods import COMPARED, VARIED, Method, parse_method, registered  # noqa: E402
+from common.methods import CHOSEN_FROM, COMPARED, VARIED, Method, parse_method, registered  # noqa: E402
 from common.scene_files import BUNDLED, bundled  # noqa: E402
 from experiments import (  # noqa: E402
+    choice,
     combine,
     compare,
     constants,
@@ -163,6 +164,18 @@ def _parser() -> argparse.ArgumentParser:
         default=[0.15, 0.5],
         metavar="SHARE",
         help="of the time that the second method has (default: 0.15 0.5)",
+    )
+
+    command = _measuring(commands, "choice", choice)
+    _renders(command, (1.0, 5.0, 20.0))
+    _compares_with_references(command)
+    command.set_defaults(seeds=1, integrators=registered(CHOSEN_FROM))
+    command.add_argument(
+        "--rooms",
+        type=int,
+        default=0,
+        metavar="N",
+        help="random rooms besides the scenes (default: 0)",
     )
 
     command = _measuring(commands, "converge", converge)
@@ -670,9 +683,20 @@ def _resampling(command: argparse.ArgumentParser, seconds: float) -> None:
     )
 
 
-def _renders(command: argparse.ArgumentParser, seconds: float | None) -> None:
-    """What is rendered, and how long."""
+def _renders(command: argparse.ArgumentParser, seconds: float | tuple[float, ...] | None) -> None:
+    """What is rendered, and how long; several times are tried one after the other."""
     _chooses(command, COMPARED, "ratios are to path, or to the first where it is not among them")
+    if isinstance(seconds, tuple):
+        command.set_defaults(spp=None)
+        command.add_argument(
+            "--times",
+            nargs="+",
+            type=_positive,
+            default=seconds,
+            metavar="SECONDS",
+            help=f"rendering seconds of each (default: {' '.join(f'{t:g}' for t in seconds)})",
+        )
+        return
     command.add_argument(
         "--time",
         type=_positive,

@@ -53,6 +53,16 @@ VARIED = (
 )
 """What variance maps are made of unless said otherwise: strategies that merge, alone and
 together."""
+CHOSEN_FROM = (
+    "path",
+    "path:sampler=multijitter",
+    "bdpm:bdd=0",
+    "bdpm_opt2",
+    "bdpm_opt3",
+    "pcbpt",
+    "bdpm_auto",
+)
+"""What `bdpm_auto` is judged by unless said otherwise."""
 BASE = "path"
 """What ratios are to, if it is among the methods; else the first of them."""
 MITSUBAS = ("path", "ptracer", "volpath", "volpathmis", "direct", "prb")

@@ -274,7 +274,7 @@ def chosen(settings: dict) -> str:
     return " ".join(
         f"{name}={value:.3g}" if isinstance(value, float) else f"{name}={value}"
         for name, value in settings.items()
-        if "." in name
+        if "." in name or name == "choice"
     )
 
 

@@ -570,3 +570,31 @@ def test_whether_methods_should_share_the_time(tmp_path, module, capsys):
     with pytest.raises(SystemExit):
         module("run").main(["combine", "--shares", "1.5"])
     assert "1.5 is not a number below 1" in capsys.readouterr().err
+
+
+def test_whether_bdpm_auto_is_behind(tmp_path, module):
+    """A row a scene and time, random rooms among them, with what was chosen; shares over all."""
+    scene = tmp_path / "tiny.xml"
+    scene.write_text(TINY)
+    module("run").main(
+        [
+            *("choice", "--scenes", str(scene), "--rooms", "1", "--times", "0.1", "0.2"),
+            *("--integrators", "path", "bdpm_auto", "--reference-time", "0.2", "--scale", "0.1"),
+            *("--references", str(tmp_path / "references"), "--out", str(tmp_path / "out")),
+        ]
+    )
+    rows = json.loads((tmp_path / "out" / "choice.json").read_text())["rows"]
+    asked = [(scene, t) for scene in ("tiny", "room00") for t in (0.1, 0.2)]
+    assert [(row["scene"], row["seconds"]) for row in rows] == asked
+    for row in rows:
+        assert row["relMSE / best"] == max(1, row["relMSE / best path"])
+        assert row["chosen"] in ("path", "bdpm", "bdpm_opt2", "bdpm_opt3")
+    found = {row["ratio"]: row for row in module("experiments.choice").shares(rows)}
+    of_path = [row["MSE / best path"] for row in rows]
+    assert found["MSE / best path"]["largest"] == max(of_path)
+    assert found["MSE / best path"]["<= 1.3"] == np.mean(np.array(of_path) <= 1.3)
+
+
+def test_random_rooms_are_the_same_each_time(module):
+    rooms = module("common.rooms")
+    assert rooms.room(3) == rooms.room(3) != rooms.room(4)
