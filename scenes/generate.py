@@ -11,6 +11,7 @@ the images.
 from pathlib import Path
 
 import generate_multiview
+import generate_still_life
 import mitsuba as mi
 import numpy as np
 
@@ -359,6 +360,7 @@ def main():
     patina()
     sky()
     generate_multiview.main()
+    generate_still_life.write_all(HERE / "gallery", write_ply)
 
 
 if __name__ == "__main__":
