@@ -6,13 +6,14 @@
 # make figures set everything up, then measure all figures of docs/results.md anew (half an hour)
 # make lint     set everything up, then check style, layout and type hints
 # make gallery  set everything up, then render the pictures of docs/ (minutes)
+# make hero     set everything up, then render the picture of README.md (a quarter of an hour)
 # make docs     set everything up, then build the documentation site: out/site/index.html
 
 PYTHON ?= python3
 VENV := .venv
 SETUP := tools/setup.sh
 
-.PHONY: render test test-all mutants lint bench figures gallery docs clean
+.PHONY: render test test-all mutants lint bench figures gallery hero docs clean
 .DELETE_ON_ERROR:
 
 render: $(VENV)/installed
@@ -38,6 +39,10 @@ gallery: $(VENV)/installed
 	@for scene in scenes/*.xml; do name=$$(basename $$scene .xml); \
 	    $(VENV)/bin/mis-render $$scene -i bdpm_auto --seed 1 --time 60 -o out/$$name.exr && cp out/$$name.png docs/images/ || exit 1; done
 	PYTHON=$(VENV)/bin/python tools/plugin_pictures.sh
+
+hero: $(VENV)/installed
+	$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check --editable '.[bench,denoise]'
+	PYTHON=$(VENV)/bin/python tools/hero.sh
 
 docs: $(VENV)/installed
 	$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check --editable '.[docs]'

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import generate_multiview
 import generate_outdoor
+import generate_still_life
 import mitsuba as mi
 import numpy as np
 
@@ -361,6 +362,7 @@ def main():
     sky()
     generate_multiview.main()
     generate_outdoor.main(write_ply)
+    generate_still_life.write_all(HERE / "gallery", write_ply)
 
 
 if __name__ == "__main__":

@@ -18,8 +18,9 @@ from .request import Opened
 MISSING = "pictures side by side need matplotlib: pip install 'mis-integrators[bench]'"
 DOTS = 100
 """Pixels an inch of the picture: how large its letters are beside the images."""
-LABEL, GAP = 60, 8
-"""Height of a label, and width between the images, in pixels."""
+LABEL, GAP, LETTERS = 60, 8, 9
+"""Height of a label and width between the images, in pixels, and size of the letters, in points;
+larger for images wider than `SMALLEST_WIDTH`, so that they can be read when all is scaled down."""
 SMALLEST_WIDTH = 400
 """Images that are narrower are enlarged until their labels fit."""
 
@@ -175,21 +176,22 @@ def write_picture(path: Path, rows: Sequence[Sequence[Entry]], names: Sequence[s
     from matplotlib.figure import Figure
 
     height, width = rows[0][0].picture.shape[:2]
-    zoom = math.ceil(SMALLEST_WIDTH / width)
+    zoom, scale = math.ceil(SMALLEST_WIDTH / width), max(1.0, width / SMALLEST_WIDTH)
     height, width, columns = height * zoom, width * zoom, len(rows[0])
-    whole = np.array([columns * width + (columns - 1) * GAP, len(rows) * (height + LABEL)])
+    label_height, gap = (round(size * scale) for size in (LABEL, GAP))
+    whole = np.array([columns * width + (columns - 1) * gap, len(rows) * (height + label_height)])
     figure = Figure(figsize=tuple(whole / DOTS), dpi=DOTS, facecolor="white")
     for row, entries in enumerate(rows):
         for column, entry in enumerate(entries):
-            left, bottom = column * (width + GAP), whole[1] - (row + 1) * (height + LABEL)
+            left, bottom = column * (width + gap), whole[1] - (row + 1) * (height + label_height)
             axes = figure.add_axes(
                 (left / whole[0], bottom / whole[1], width / whole[0], height / whole[1])
             )
             axes.imshow(_srgb(entry.picture, names), interpolation="nearest", aspect="auto")
             axes.axis("off")
             label = "\n".join(filter(None, [entry.name, entry.effort, entry.quality]))
-            middle = (left + width / 2) / whole[0], (bottom + height + LABEL / 2) / whole[1]
-            figure.text(*middle, label, ha="center", va="center", fontsize=9)
+            middle = (left + width / 2) / whole[0], (bottom + height + label_height / 2) / whole[1]
+            figure.text(*middle, label, ha="center", va="center", fontsize=LETTERS * scale)
     with output.replacing(path) as temporary:
         figure.savefig(temporary, format="png", dpi=DOTS)
 

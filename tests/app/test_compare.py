@@ -91,6 +91,19 @@ def test_picture_has_one_exposure_and_labels(rgb, tmp_path):
     assert np.all(found[60 : 60 + height, width : width + 8] == 255)
 
 
+def test_labels_grow_with_wide_images(rgb, tmp_path):
+    """Twice as wide as the narrowest that is not enlarged: labels and letters are twice as high."""
+    heights = []
+    for width in 400, 800:
+        rows = [[compare.Entry("one", "", flat(0.5, (50, width)), "")] * 2]
+        compare.write_picture(tmp_path / "a.png", rows, NAMES)
+        found = png(tmp_path / "a.png")
+        label = 60 * width // 400
+        assert found.shape[:2] == (50 + label, 2 * width + 8 * width // 400)
+        heights.append(np.ptp(np.nonzero(found[:label].min(axis=(1, 2)) < 128)[0]))
+    assert heights[1] == pytest.approx(2 * heights[0], abs=3)
+
+
 def test_errors_are_those_of_the_metrics(rgb):
     pytest.importorskip("flip_evaluator")
     words = compare.quality(flat(0.6), flat(0.5))

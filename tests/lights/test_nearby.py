@@ -15,13 +15,14 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from worlds import T, diffuse, film, look
 
 COUNT = 1 << 18
 
 
+@settings(deadline=None)
 @given(
     st.integers(0, 2**32 - 1),
     st.tuples(*[st.integers(1, 4)] * 3),
