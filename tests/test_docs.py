@@ -185,6 +185,14 @@ def test_tables_are_those_of_the_docstrings():
     assert result.returncode == 0, result.stdout
 
 
+def test_tables_are_those_of_the_history():
+    """Recorded figures, and the command that writes them."""
+    script = ROOT / "tools" / "history_tables.py"
+    result = run([sys.executable, str(script), "--check"], ROOT)
+    assert result.returncode == 0, result.stdout
+    assert any("<!-- rows: " in page.read_text() for page in PAGES)
+
+
 @pytest.mark.parametrize("page", [*PAGES, *OTHERS], ids=lambda page: str(page.relative_to(ROOT)))
 def test_links_lead_somewhere(page):
     """Files that exist, and headings of those that are named."""
