@@ -23,6 +23,7 @@ MODULES: tuple[str, ...] = (
     "bdpm",
     "weighted",
     "bdpm_balance",
+    "published",
     "bdpm_opt",
     "bdpt",
     "vcm",
