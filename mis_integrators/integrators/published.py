@@ -12,6 +12,7 @@ import mitsuba as mi
 
 from ..core.film import splat_samples
 from ..core.packing import rounded_up
+from ..core.recording import no_garbage_collection
 from ..mis.published import FrozenMap, Limits, ThreeStrategies, TwoStrategies, typical_flux
 from ..photons.chains import NONE, PhotonChains, trace_camera_chains, trace_photon_chains
 from ..photons.grid import build_photon_map, smallest_cell
@@ -99,6 +100,10 @@ class PublishedSession(BDPMSession):
         radii = self.radii_at(iteration)
         if not radii:
             return super()._render(iteration)
+        with no_garbage_collection():
+            return self._render_weighted(iteration, radii)
+
+    def _render_weighted(self, iteration, radii):
         self._learn()
         spectral = self._spectral(iteration)
         chains = self._trace_chains(
@@ -138,8 +143,8 @@ class PublishedSession(BDPMSession):
             if wanted <= capacity:
                 break
             capacity = rounded_up(wanted + wanted // 8)
-        gathered = light.gather(chains, self.chunk, sequence.own_seed())
-        radiance += gathered if beyond is None else gathered * beyond
+        gathered, direct = light.gather(chains, self.chunk, sequence.own_seed())
+        radiance += direct + (gathered if beyond is None else gathered * beyond)
         if integrator.hide_emitters:
             radiance = dr.select(alpha > 0, radiance, 0)
         weight = 1 if beyond is None else dr.rcp(beyond)
@@ -177,10 +182,10 @@ class LightOfIteration:
     # ------------------------------------------------------------------ sums
 
     def gather(self, camera, paths, seed):
-        """Radiance of photons at the vertices of camera paths, and of direct light beyond the first
-        strategy's vertex, all of it weighted: a spectrum for each of `paths` paths."""
+        """Weighted radiance of photons at the vertices of camera paths, and of direct light beyond
+        the first strategy's vertex: two spectra for each of `paths` paths."""
         self.camera, self.seed = camera, seed
-        self.total = dr.zeros(mi.Spectrum, paths)
+        self.photons, self.direct = dr.zeros(mi.Spectrum, paths), dr.zeros(mi.Spectrum, paths)
         first = self.session.integrator.first_vertex
         for number in range(first):  # before all strategies: only caustics are merged
             self._add("caustic", number, 1)
@@ -194,14 +199,14 @@ class LightOfIteration:
             self._finish(first + 1, root)
         else:
             self._finish(first + 2, self._inner(first + 1, root))
-        return self.total
+        return self.photons, self.direct
 
     def _inner(self, number, root):
         """Light at vertices z_1 of three strategies: their `Middle`, for those beyond."""
         theory, camera = self.theory, self.camera
         place = camera.section(number)
         record, link = camera.record(place), camera.link(place)
-        middle = theory.of_inner(record, link, self._before(link, number, root))
+        middle = theory.of_inner(record, link, self._before(record, link, number, root))
         weight = 1 - middle.direct_weight()
         self._add_direct(number, record, weight)
         self._add("caustic", number, weight)
@@ -216,39 +221,41 @@ class LightOfIteration:
         place = camera.section(number)
         record, link = camera.record(place), camera.link(place)
         if self.session.integrator.strategies == 2:
-            known = self._before(link, number, before)
+            known = self._before(record, link, number, before)
         else:
-            index, there = self._place_before(link, number)
-            known = before.at(index, there)
+            known = before.at(*self._place_before(record, link, number))
         weight = self.theory.of_last(record, link, known)
         dr.eval(weight)
         self._add_direct(number, record, weight)
         for kind in self.maps:
             self._add(kind, number, weight)
 
-    def _place_before(self, link, number):
+    def _place_before(self, record, link, number):
         """Numbers, in their section, of the vertices before those with this number, and whether
         there are any."""
-        there = link["before"] != NONE
-        return link["before"] - (number - 1) * self.camera.capacity, there
+        there = (dr.max(record["throughput"]) > 0) & (link["before"] != NONE)
+        index = link["before"] - (number - 1) * self.camera.capacity
+        return dr.select(there, index, 0), there  # what is not there may hold any number
 
-    def _before(self, link, number, arrays):
+    def _before(self, record, link, number, arrays):
         """What is known of the vertices before."""
-        index, there = self._place_before(link, number)
+        index, there = self._place_before(record, link, number)
         return [dr.gather(mi.Float, array, index, there) for array in arrays]
 
     # ------------------------------------------------------------------ parts of the sum
 
-    def _to_paths(self, record, values):
+    @staticmethod
+    def _to_paths(total, record, values):
+        """Adds values of vertices to those of their paths."""
         used = dr.max(record["throughput"]) > 0
         dr.scatter_reduce(
-            dr.ReduceOp.Add, self.total, values, record["path"], used, dr.ReduceMode.Direct
+            dr.ReduceOp.Add, total, values, record["path"], used, dr.ReduceMode.Direct
         )
-        dr.eval(self.total)
+        dr.eval(total)
 
     def _add_direct(self, number, record, weight):
         place = self.camera.section(number)
-        self._to_paths(record, self.camera.light(place) * weight)
+        self._to_paths(self.direct, record, self.camera.light(place) * weight)
 
     def _correction(self, kind, record, radius):
         session = self.session
@@ -266,7 +273,7 @@ class LightOfIteration:
         (values,) = self.session._merge(
             self.maps[kind], record, kind, [radius], self.spectral, scale=scale
         )
-        self._to_paths(record, values * self._correction(kind, record, radius))
+        self._to_paths(self.photons, record, values * self._correction(kind, record, radius))
 
     def _add_pairs(self, number, record, weight_of):
         """Indirect photons at vertices with a number, each under a weight of its own,
@@ -293,7 +300,7 @@ class LightOfIteration:
             )
             dr.eval(values)
         values *= dr.rcp(dr.pi * dr.square(radius) * session.light_path_count)
-        self._to_paths(record, values * self._correction("indirect", record, radius))
+        self._to_paths(self.photons, record, values * self._correction("indirect", record, radius))
 
 
 FROZEN = 3

@@ -274,7 +274,7 @@ class ThreeStrategies:
         """Whether photons have passed a vertex z_2 before their z_1, and there `f1`, `p1`, L, b."""
         link = chains.link(place, active)
         longer = active & (link["before"] != NONE)
-        _, L, b = self.frozen.light_of(light, link["before"], longer)
+        _, L, b = self.frozen.light_of(light, dr.select(longer, link["before"], 0), longer)
         return longer, (link["f"], link["p"], L, b)
 
     def flux_terms(self, meeting, place):

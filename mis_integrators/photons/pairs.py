@@ -22,6 +22,10 @@ PAIRS_AT_ONCE = 1 << 19
 """Pairs that are evaluated together (bounds memory)."""
 
 
+MISSING = (1 << 32) - 1
+"""Stands for a pair that has been counted and is not found again."""
+
+
 def parts(count: int):
     """Numbers 0, 1, ..., count - 1 in parts of `PAIRS_AT_ONCE` at most."""
     for first in range(0, count, PAIRS_AT_ONCE):
@@ -115,22 +119,21 @@ def list_pairs(photon_map, vertices, radius, longest: int):
     first = dr.prefix_sum(counts)
     dr.eval(counts, first)
     total = int(dr.sum(counts)[0])
-    vertex, photon = dr.zeros(mi.UInt32, total), dr.zeros(mi.UInt32, total)
-    if total == 0:
-        return vertex, photon
-    number = dr.arange(mi.UInt32, dr.width(counts))
+    vertex, photon = (dr.full(mi.UInt32, MISSING, max(total, 1)) for _ in range(2))
+    dr.eval(vertex, photon)
+    number, end = dr.arange(mi.UInt32, dr.width(counts)), first + counts
 
     def write(index, landing, offset, squared, hit, state):
         hit = _within(vertices, landing, offset, squared, radius, longest, hit)
+        hit &= state[0] < end  # rounding may differ from that of the kernel that counts
         dr.scatter(vertex, number, state[0], hit)
         dr.scatter(photon, index, state[0], hit)
         return (state[0] + dr.select(hit, mi.UInt32(1), mi.UInt32(0)),)
 
-    for_each_photon(
-        photon_map, vertices.p, radius, vertices.active, write, (mi.UInt32(first),)
-    )
+    for_each_photon(photon_map, vertices.p, radius, vertices.active, write, (mi.UInt32(first),))
     dr.eval(vertex, photon)
-    return vertex, photon
+    there = dr.compress(photon != MISSING)
+    return dr.gather(mi.UInt32, vertex, there), dr.gather(mi.UInt32, photon, there)
 
 
 def meeting_of(photon_map, vertices, photon):
