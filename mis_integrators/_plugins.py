@@ -23,6 +23,7 @@ MODULES: tuple[str, ...] = (
     "bdpm",
     "weighted",
     "bdpm_balance",
+    "published_optimal",
     "bdpm_opt",
     "bdpt",
     "vcm",

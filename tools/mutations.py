@@ -110,7 +110,7 @@ MUTATIONS = [
         f"{RIS}::test_weights_sum_to_one",
     ),
     Mutation(
-        "mis/published.py",
+        "mis/published_resampling.py",
         "return [*after[:-1], state[2]]",
         "return [*after[:-1], after[2]]",
         "what a light vertex sends to cache points holds its own scattering twice",

@@ -110,14 +110,15 @@ ALIGNMENT = 64
 
 
 def from_numpy(dtype, values):
-    """The numbers `values` (NumPy, flat) as a Dr.Jit array of type `dtype`. On the CPU Dr.Jit goes
-    on using NumPy's memory: here that of a copy, which begins where all its arrays do, since
-    kernels that read another are compiled anew whenever that happens to be aligned in another
-    way."""
+    """The numbers `values` (NumPy, flat) as a Dr.Jit array of type `dtype` in memory of its own.
+    Without the copy Dr.Jit goes on using NumPy's memory, and kernels that read it are compiled anew
+    whenever that happens to be aligned in another way; so is the one that copies."""
     values = np.asarray(values, np.float32 if dr.is_float_v(dtype) else np.uint32)
     array = dtype(_aligned(values))
-    dr.eval(array)
-    return array
+    copy = array + dr.opaque(dtype, 0)  # (a gather of all would be the array itself)
+    dr.eval(copy)
+    dr.sync_thread()  # kernels wait for their turn, NumPy's memory is given back at once
+    return copy
 
 
 def _aligned(values):

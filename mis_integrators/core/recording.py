@@ -10,7 +10,7 @@ import mitsuba as mi
 
 
 @contextlib.contextmanager
-def _no_garbage_collection():
+def no_garbage_collection():
     """A scene that Python's collector destroys in the middle of a recording aborts the process (its
     Embree release cannot be recorded), so the collector waits."""
     enabled = gc.isenabled()
@@ -79,7 +79,7 @@ def frozen(function, tidy=gc.collect):
     fresh, plain = True, False
 
     def attempt(args):
-        with _no_garbage_collection():
+        with no_garbage_collection():
             return recorded(anchor, *args)
 
     def call(*args):

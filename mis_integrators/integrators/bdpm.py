@@ -323,15 +323,18 @@ class BDPMSession(PilotedSession):
         )
 
     def _covered(self, scene, tables, vertices, radius, seed):
+        """`covered` of the vertices of a buffer (recorded: `tables` are what it reads)."""
+        return self.covered(scene, read_queries(vertices), radius, seed)
+
+    def covered(self, scene, record, radius, seed):
         """Share of each vertex' merge disk that holds surface; one where the surface is not
         Lambertian: in a highlight the noise of dividing by an estimate would outweigh what it
-        mends."""
-        vertices = read_queries(vertices)
-        probed = dr.max(vertices["throughput"]) > 0
+        mends. `record` as of `read_queries`."""
+        probed = dr.max(record["throughput"]) > 0
         if self.traits.has_rough:
-            bsdf = vertices["hit"].shape.bsdf()
+            bsdf = record["hit"].shape.bsdf()
             probed &= lookup(self.traits.lambertian, bsdf, mi.Bool, probed)
-        return dr.select(probed, covered_share(scene, vertices, radius, seed, probed), 1)
+        return dr.select(probed, covered_share(scene, record, radius, seed, probed), 1)
 
     def _per_path(self, values, vertices, paths):
         """Sums values of the vertices for each of `paths` camera paths."""

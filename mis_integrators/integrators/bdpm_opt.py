@@ -14,6 +14,8 @@ from ..photons.irradiance_cache import IrradianceCache
 from ..photons.trace import trace_light_paths
 from ..pilot.denoiser import LEFT
 from .common import MOST_LIGHT_PATHS
+from .parameters import ParameterError
+from .published_optimal import STRATEGIES, PublishedSession
 from .weighted import WeightedBDPM, WeightedSession
 
 USUAL_FROZEN_PATHS = 1 << 16
@@ -43,14 +45,15 @@ class BDPMOpt(WeightedBDPM):
      * - weights
        - |string|
        - ``full`` keeps the means over directions in the optimal weights, estimated from typical
-         neighbours; ``local`` drops them, which is cheaper and on diffuse scenes as good. (Default:
-         ``local``)
+         neighbours; ``local`` drops them, which is cheaper and on diffuse scenes as good.
+         ``published`` is the reference: the weights as the papers print them, from gathers in a
+         frozen photon map; for two or three strategies, slow. (Default: ``local``)
      * - mix_diffuse
        - |bool|
        - Whether strategies go on beyond vertices that scatter as Lambertians do; else a path's
          first Lambertian vertex is its last strategy. It makes iterations less noisy and
-         longer. Images that will be ``denoised`` have it unless it is given. (Default: no, i.e.
-         |false|)
+         longer. Images that will be ``denoised`` have it unless it is given, and published weights
+         know nothing else. (Default: no, i.e. |false|)
      * - frozen_photons
        - |int|
        - Light sub-paths of the pass from which the weights learn where light is; they do not
@@ -93,11 +96,32 @@ class BDPMOpt(WeightedBDPM):
         self.first_vertex = self.bdd = parameters.integer(
             "first_vertex", 0, 0, "from 0 to 16", high=16
         )
-        self.weights = parameters.choice("weights", "local", ("full", "local"))
-        self.mix_diffuse = parameters.boolean("mix_diffuse", self.denoised)
+        self.weights = parameters.choice("weights", "local", ("full", "local", "published"))
+        published = self.weights == "published"
+        self.mix_diffuse = parameters.boolean("mix_diffuse", self.denoised or published)
+        if published:
+            self.check_published()
         self.frozen_photons = parameters.integer(
             "frozen_photons", 0, 0, "at least 0 (0: 65536)", high=MOST_LIGHT_PATHS
         )
+
+    def check_published(self):
+        """Refuses what the published weights do not have."""
+        if self.strategies not in STRATEGIES:
+            raise ParameterError(
+                f'{self.plugin}: parameter "weights" = "published" allows "strategies" 2 or 3, for '
+                f"which weights are printed; got {self.strategies}"
+            )
+        if not self.mix_diffuse:
+            raise ParameterError(
+                f'{self.plugin}: parameter "weights" = "published" allows no "mix_diffuse" = false: '
+                "the papers mix strategies at all surfaces"
+            )
+        if self.splits_light:
+            raise ParameterError(
+                f'{self.plugin}: parameter "weights" = "published" allows no layers "direct", '
+                '"indirect" or "caustic" among the "aovs"'
+            )
 
     def settings(self):
         return {
@@ -109,7 +133,8 @@ class BDPMOpt(WeightedBDPM):
         }
 
     def new_session(self, scene, sensor, seed, iterations):
-        return BDPMOptSession(self, scene, sensor, seed, iterations)
+        session = PublishedSession if self.weights == "published" else BDPMOptSession
+        return session(self, scene, sensor, seed, iterations)
 
 
 class BDPMOpt2(BDPMOpt):

@@ -21,7 +21,7 @@ from ..core.recording import lanes, recorder
 from ..core.spectra import channel_mean
 from ..core.traits import SceneTraits
 from ..lights.lights import Lights
-from ..mis.published import PublishedWeights, published_tables, unknown_tables
+from ..mis.published_resampling import PublishedWeights, published_tables, unknown_tables
 from ..mis.resampling import (
     LENGTHS,
     ResampledWeights,

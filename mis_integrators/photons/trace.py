@@ -36,10 +36,19 @@ class PhotonVisitor:
         return [sums, [mi.Bool(False)] if self.marked else []]
 
     def arrive(self, state, at, active):
-        store, (sums, mark) = self.store, state
+        sums, mark = state
         if self.light_state is not None:
             straight = active & at.first & ~at.had_delta
             sums = self.light_state.first_vertex(sums, at.si, at.source, straight)
+        slot, keep = self.keep(at, mark, active)
+        if self.light_state is not None:
+            words = self.light_state.words(sums)
+            write_packets(self.store.mis_words, words, slot, keep)
+        return [sums, mark]
+
+    def keep(self, at, mark, active):
+        """Stores the photons that are to be kept: their places, and which they are."""
+        store = self.store
         keep = active & mi.has_flag(at.bsdf.flags(), mi.BSDFFlags.Smooth)
         keep &= at.scattered | at.had_delta | self.keep_direct
         slot = dr.scatter_inc(store.count, mi.UInt32(0), keep)
@@ -55,9 +64,7 @@ class PhotonVisitor:
         if self.marked:
             photon["delta_at_light"] = mark[0]
         write_photon(store.surface, store.power, slot, photon, keep)
-        if self.light_state is not None:
-            write_packets(store.mis_words, self.light_state.words(sums), slot, keep)
-        return [sums, mark]
+        return slot, keep
 
     def leave(self, state, at, wo, delta, active):
         sums, mark = state

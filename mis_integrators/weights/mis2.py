@@ -24,7 +24,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from mis_integrators.weights import Array
+from . import Array
 
 
 def shared_density(p: Array, camera_paths: int = 1, M: int = 0) -> Array:

@@ -30,7 +30,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from mis_integrators.weights import Array
+from . import Array
 
 
 def first_cost(f0: Array, camera_paths: int = 1) -> Array:
