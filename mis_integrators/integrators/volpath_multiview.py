@@ -120,10 +120,8 @@ class VolpathMultiview(IterativeIntegrator):
     def read_parameters(self, parameters):
         self.shift = parameters.choice("shift", "majorant_optical_depth", tuple(SHIFTS))
         self.weights = parameters.choice("weights", "mis", HEURISTICS)
-        self.beta = 2.0
-        if self.weights == "power":
-            self.beta = parameters.number("beta", 2.0, lambda x: 1 <= x <= 8, "from 1 to 8")
-        else:
+        self.beta = parameters.number("beta", 2.0, lambda x: 1 <= x <= 8, "from 1 to 8")
+        if self.weights != "power":
             parameters.refuse("beta", 'only weights = "power" have an exponent')
         self.add_nulls = parameters.boolean("add_nulls", True)
 
