@@ -18,6 +18,7 @@ from ..lights.lights import Lights
 from ..paths.camera import film_sample_count, film_size
 from ..paths.layers import CHANNELS, SPLIT
 from ..paths.light_classes import LightClasses
+from ..paths.lobes import narrow_bsdfs
 from ..paths.setting import World
 from ..photons.coverage import covered_share
 from ..photons.gather import QueryVertices, gather_photons, mean_photon_count
@@ -178,8 +179,9 @@ class BDPMSession(PilotedSession):
             or (self.traits.has_delta and (depth < 0 or depth >= 3))
         )
         self.has_indirect = not self.lights.dark and (depth < 0 or depth >= integrator.bdd + 3)
+        self.narrow = narrow_bsdfs(scene) if self.passes_narrow and self.has_indirect else None
         self.one_vertex = not self.traits.has_mixed and (
-            integrator.bdd == 0 or not self.has_caustics
+            (integrator.bdd == 0 and self.narrow is None) or not self.has_caustics
         )
         self.split_paths(CAMERA_CHUNK)
         self.photon_capacity = rounded_up(3 * self.light_path_count)
@@ -201,6 +203,10 @@ class BDPMSession(PilotedSession):
     def last_vertex(self):
         """The smooth camera vertex, counted from 0, beyond which no camera path is shaded."""
         return self.integrator.bdd
+
+    passes_narrow = True
+    """Whether surfaces with narrow lobes (`paths.lobes`) are passed, and photons gathered at later
+    ones."""
 
     def kinds(self):
         return [
@@ -262,6 +268,8 @@ class BDPMSession(PilotedSession):
         """Records the passes anew; from the second iteration on, their kernels run without their
         Python."""
         self._tables = [self.traits.lambertian, self.traits.perturbed, *self.lights.tables()]
+        if self.narrow is not None:
+            self._tables.append(self.narrow)
         self._light_pass = self.recorded(self._trace_light)
         self._map_pass = self.recorded(self._build_maps)
         self._record_camera_pass()
@@ -288,7 +296,12 @@ class BDPMSession(PilotedSession):
         """Traces the paths of a `CameraPass`, with room for so many vertices; other arguments as of
         `trace_camera_paths`."""
         queries = Queries(
-            self.last_vertex, capacity, self.has_caustics, self.has_indirect, self.one_vertex
+            self.last_vertex,
+            capacity,
+            self.has_caustics,
+            self.has_indirect,
+            self.one_vertex,
+            self.narrow if self.passes_narrow else None,
         )
         return trace_camera_paths(
             self.world,

@@ -29,6 +29,8 @@ from .unidirectional import PathSession
 
 CANDIDATES = {"path": {}, "bdpm": {"bdd": 0}, "bdpm_opt2": {}, "bdpm_opt3": {}}
 """Plugins that may be chosen, and their parameters."""
+FOR_DENOISERS = {"bdpm": {"bdd": 1}}
+"""Parameters in place of these where the image will be denoised."""
 SHORT_SECONDS, SHORT_ITERATIONS = 5.0, 32
 """Tuned: renders for which learning weights takes longer than they save."""
 PATH_TRIALS = 16
@@ -96,11 +98,15 @@ def handed_on(integrator):
     }
 
 
-def photon_mapper(traits, iterations, seconds):
-    """The plugin that stands for all photon mappers in a scene of these `SceneTraits`. Two
-    strategies are within a third of the best number of them, and are one where all smooth surfaces
-    are diffuse; but within and behind rough glass camera paths meet it twice before photons are of
-    use. Short renders have one strategy."""
+def photon_mapper(traits, iterations, seconds, denoised):
+    """The plugin that stands for all photon mappers in a scene of these `SceneTraits`.
+
+    For a denoiser photons are gathered at the second vertex: nearly all noise is then that of
+    camera paths, which it takes away. Else two strategies are within a third of the best number of
+    them, and are one where all smooth surfaces are diffuse; but within and behind rough glass
+    camera paths meet it twice before photons are of use. Short renders have one strategy."""
+    if denoised:
+        return "bdpm"
     if seconds is not None and seconds < SHORT_SECONDS:
         return "bdpm"
     if seconds is None and iterations is not None and iterations < SHORT_ITERATIONS:
@@ -112,7 +118,7 @@ def choose(integrator, scene, sensor, seed, iterations, seconds):
     """The `Decision` for a render of so many iterations, or of so many seconds (either may be
     `None`)."""
     path = PathSession(integrator, scene, sensor, seed, iterations)
-    plugin = photon_mapper(SceneTraits(scene), iterations, seconds)
+    plugin = photon_mapper(SceneTraits(scene), iterations, seconds, integrator.denoised)
     photons = new_session(plugin, integrator, scene, sensor, seed, iterations)
     alone = (plugin, photons) if integrator.splits_light else ("path", path)
     if not photons.kinds():
@@ -176,7 +182,10 @@ def new_session(plugin, integrator, scene, sensor, seed, iterations):
         "denoised": integrator.denoised,
         "aovs": written(integrator.layers),
     }
-    return mi.load_dict({"type": plugin, **shared, **CANDIDATES[plugin]}).new_session(
+    own = CANDIDATES[plugin]
+    if integrator.denoised:
+        own = FOR_DENOISERS.get(plugin, own)
+    return mi.load_dict({"type": plugin, **shared, **own}).new_session(
         scene, sensor, seed, iterations
     )
 

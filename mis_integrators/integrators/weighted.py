@@ -24,6 +24,7 @@ class WeightedBDPM(BDPM):
 class WeightedSession(BDPMSession):
     """Iterations of a `WeightedBDPM`. A subclass makes the weights."""
 
+    passes_narrow = False  # weights leave the light of narrow lobes to later vertices by themselves
     weighted_pilot = False
     """Whether the pilot of the automatic radius renders under the weights, made for
     `usual_radius()`; else it merges at the first vertex."""

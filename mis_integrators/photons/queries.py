@@ -4,6 +4,7 @@ are to be gathered."""
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -11,6 +12,7 @@ import mitsuba as mi
 from ..core.packing import Store
 from ..core.recording import lanes
 from ..core.records import Layout
+from ..core.traits import lookup
 from ..lights.lights import mis_power
 from ..paths.camera import trace_camera
 from ..paths.light_classes import class_of, scattered_history, start_of_camera_path
@@ -76,7 +78,9 @@ class Queries:
 
     `bdd`: the last smooth camera vertex, counted from 0; `capacity`: vertices that there is room
     for (under weights, in each section); `has_caustics`, `has_indirect`: kinds of photons that
-    there are; `one_vertex`: no path asks twice, and each owns the place of its number.
+    there are; `one_vertex`: no path asks twice, and each owns the place of its number; `narrow`: a
+    registry table of BSDFs at which none but caustic photons are gathered, and which the `bdd` does
+    not count (None: there are none).
     """
 
     bdd: int
@@ -84,6 +88,7 @@ class Queries:
     has_caustics: bool
     has_indirect: bool
     one_vertex: bool
+    narrow: Any = None
 
 
 class QueryVisitor:
@@ -92,10 +97,11 @@ class QueryVisitor:
     `first` is what emission, and direct light at the first smooth vertex, count, which other paths
     see, too; `beyond` what direct light counts beyond that, if it is not the same.
 
-    Its state: smooth vertices left behind (the last one counts as the `bdd`-th); whether the last
-    vertex scattered by a delta function; the density of the last smooth scattering; the last smooth
-    vertex; the weight of direct light there; how many times light counts that is found there; the
-    state of `weights`; and with `classes` what these carry along.
+    Its state: smooth vertices left behind, `narrow` ones not counted (the last one counts as the
+    `bdd`-th); whether there was any of these; whether the last vertex scattered by a delta
+    function; the density of the last smooth scattering; the last smooth vertex; the weight of
+    direct light there; how many times light counts that is found there; the state of `weights`; and
+    with `classes` what these carry along.
     """
 
     def __init__(self, world, limits, queries, weights, first, beyond, classes):
@@ -117,22 +123,20 @@ class QueryVisitor:
         origin = dr.zeros(mi.Interaction3f)
         one = mi.Float(1)
         history = [] if self.classes is None else start_of_camera_path()
-        begun = [mi.UInt32(0), mi.Bool(False), one, origin, mi.Spectrum(1), mi.Float(self.first)]
-        return [*begun, sums, history]
+        begun = [mi.UInt32(0), mi.Bool(False), mi.Bool(False), one, origin, mi.Spectrum(1)]
+        return [*begun, mi.Float(self.first), sums, history]
 
     def emission(self, state, at, active):
-        vertex, behind_delta, scatter_pdf, origin, share_here, times, sums, history = state
+        _, met, behind_delta, scatter_pdf, origin, share_here, times, sums, history = state
         ds = mi.DirectionSample3f(self.scene, at.si, origin)
-        shown = active & ((vertex == 0) | ~behind_delta)
+        shown = active & (~met | ~behind_delta)
         if self.hide_emitters:
             shown &= (at.depth > 1) | at.si.is_valid()
-        later = shown & (vertex > 0)
+        later = shown & met
         light_pdf = self.lights.pdf_direct(origin, ds, later)
         if self.by_light:
             share_here = self.weights.next_event_weight(sums, origin, ds, later)
-        share = dr.select(
-            vertex == 0, mi.Spectrum(1), mis_power(scatter_pdf, light_pdf) * share_here
-        )
+        share = dr.select(met, mis_power(scatter_pdf, light_pdf) * share_here, mi.Spectrum(1))
         light = at.throughput * share * ds.emitter.eval(at.si, shown)
         if self.classes is not None:
             self.classes.add("met", at.path, class_of(*history), light * times, shown)
@@ -142,17 +146,19 @@ class QueryVisitor:
         return state[0] <= self.bdd
 
     def arrive(self, state, at, rng, active):
-        vertex, behind_delta, scatter_pdf, origin, share_here, times, sums, history = state
+        vertex, met, behind_delta, scatter_pdf, origin, share_here, times, sums, history = state
         weights, bsdf = self.weights, at.bsdf
         smooth = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
         at.ends = vertex >= self.bdd  # the path's last smooth vertex
+        if self.queries.narrow is not None:
+            at.ends &= ~lookup(self.queries.narrow, bsdf, mi.Bool, smooth)
         if self.beyond is not None:
-            times = dr.select(smooth & (vertex > 0), self.beyond, times)
+            times = dr.select(smooth & met, self.beyond, times)
         if weights is not None:
             sums, share = weights.propagate(sums, at.si, bsdf, vertex, smooth)
             share_here = dr.select(smooth, share, share_here)
             at.ends |= weights.ends(bsdf, vertex, smooth)
-        state = [vertex, behind_delta, scatter_pdf, origin, share_here, times, sums, history]
+        state = [vertex, met, behind_delta, scatter_pdf, origin, share_here, times, sums, history]
         direct = mi.Spectrum(0)
         if not self.lights.dark:
             direct = self._direct(state, at, rng, smooth) * times
@@ -164,7 +170,7 @@ class QueryVisitor:
 
     def _direct(self, state, at, rng, smooth):
         """Radiance of direct light at smooth vertices, by next-event estimation."""
-        vertex, _, _, _, share_here, _, sums, _ = state
+        vertex, _, _, _, _, share_here, _, sums, _ = state
         si, weights = at.si, self.weights
         ds, light, light_pdf = self.lights.sample_direct(si, rng, smooth)
         wo = si.to_local(ds.d)
@@ -178,9 +184,9 @@ class QueryVisitor:
 
     def _ask_for_photons(self, state, at, smooth):
         """Stores the vertices at which photons are to be gathered."""
-        vertex, _, _, _, share_here, _, sums, history = state
+        vertex, _, _, _, _, share_here, _, sums, history = state
         weights, store, queries = self.weights, self.store, self.queries
-        last = (vertex == self.bdd) | (weights is not None)
+        last = at.ends | (weights is not None)
         wants = smooth & (dr.max(at.throughput) > 0)
         if not queries.has_caustics:
             wants &= last & queries.has_indirect
@@ -210,15 +216,19 @@ class QueryVisitor:
             dr.scatter(store.vertices["first"], history[0] == 0, slot, wants)
 
     def leave(self, state, at, rng, bs, weight, delta, active):
-        vertex, _, scatter_pdf, origin, share_here, times, sums, history = state
+        vertex, met, _, scatter_pdf, origin, share_here, times, sums, history = state
         if not self.traits.has_light_surfaces:
             active &= delta | ~at.ends
         scattered = active & ~delta
         if self.weights is not None:
             sums = self.weights.scatter(sums, at.si, at.bsdf, bs, vertex, scattered)
         beyond = dr.select(at.ends, mi.UInt32(self.bdd), vertex) + 1
+        if self.queries.narrow is not None:
+            narrow = ~at.ends & lookup(self.queries.narrow, at.bsdf, mi.Bool, scattered)
+            beyond = dr.select(narrow, vertex, beyond)
         state = [
             dr.select(scattered, beyond, vertex),
+            met | scattered,
             mi.Bool(delta),
             dr.select(scattered, bs.pdf, scatter_pdf),
             dr.select(scattered, mi.Interaction3f(at.si), origin),
@@ -246,7 +256,7 @@ def trace_camera_paths(
     `bdd`-th, direct light by next-event estimation combined with BSDF sampling (power heuristic).
     Light that reaches a smooth vertex through delta surfaces belongs to caustic photons and is left
     out. Delta vertices do not count; a BSDF with both parts is a smooth vertex whose delta part
-    goes on.
+    goes on. At `queries.narrow` vertices there is direct light, but they do not count, either.
 
     Returns `(radiance, alpha, splat position, vertices, count)`: the vertices at which photons are
     to be gathered, as made by `new_vertex_buffer`, and how many wanted a place in it (width one).

@@ -1,0 +1,74 @@
+"""How narrow the lobes of BSDFs are: whether photons that arrive at a surface are of use there."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..core.sequences import sobol
+from ..core.spectra import channel_mean
+from ..core.traits import registry_table, used_bsdfs
+
+NARROW = 10.0
+"""Tuned: concentration from which on photons are gathered one vertex later."""
+COSINES = 0.25, 0.5, 0.75, 1.0
+"""Of the angles under which BSDFs are looked at."""
+SAMPLES = 64
+"""Directions sampled of each BSDF under each angle."""
+
+
+def narrow_bsdfs(scene):
+    """A registry table: of each BSDF of the scene whether its median `concentration` over the
+    angles is above `NARROW`. None where there is no such BSDF."""
+    smooth = [b for b in used_bsdfs(scene) if mi.has_flag(b.flags(), mi.BSDFFlags.Smooth)]
+    rough = [b for b in smooth if int(b.flags()) & ~_EVEN]
+    if not rough:
+        return None
+    narrow = np.median(concentration(rough), axis=1) > NARROW
+    return registry_table(rough, mi.BSDFPtr, narrow, mi.Bool) if narrow.any() else None
+
+
+_EVEN = int(
+    mi.BSDFFlags.DiffuseReflection
+    | mi.BSDFFlags.DiffuseTransmission
+    | mi.BSDFFlags.FrontSide
+    | mi.BSDFFlags.BackSide
+    | mi.BSDFFlags.SpatiallyVarying
+    | mi.BSDFFlags.Null
+)
+"""Flags of BSDFs without lobes."""
+
+
+def concentration(bsdfs):
+    """How unevenly each of the BSDFs f weighs photons that arrive from everywhere alike, at some
+    points of its textures: an array (BSDFs, angles) of
+
+        pi I[f^2] / I[f]^2,    I[g] = integral of g |cos| over directions,
+
+    which is 1 for a diffuse BSDF. So many photons tell as much as one at a diffuse surface. By
+    samples of the BSDF, with p their density and w = f |cos| / p: I[f] = E[w], I[f^2] = E[w f]."""
+    count = len(bsdfs) * len(COSINES) * SAMPLES
+    index = dr.arange(mi.UInt32, count)
+    bsdf = dr.gather(mi.BSDFPtr, mi.BSDFPtr(bsdfs), index // (len(COSINES) * SAMPLES))
+    cosine = dr.gather(mi.Float, mi.Float(COSINES), index // SAMPLES % len(COSINES))
+    si = dr.zeros(mi.SurfaceInteraction3f, count)
+    si.wi = mi.Vector3f(dr.sqrt(1 - cosine * cosine), 0, cosine)
+    si.n = mi.Normal3f(0, 0, 1)
+    si.sh_frame = mi.Frame3f(mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0), mi.Vector3f(0, 0, 1))
+    si.dp_du, si.dp_dv = mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0)
+    si.t = mi.Float(1)
+    if mi.is_spectral:
+        si.wavelengths = mi.sample_rgb_spectrum(mi.Wavelength(0.5))[0]
+    choice, u, v, s, t = *sobol(index, mi.UInt32(1), 3), *sobol(index, mi.UInt32(2), 2)
+    si.uv = mi.Point2f(s, t)
+    context = mi.BSDFContext(mi.TransportMode.Radiance, int(mi.BSDFFlags.Smooth))
+    bs, weight = bsdf.sample(context, si, choice, mi.Point2f(u, v))
+    value = channel_mean(bsdf.eval(context, si, bs.wo))
+    weight, f = channel_mean(weight), value / dr.maximum(dr.abs(bs.wo.z), 0.05)
+    dr.eval(weight, f)
+    first, second = (
+        np.array(x, np.float64).reshape(len(bsdfs), len(COSINES), SAMPLES).mean(axis=2)
+        for x in (weight, weight * f)
+    )
+    return np.pi * second / np.maximum(first, 1e-12) ** 2
