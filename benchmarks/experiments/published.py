@@ -141,8 +141,8 @@ def over_time(opened: OpenScene, references: References, options: argparse.Names
                     "seconds": float(np.mean([seconds for seconds, _ in at])),
                     "MAPE": float(np.exp(np.mean(np.log([mape for _, mape in at])))),
                     "ratio at the end": ratio.value if last else None,
-                    "ratio low": ratio.low if last else None,
-                    "ratio high": ratio.high if last else None,
+                    "ratio at the end low": ratio.low if last else None,
+                    "ratio at the end high": ratio.high if last else None,
                 }
             )
     return rows
