@@ -254,6 +254,27 @@ MUTATIONS = [
         "noisy pixels send too many paths",
         PATHS,
     ),
+    Mutation(
+        "weights/multiview.py",
+        "return at_most(ratio, LARGEST_SUMMAND ** (1 / exponent)) ** exponent",
+        "return at_most(ratio, LARGEST_SUMMAND ** (1 / exponent)) ** 2.0",
+        "the power heuristic of views has one exponent, whatever is asked for",
+        "tests/volume/test_view_weights.py",
+    ),
+    Mutation(
+        "volume/views.py",
+        "density, d = dr.select(parallel, even, density), dr.select(parallel, -forward, d)",
+        "d = dr.select(parallel, -forward, d)",
+        "paths of orthographic views have the density of perspective ones",
+        f"{VIEWS}::test_orthographic_views",
+    ),
+    Mutation(
+        "volume/shifts.py",
+        "at, majorant = at_length(target, C * length(base, t))",
+        "at, majorant = at_optical_depth(target, C * length(base, t))",
+        "raw depth is measured in optical depths on the target",
+        f"{VIEWS}::test_three_media",
+    ),
     # ------------------------------------------------------------------ resampling
     Mutation(
         "resampling/cache_targets.py",

@@ -199,9 +199,7 @@ def load(path: Path, scale: float, count: int | None = None):
     return mi.load_string(ElementTree.tostring(root, encoding="unicode"), **size), parameters
 
 
-def race(
-    scene, parameters: dict, methods: dict[str, dict], label: str, options: argparse.Namespace
-) -> Race:
+def race(scene, parameters: dict, methods: dict, label: str, options: argparse.Namespace) -> Race:
     """Renders by `volpath` and by `volpath_multiview` with the parameters of each of the `methods`,
     `options.seeds` of each."""
     apart = Apart(scene, parameters)
@@ -262,18 +260,23 @@ def compare(path: Path, options: argparse.Namespace) -> list[Row]:
 
 
 def compare_shifts(path: Path, options: argparse.Namespace) -> list[Row]:
-    """A row for each shift: variance of a camera path, seconds of one, and their product, over
-    those of `volpath`; the share of connections that the shift loses, of those that see the
-    pivot."""
+    """A row for each shift, for stretches without and with added null interactions (the paper has
+    none): variance of a camera path, seconds of one, and their product, over those of `volpath`;
+    the share of connections that the shift loses, of those that see the pivot."""
     scene, parameters = load(path, options.scale)
-    methods = {shift: {"shift": shift} for shift in SHIFTS}
+    methods = {
+        (shift, add): {"shift": shift, "add_nulls": add}
+        for add in (False, True)
+        for shift in SHIFTS
+        if not (add and shift.endswith("copy"))  # of no effect there
+    }
     run = race(scene, parameters, methods, path.stem, options)
     lost = {row["shift"]: row["invalid"] for row in invalid_shifts(path, options)}
 
-    def variance(name: str) -> float:
+    def variance(name) -> float:
         return float(run.noise(name).mean()) * run.samples(name)
 
-    def seconds(name: str) -> float:
+    def seconds(name) -> float:
         return run.seconds(name) / run.samples(name)
 
     return [
@@ -281,13 +284,14 @@ def compare_shifts(path: Path, options: argparse.Namespace) -> list[Row]:
             "scene": path.stem,
             "views": run.views,
             "shift": shift,
-            "variance": variance(shift) / variance("volpath"),
-            "seconds": seconds(shift) / seconds("volpath"),
-            "variance x time": run.cost(shift) / run.cost("volpath"),
+            "added nulls": "yes" if add else "no",
+            "variance": variance((shift, add)) / variance("volpath"),
+            "seconds": seconds((shift, add)) / seconds("volpath"),
+            "variance x time": run.cost((shift, add)) / run.cost("volpath"),
             "lost": lost[shift],
-            "mean ratio": float(np.mean(run.images[shift]) / run.mean.mean()),
+            "mean ratio": float(np.mean(run.images[shift, add]) / run.mean.mean()),
         }
-        for shift in SHIFTS
+        for shift, add in methods
     ]
 
 

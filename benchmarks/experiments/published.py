@@ -9,7 +9,8 @@ from collections.abc import Mapping
 
 from mis_integrators.analysis.confidence import ratio_interval
 from mis_integrators.analysis.metrics import References, errors
-from mis_integrators.mis.resampling import ResampledWeights
+from mis_integrators.mis.published import PublishedWeights
+from mis_integrators.mis.resampling import LEAST_GAIN, MOST_GAIN, ResampledWeights
 
 import drjit as dr
 import numpy as np
@@ -57,15 +58,36 @@ class Unsoftened(ResampledWeights):
         return geometry
 
 
+class WithoutLengths(PublishedWeights):
+    """Published weights with Q in place of Q_s, as in the authors' program."""
+
+    @staticmethod
+    def share_of_length(shares, place, active):
+        return 1.0
+
+
+class WithBounds(PublishedWeights):
+    """Published weights whose gains have the bounds of the bounded form."""
+
+    def gains(self, r, row, s, active=True):
+        gains = super().gains(r, row, s, active)
+        total = sum(gains)
+        bounded = dr.clip(total, LEAST_GAIN * (1 - 1 / self.M), MOST_GAIN * self.N)
+        return [gain * bounded * dr.rcp(dr.maximum(total, 1e-20)) for gain in gains]
+
+
 def no_guess(z, joined):
     """In place of `guessed_weight`: one."""
     return 1.0
 
 
+PUBLISHED, WEIGHTS = "bdpt_ris:weights=published", "mis.published.PublishedWeights"
 GUESS: Mapping[str, object] = {"mis.resampling.guessed_weight": no_guess}
 POLE: Mapping[str, object] = {"mis.resampling.ResampledWeights": Unsoftened}
 LADDER: dict[str, tuple[str, Mapping[str, object]]] = {
-    "published": ("bdpt_ris:weights=published", {}),
+    "published": (PUBLISHED, {}),
+    "published, Q in place of Q_s": (PUBLISHED, {WEIGHTS: WithoutLengths}),
+    "published, with the bounds of gains": (PUBLISHED, {WEIGHTS: WithBounds}),
     "bounded": ("bdpt_ris", {}),
     "bounded, without blind shares": ("bdpt_ris", BLIND),
     "bounded, uniform share 1/(N_c + 1)": ("bdpt_ris", UNIFORM),
@@ -119,8 +141,8 @@ def over_time(opened: OpenScene, references: References, options: argparse.Names
                     "seconds": float(np.mean([seconds for seconds, _ in at])),
                     "MAPE": float(np.exp(np.mean(np.log([mape for _, mape in at])))),
                     "ratio at the end": ratio.value if last else None,
-                    "ratio low": ratio.low if last else None,
-                    "ratio high": ratio.high if last else None,
+                    "ratio at the end low": ratio.low if last else None,
+                    "ratio at the end high": ratio.high if last else None,
                 }
             )
     return rows

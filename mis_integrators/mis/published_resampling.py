@@ -57,13 +57,18 @@ class PublishedWeights(ResampledWeights):
         for number, ratio in enumerate(r):
             point = self.grid.neighbor(row, number, active)
             Q = dr.gather(mi.Float, self.Q, point, active)
-            share = dr.gather(mi.Float, self.shares, point * LENGTHS + place, active)
+            share = self.share_of_length(self.shares, point * LENGTHS + place, active)
             q_over_p = resampling.proposal_weight(ratio, Q)
             result.append(chance * resampling.gain(q_over_p, share, self.M, self.N))
-        share = dr.gather(mi.Float, self.uniform, place, active)
+        share = self.share_of_length(self.uniform, place, active)
         ends = dr.gather(mi.Float, self.uniform, mi.UInt32(LENGTHS), active)
         q_over_p = resampling.uniform_density_ratio(ends)
         return [*result, chance * resampling.gain(q_over_p, share, self.M, self.N)]
+
+    @staticmethod
+    def share_of_length(shares, place, active):
+        """Q_s/Q."""
+        return dr.gather(mi.Float, shares, place, active)
 
     def gain(self, r, row, s, active=True):
         """The sum of `gains`: what resampling makes of all techniques at one camera vertex."""
