@@ -1,8 +1,8 @@
 """Iterations of `bdpm_opt` under the weights as Ershov, Kopylov and Voloboy print them.
 
-No theory of weights is evaluated in a path loop. The passes of an iteration leave flat arrays: photons
-with the vertices that they come from, and camera vertices with the light found there. Weights are
-gathered at these vertices in the frozen map, and then each strategy's light is summed.
+No theory of weights is evaluated in a path loop. The passes of an iteration leave flat arrays:
+photons with the vertices that they come from, and camera vertices with the light found there.
+Weights are gathered at these vertices in the frozen map, then each strategy's light is summed.
 """
 
 from __future__ import annotations
@@ -54,9 +54,7 @@ class PublishedSession(BDPMSession):
             light_pass = self.describe_light_pass(
                 self.sensor, self._sequence(*seed_of, paths), paths, spectral
             )
-            chains = trace_photon_chains(
-                self.world, self.limits, light_pass, capacity, keep_direct
-            )
+            chains = trace_photon_chains(self.world, self.limits, light_pass, capacity, keep_direct)
             dr.eval(chains)
             found = int(chains.count[0])
             if found <= capacity:
@@ -192,9 +190,13 @@ class LightOfIteration:
         self._add("caustic", first, 1)
         root_record = camera.record(camera.section(first))
         root = self.theory.roots(root_record)
-        self._add_pairs(first, root_record, lambda meeting, place, vertex: self.theory.of_photons(
-            meeting, self.chains, self.known, place, [take(x, vertex) for x in root]
-        ))
+        self._add_pairs(
+            first,
+            root_record,
+            lambda meeting, place, vertex: self.theory.of_photons(
+                meeting, self.chains, self.known, place, [take(x, vertex) for x in root]
+            ),
+        )
         if self.session.integrator.strategies == 2:
             self._finish(first + 1, root)
         else:
@@ -210,9 +212,13 @@ class LightOfIteration:
         weight = 1 - middle.direct_weight()
         self._add_direct(number, record, weight)
         self._add("caustic", number, weight)
-        self._add_pairs(number, record, lambda meeting, place, vertex: theory.of_inner_photons(
-            meeting, self.known, place, middle.at(vertex)
-        ))
+        self._add_pairs(
+            number,
+            record,
+            lambda meeting, place, vertex: theory.of_inner_photons(
+                meeting, self.known, place, middle.at(vertex)
+            ),
+        )
         return middle
 
     def _finish(self, number, before):

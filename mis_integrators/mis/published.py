@@ -36,6 +36,7 @@ SMALLEST_VALUE = 1e-8
 SMALLEST_DIVISOR = 1e-30
 """Stands for zero in other divisors: L where no photon is near, alpha and det A."""
 
+
 def positive(value):
     """A BSDF value or a density, not zero."""
     return dr.maximum(value, SMALLEST_VALUE)
@@ -253,8 +254,9 @@ class Middle:
 
 
 class ThreeStrategies:
-    """MIS-3: photons at z_0 have the weights w20 (of two segments) and w30, those at z_1 w31, direct
-    light there w21, photons and direct light at z_2 w32. Arguments as of `TwoStrategies`."""
+    """MIS-3: photons at z_0 have the weights w20 (of two segments) and w30, those at z_1 w31,
+    direct light there w21, photons and direct light at z_2 w32. Arguments as of
+    `TwoStrategies`."""
 
     def __init__(self, frozen, n, camera_paths):
         self.frozen, self.n = frozen, n
