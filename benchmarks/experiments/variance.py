@@ -16,6 +16,7 @@ import numpy as np
 from common.methods import Method
 from common.rows import Row, console, save, show, tell
 from common.scene_files import OpenScene, merge_radius, open_scene, scaled_size
+from experiments import terms
 from report import sections
 from report.figures import draw_variance_maps
 from report.page import Page
@@ -36,6 +37,9 @@ COLUMNS = (
 
 def run(options: argparse.Namespace) -> None:
     """The sub-command ``variance``."""
+    if options.terms:
+        run_terms(options)
+        return
     rows: list[Row] = []
     page = Page("Variance of one iteration", options.out / "variance.html")
     for path in options.scenes:
@@ -50,6 +54,18 @@ def run(options: argparse.Namespace) -> None:
         summarise([row for row in rows if row["N_B"] == camera_paths], camera_paths)
     page.write()
     console.print(f"page: {page.path}")
+
+
+def run_terms(options: argparse.Namespace) -> None:
+    """With ``--terms``: the variance split into the terms of the noise law."""
+    rows: list[Row] = []
+    for path in options.scenes:
+        opened = open_scene(path, scaled_size(path, options.scale))
+        for camera_paths in options.camera_paths:
+            found = terms.compare(opened, camera_paths, options)
+            show(f"{opened.name}: terms of the noise law", found, terms.COLUMNS)
+            rows += found
+            save(options.out, "terms", rows, vars(options))
 
 
 def picture_of(opened: OpenScene, camera_paths: int, options: argparse.Namespace) -> Path:
