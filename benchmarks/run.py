@@ -182,6 +182,12 @@ def _parser() -> argparse.ArgumentParser:
     )
     _variance(command, 24)
     command.add_argument(
+        "--one-weight",
+        action="store_true",
+        help="measure bdpm_opt2 again, with one weight for direct light and photons at the last "
+        "vertex",
+    )
+    command.add_argument(
         "--terms",
         action="store_true",
         help="split the variance into the cross, camera and photon terms of the noise law instead; "
