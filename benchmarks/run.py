@@ -196,6 +196,18 @@ def _parser() -> argparse.ArgumentParser:
     )
     _variance(command, 24)
     command.add_argument(
+        "--one-weight",
+        action="store_true",
+        help="measure bdpm_opt2 again, with one weight for direct light and photons at the last "
+        "vertex",
+    )
+    command.add_argument(
+        "--terms",
+        action="store_true",
+        help="split the variance into the cross, camera and photon terms of the noise law instead; "
+        "three images a round, --iterations rounds",
+    )
+    command.add_argument(
         "--scale", type=_positive, default=1, help="film size, scene's own = 1 (default: 1)"
     )
 

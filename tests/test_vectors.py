@@ -11,11 +11,9 @@ import functools
 import json
 from pathlib import Path
 
-from mis_integrators.weights import heuristics, recursion
+from mis_integrators.weights import heuristics, mis2, mis3, recursion
 
 import discrete_worlds as worlds
-import mis2
-import mis3
 import mitsuba as mi
 import numpy as np
 import pytest

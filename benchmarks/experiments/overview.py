@@ -63,7 +63,9 @@ def run(options: argparse.Namespace) -> None:
             measurement.failures,
         )
         small = open_scene(path, scaled_size(path, options.variance_scale))
-        maps = argparse.Namespace(**{**vars(options), "integrators": options.varied})
+        maps = argparse.Namespace(
+            **{**vars(options), "integrators": options.varied, "one_weight": False}
+        )
         varied += variance.compare(small, 1, maps)
         for kind, kept in (
             ("compare", rows),

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 
 from mis_integrators.analysis.confidence import ratio_interval
 from mis_integrators.analysis.metrics import References, errors
-from mis_integrators.mis.published import PublishedWeights
+from mis_integrators.mis.published_resampling import PublishedWeights
 from mis_integrators.mis.resampling import LEAST_GAIN, MOST_GAIN, ResampledWeights
 
 import drjit as dr

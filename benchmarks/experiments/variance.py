@@ -4,7 +4,9 @@ strategy, and maps side by side."""
 from __future__ import annotations
 
 import argparse
+import contextlib
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 from mis_integrators.analysis.metrics import trimmed_mean
@@ -16,6 +18,8 @@ import numpy as np
 from common.methods import Method
 from common.rows import Row, console, save, show, tell
 from common.scene_files import OpenScene, merge_radius, open_scene, scaled_size
+from experiments import terms
+from experiments.one_weight import one_weight
 from report import sections
 from report.figures import draw_variance_maps
 from report.page import Page
@@ -36,6 +40,9 @@ COLUMNS = (
 
 def run(options: argparse.Namespace) -> None:
     """The sub-command ``variance``."""
+    if options.terms:
+        run_terms(options)
+        return
     rows: list[Row] = []
     page = Page("Variance of one iteration", options.out / "variance.html")
     for path in options.scenes:
@@ -52,9 +59,34 @@ def run(options: argparse.Namespace) -> None:
     console.print(f"page: {page.path}")
 
 
+def run_terms(options: argparse.Namespace) -> None:
+    """With ``--terms``: the variance split into the terms of the noise law."""
+    rows: list[Row] = []
+    for path in options.scenes:
+        opened = open_scene(path, scaled_size(path, options.scale))
+        for camera_paths in options.camera_paths:
+            found = terms.compare(opened, camera_paths, options)
+            show(f"{opened.name}: terms of the noise law", found, terms.COLUMNS)
+            rows += found
+            save(options.out, "terms", rows, vars(options))
+
+
 def picture_of(opened: OpenScene, camera_paths: int, options: argparse.Namespace) -> Path:
     """Where the maps of a scene are drawn."""
     return options.out / f"variance_{opened.name}_{camera_paths}.png"
+
+
+def variants(options: argparse.Namespace) -> list[tuple[Method, Callable]]:
+    """The methods, each with what is to be changed while it renders: nothing; with ``--one-weight``
+    those of two strategies once more, under one last weight."""
+    found: list[tuple[Method, Callable]] = []
+    for method in options.integrators:
+        found.append((method, contextlib.nullcontext))
+        published = method.parameters.get("weights") == "published"
+        if options.one_weight and method.plugin == "bdpm_opt2" and not published:
+            label = f"{method.label} (one weight)"
+            found.append((Method(label, method.plugin, method.parameters), one_weight))
+    return found
 
 
 def compare(opened: OpenScene, camera_paths: int, options: argparse.Namespace) -> list[Row]:
@@ -67,21 +99,22 @@ def compare(opened: OpenScene, camera_paths: int, options: argparse.Namespace) -
     radius = merge_radius(opened, options)
     common = {"initial_radius": radius, "camera_paths": camera_paths, "variance": True}
     methods, images, variances, seconds = [], [], [], []
-    for method in options.integrators:
-        try:
-            integrator = Method(
-                method.label, method.plugin, {**common, **method.parameters}
-            ).integrator(opened)
-            session = integrator.session(opened.scene, opened.sensor, seed=1)
+    for method, changed in variants(options):
+        with changed():
+            try:
+                integrator = Method(
+                    method.label, method.plugin, {**common, **method.parameters}
+                ).integrator(opened)
+                session = integrator.session(opened.scene, opened.sensor, seed=1)
+                session.iterate()
+            except loading.SCENE_ERRORS as error:
+                console.print(f"{opened.name}: {method.label} left out: {loading.one_line(error)}")
+                continue
             session.iterate()
-        except loading.SCENE_ERRORS as error:
-            console.print(f"{opened.name}: {method.label} left out: {loading.one_line(error)}")
-            continue
-        session.iterate()
-        start = time.perf_counter()
-        while session.iterations < options.iterations + 2:
-            session.iterate()
-            tell(f"{opened.name}: {method.label} {session.iterations}")
+            start = time.perf_counter()
+            while session.iterations < options.iterations + 2:
+                session.iterate()
+                tell(f"{opened.name}: {method.label} {session.iterations}")
         methods.append(method)
         seconds.append((time.perf_counter() - start) / options.iterations)
         image = session.image()

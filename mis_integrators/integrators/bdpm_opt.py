@@ -114,8 +114,8 @@ class BDPMOpt(WeightedBDPM):
             )
         if not self.mix_diffuse:
             raise ParameterError(
-                f'{self.plugin}: parameter "weights" = "published" allows no "mix_diffuse" = false: '
-                "the papers mix strategies at all surfaces"
+                f'{self.plugin}: parameter "weights" = "published" allows no "mix_diffuse" = '
+                "false: the papers mix strategies at all surfaces"
             )
         if self.splits_light:
             raise ParameterError(

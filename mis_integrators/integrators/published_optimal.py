@@ -1,8 +1,8 @@
 """Iterations of `bdpm_opt` under the weights as Ershov, Kopylov and Voloboy print them.
 
-No theory of weights is evaluated in a path loop. The passes of an iteration leave flat arrays: photons
-with the vertices that they come from, and camera vertices with the light found there. Weights are
-gathered at these vertices in the frozen map, and then each strategy's light is summed.
+No theory of weights is evaluated in a path loop. The passes of an iteration leave flat arrays:
+photons with the vertices that they come from, and camera vertices with the light found there.
+Weights are gathered at these vertices in the frozen map, then each strategy's light is summed.
 """
 
 from __future__ import annotations

@@ -254,8 +254,9 @@ class Middle:
 
 
 class ThreeStrategies:
-    """MIS-3: photons at z_0 have the weights w20 (of two segments) and w30, those at z_1 w31, direct
-    light there w21, photons and direct light at z_2 w32. Arguments as of `TwoStrategies`."""
+    """MIS-3: photons at z_0 have the weights w20 (of two segments) and w30, those at z_1 w31,
+    direct light there w21, photons and direct light at z_2 w32. Arguments as of
+    `TwoStrategies`."""
 
     def __init__(self, frozen, n, camera_paths):
         self.frozen, self.n = frozen, n

@@ -17,7 +17,6 @@ from .gather import Scattering, landing_cosine, same_surface, within_disk
 from .grid import for_each_photon
 from .photon import read_landing, read_power
 
-
 PAIRS_AT_ONCE = 1 << 19
 """Pairs that are evaluated together (bounds memory)."""
 

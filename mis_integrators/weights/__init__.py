@@ -2,9 +2,10 @@
 alike.
 
 Nothing here knows a renderer. `recursion` holds the optimal weights of any number of merging
-strategies, `heuristics` Veach's balance and power heuristic, `bidirectional` the sums by which
-sub-paths carry it, `resampling` the weights that know of resampled light sub-paths, `multiview`
-those of views that share their paths.
+strategies, `mis2` and `mis3` the printed closed forms for two and three of them, `heuristics`
+Veach's balance and power heuristic, `bidirectional` the sums by which sub-paths carry it,
+`resampling` the weights that know of resampled light sub-paths, `multiview` those of views that
+share their paths.
 """
 
 from typing import Any

@@ -1,5 +1,5 @@
-"""Optimal weights of two merging strategies, the closed form: for comparison, renders use
-`recursion`.
+"""Optimal weights of two merging strategies, the closed form as it is printed: `bdpm_opt`
+renders with it where its weights are `published`, else with `recursion`.
 
 Source: Ershov and Voloboy, Calculation of MIS weights for bidirectional path tracing with photon
 maps in presence of direct illumination, Mathematica Montisnigri 48 (2020), doi

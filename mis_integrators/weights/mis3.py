@@ -1,5 +1,5 @@
-"""Optimal weights of three merging strategies, the closed form: for comparison, renders use
-`recursion`.
+"""Optimal weights of three merging strategies, the closed form as it is printed: `bdpm_opt`
+renders with it where its weights are `published`, else with `recursion`.
 
 Source: Ershov, Kopylov and Voloboy, Optimal weights for bidirectional ray tracing with photon maps
 while mixing 3 strategies, Keldysh Institute preprint 89 (2021), doi 10.20948/prepr-2021-89-e

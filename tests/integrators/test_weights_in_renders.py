@@ -619,7 +619,7 @@ def test_diffuse_surfaces_mix_where_asked(rgb, given):
     [
         ("strategies", 0, "from 1 to 6"),
         ("strategies", 2.0, "an integer"),
-        ("weights", "best", '"full" or "local"'),
+        ("weights", "best", '"full" or "local" or "published"'),
         ("first_vertex", -1, "from 0 to 16"),
         ("frozen_photons", -1, "at least 0"),
         ("bdd", 1, "unknown parameter"),
