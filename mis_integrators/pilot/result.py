@@ -22,8 +22,9 @@ RADIUS_WITHOUT_VERTICES = 1e-3
 class PilotSamples(NamedTuple):
     """The estimates of all iterations of a pilot: mean over the channels of radiance."""
 
-    ladder: np.ndarray
-    """(radii,), ascending."""
+    ladder: dict[str, np.ndarray]
+    """By kind: (radii,), ascending. Kinds that no camera path gathers are missing here, and
+    below."""
     photons: dict[str, float]
     """By kind: photons within the ladder's largest radius of a vertex, on average."""
     gathered: dict[tuple[str, bool], np.ndarray]
@@ -103,14 +104,17 @@ class PilotResult:
             A choice that is kept, kind by kind, unless the error falls by more than the share
             `reluctance`.
         """
+        radius = RADIUS_WITHOUT_VERTICES * self.setting.extent
         if not self.errors:
-            radius = RADIUS_WITHOUT_VERTICES * self.setting.extent
             kinds = self.setting.kinds
             return Choice(dict.fromkeys(kinds, radius), dict.fromkeys(kinds, False), None)
         chosen = {kind: self._best_radius(kind, count, kept, reluctance) for kind in self.errors}
         choice = Choice(
-            {kind: found.radius for kind, found in chosen.items()},
-            {kind: found.corrected for kind, found in chosen.items()},
+            {
+                kind: chosen[kind].radius if kind in chosen else radius
+                for kind in self.setting.kinds
+            },
+            {kind: kind in chosen and chosen[kind].corrected for kind in self.setting.kinds},
             None,
         )
         prediction = self._predict(choice, list(chosen.values()), count)
@@ -136,7 +140,7 @@ class PilotResult:
             self.direct + sum(found.variance for found in chosen),
             self.direct,
             self.photon_light,
-            sum(self.gathered(kind, radius) for kind, radius in choice.radii.items()),
+            sum(self.gathered(kind, choice.radii[kind]) for kind in self.errors),
             count / self.cost(choice),
             self.mean,
             self.pixels,
@@ -173,19 +177,19 @@ def measure(
         nothing = np.zeros(pixels.count)
         return PilotResult(setting, pixels, seconds, {}, {}, 0.0, nothing, 0.0, 0.0)
     middle = {
-        kind: samples.gathered[kind, False][:, middle_index(samples.ladder)].mean(axis=1)
-        for kind in setting.kinds
+        kind: samples.gathered[kind, False][:, middle_index(ladder)].mean(axis=1)
+        for kind, ladder in samples.ladder.items()
     }  # (iterations, pixels)
     image = samples.direct.mean(axis=1) + sum(middle.values())
     mean = shrink_to_neighbours(image, neighbourhoods(setting.width, pixels))
     weights = relative_weights(mean)
     errors = {}
-    for kind in setting.kinds:
+    for kind, ladder in samples.ladder.items():
         by_correction = {
             corrected: samples.gathered[kind, corrected] for corrected in setting.corrections(kind)
         }
         errors[kind] = error_by_radius(
-            samples.ladder,
+            ladder,
             by_correction[False],
             by_correction.get(True),
             mean,
