@@ -199,9 +199,10 @@ def pass_straight(scene, traits, ray, medium, draws, keep, active):
     tracking (Novak et al. 2014), whose tentative collisions cut the way into pieces. Where the
     share is faint, the way is cut, too, and goes on by roulette.
 
-    `keep(start, medium, length, kept, mask)` is called for each piece in a medium: `start` is a ray
-    from its beginning, `kept` the share there. Along a piece, the share falls with the extinction
-    of homogeneous media, and is constant in others.
+    `keep(start, medium, length, kept, normal, surface, mask)` is called for each piece in a medium:
+    `start` is a ray from its beginning, `kept` the share there; `normal` is that of the surface
+    which the ray meets, `surface` the distance to it (infinite: none). Along a piece, the share
+    falls with the extinction of homogeneous media, and is constant in others.
     """
     ray = mi.Ray3f(ray)
     medium = mi.MediumPtr(medium)
@@ -210,11 +211,14 @@ def pass_straight(scene, traits, ray, medium, draws, keep, active):
     hit = dr.zeros(mi.PreliminaryIntersection3f)
     kept = mi.Spectrum(1)
     passed = mi.Float(0)
+    normal = mi.Normal3f(0, 0, 1)
     fresh = mi.Bool(True)  # the next surface is not known yet
     scattering = int(mi.BSDFFlags.Delta) | int(mi.BSDFFlags.Smooth)  # Null among them
     while dr.hint(going, label="straight on"):
         look = going & fresh
         hit[look] = scene.ray_intersect_preliminary(ray, coherent=False, active=look)
+        look &= hit.is_valid()
+        normal[look] = hit.compute_surface_interaction(ray, mi.RayFlags.Minimal, look).n
         fresh = mi.Bool(False)
 
         # ---- Media: one piece
@@ -240,7 +244,7 @@ def pass_straight(scene, traits, ray, medium, draws, keep, active):
         t = dr.minimum(t, far)
         begin = mi.Ray3f(ray)
         begin.o = ray(start)
-        keep(begin, medium, t - start, kept, inside)
+        keep(begin, medium, t - start, kept, normal, hit.t - start, inside)
         kept[inside & ~grid] = kept * dr.exp(-sigma_t * (t - start))
         if dr.hint(traits.has_grids, mode="scalar"):
             collided = grid & cut

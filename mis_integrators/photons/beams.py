@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from ..core.packing import read_mark
+from ..core.packing import read_mark, unpack_direction
 from ..core.recording import lanes
 from ..core.records import Layout
 from ..core.spectra import channel_mean
@@ -30,7 +30,8 @@ SLACK = 2e-3
 
 def beam_layout():
     """Fields of a beam: its ray, `length`, the path's throughput at its beginning, the number of
-    the path, its depth in segments with this one, and the medium."""
+    the path, its depth in segments with this one, the medium, and the surface that its ray meets:
+    packed geometric `normal`, and distance (infinite: none)."""
     return Layout(
         {
             "o": mi.Point3f,
@@ -40,6 +41,8 @@ def beam_layout():
             "throughput": mi.Spectrum,
             "length": mi.Float,
             "medium": mi.MediumPtr,
+            "normal": mi.UInt32,
+            "surface": mi.Float,
         }
     )
 
@@ -66,6 +69,8 @@ class Beams:
     path: mi.UInt32
     depth: mi.UInt32
     medium: mi.MediumPtr
+    normal: mi.Vector3f
+    surface: mi.Float
     active: mi.Bool
     extinction: mi.Spectrum
     wavelengths: mi.Float
@@ -80,8 +85,16 @@ class Beams:
         even = active & medium.is_homogeneous()
         _, _, sigma_t = medium.get_scattering_coefficients(at_start, even)
         extinction = dr.select(even, sigma_t, 0)
-        return cls(**{**record, "medium": medium}, active=active, extinction=extinction,
-                   wavelengths=wavelengths)  # fmt: skip
+        normal = dr.normalize(unpack_direction(record["normal"]))
+        normal = dr.mulsign(normal, -dr.dot(normal, record["d"]))
+        record |= {"medium": medium, "normal": normal}
+        return cls(**record, active=active, extinction=extinction, wavelengths=wavelengths)
+
+    def before_surface(self, p):
+        """Whether points lie on the camera's side of the surface that ends the way: on that of its
+        tangent plane. Behind a thin wall there may be light that does not get through."""
+        height = dr.dot(p - self.o - self.d * self.surface, self.normal)
+        return ~dr.isfinite(self.surface) | (height > 0)
 
     def phase(self, p, towards, active):
         """The phase function [1/sr] at points `p`, for light from `towards` that goes on to the
@@ -210,17 +223,17 @@ def _within(low, high, beams):
 def gather_along(photon_map, beams, radii, light_path_count, max_depth, grey=False, marked=False):
     """Radiance that volume photons bring to camera paths along beams, for each radius of a list:
     the sum over photons of phase function x flux x transmittance to the beam's beginning, over
-    (pi radius^2 x light sub-paths) (Jarosz et al. 2008, equation 14, with a constant kernel).
+    (pi radius^2 x light sub-paths) (Jarosz et al. 2008, with a constant kernel).
 
     Parameters and result are those of `gather.gather_photons`. Photons count for beams in their own
-    medium only.
+    medium only, and not behind the surface that ends the beam.
     """
     query = BeamQuery(photon_map, beams, radii[-1])
     own_medium = number_of_medium(beams.medium)
     split = marked and not grey
 
     def visit(index, landing, offset, distance_squared, hit, totals):
-        hit &= landing.medium == own_medium
+        hit &= (landing.medium == own_medium) & beams.before_surface(landing.p)
         if max_depth > 0:
             hit &= landing.depth + beams.depth <= max_depth
         flux, towards = read_power(photon_map.power, index, hit)

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from ..core.packing import Store
+from ..core.packing import Store, pack_direction
 from ..core.recording import lanes
 from ..core.records import Layout
-from ..lights.lights import mis_power
 from ..core.spectra import channel_mean
+from ..lights.lights import mis_power
 from ..paths.camera import trace_camera, whole_or_nothing
 from ..paths.light_classes import class_of, scattered_history, start_of_camera_path
 from ..paths.media import direct_light, next_hit_straight_on
@@ -144,12 +144,12 @@ class QueryVisitor:
     def _keep_beams(self, vertex, throughput, path, depth):
         """What keeps the beams of paths before their first smooth vertex (see `pass_straight`)."""
         if not self.queries.beams:
-            return lambda start, medium, length, kept, mask: None
+            return lambda *piece: None
         store, wanted = self.store, vertex == 0
         if self.deepest is not None:
             wanted &= mi.Int32(depth) <= self.deepest
 
-        def keep(start, medium, length, kept, mask):
+        def keep(start, medium, length, kept, normal, surface, mask):
             light = throughput * kept
             mask = mask & wanted & (dr.max(light) > 0)
             slot = dr.scatter_inc(store.beam_count, mi.UInt32(0), mask)
@@ -162,6 +162,8 @@ class QueryVisitor:
                 "path": path,
                 "depth": depth,
                 "medium": medium,
+                "normal": pack_direction(normal),
+                "surface": surface,
             }
             beam_layout().write(store.beams, beam, slot, mask)
 
