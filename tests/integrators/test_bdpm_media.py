@@ -133,8 +133,11 @@ def test_coverage_is_that_of_volpath(rgb):
 # --- Closed forms -------------------------------------------------------------
 
 
-@pytest.mark.parametrize("albedo, g", [(0.5, 0.0), (1.0, 0.5), *extended((1.0, -0.5))])
-def test_single_scattering_in_closed_form(rgb, albedo, g):
+@pytest.mark.parametrize(
+    "albedo, g, whole, block",
+    [(0.5, 0.0, 0.02, 0.04), *extended((1.0, 0.5, 0.03, 0.08), (1.0, -0.5, 0.03, 0.08))],
+)
+def test_single_scattering_in_closed_form(rgb, albedo, g, whole, block):
     """An infinite medium without any shape."""
     sigma_t, distance, half_width, at = 0.7, 2.0, 0.5, (1.5, 0.3, 0.4)
     scene = mi.load_dict(
@@ -154,7 +157,7 @@ def test_single_scattering_in_closed_form(rgb, albedo, g):
     exact = Estimate.exact(np.repeat(block_means(picture[:, :, None], 2), 3, axis=1))
     batches = SmallRadiusBatches(scene, 2, max_depth=2, photon_count=100000)
     batches.add(2)
-    assert_same(*collect_until(batches, exact, 0.02, 0.04), 0.02, 0.04, slack=2e-3)
+    assert_same(*collect_until(batches, exact, whole, block), whole, block, slack=2e-3)
 
 
 def test_furnace(rgb):
@@ -207,10 +210,11 @@ def test_radius_without_surfaces(rgb):
 
 
 def test_classes_of_light_are_those_of_bdpt(rgb):
-    """Direct, indirect and caustic light sum to the image, and have the shares that `bdpt` finds
-    (to 3 % of the image: 40 iterations)."""
+    """Direct, indirect and caustic light sum to the image, and have the shares that `bdpt`
+    finds."""
     aovs = ",".join(f"{name}:{name}" for name in ("direct", "indirect", "caustic"))
-    scene, means = small_scene(), []
+    glass = ball({"type": "dielectric"}, 0.8, exterior=FOG)
+    scene, means = fog_scene(homogeneous(0.5), floor=None, ball=glass), []
     for integrator in (
         bdpm(initial_radius=0.03, aovs=aovs),
         mi.load_dict({"type": "bdpt", "max_depth": 6, "camera_paths": 16, "aovs": aovs}),
@@ -218,8 +222,9 @@ def test_classes_of_light_are_those_of_bdpt(rgb):
         image = np.array(mi.render(scene, integrator=integrator, spp=640)).mean(axis=(0, 1))
         assert image[3:].reshape(3, 3).sum(axis=0) == pytest.approx(image[:3], rel=1e-4)
         means.append(image[3:].reshape(3, 3).mean(axis=1) / image[:3].mean())
-    assert means[1].min() > 0.05
-    assert np.abs(means[0] - means[1]).max() < 0.03
+    # Other seeds differ by 0.003.
+    assert means[1].min() > 0.03
+    assert np.abs(means[0] - means[1]).max() < 0.01
 
 
 def test_variance_and_time_limit(rgb):
@@ -228,7 +233,7 @@ def test_variance_and_time_limit(rgb):
     session.plan_time(2.0)
     session.iterate()
     session.iterate()
-    assert session.prediction.iterations > 1
+    assert session.prediction.iterations > 0 and session.radii["volume"] > 0
     assert np.isfinite(session.image()).all() and session.image()[:, :, 3:].min() > 0
 
 
