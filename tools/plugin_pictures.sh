@@ -16,6 +16,7 @@ mkdir -p docs/images/plugins
 small="-D resx=200 -D resy=200"
 picture bdpm_auto door $small -i bdpm_auto
 picture bdpm caustics $small -i bdpm -P bdd=0
+picture bdpm_media media/fog_caustic $small -i bdpm -P bdd=0
 picture bdpm_opt cornell_glossy $small -i bdpm_opt3
 picture bdpm_balance cornell_glossy $small -i bdpm_balance
 picture bdpt door $small -i bdpt

@@ -175,6 +175,7 @@ class MediaTraits:
     """What a scene with media needs besides.
 
     Attributes: `media` (a list of all), `has_grids` (media that are not homogeneous),
+    `has_delta` (specular scattering somewhere: boundaries that let light pass are none),
     `has_null_media` (media in which collisions may be null: grids, and media whose extinction
     depends on the channel), `has_null_vertices` (BSDFs that scatter and let part of the light pass
     straight on), `boundary_flags` (what must be known of surfaces that only let light pass).
@@ -187,6 +188,8 @@ class MediaTraits:
         self.has_null_vertices = any(f & int(flag.Null) and f & others for f in flags)
         # Where all boundaries are plain, neither textures nor shading frames matter there.
         self.boundary_flags = mi.RayFlags.All if self.has_null_vertices else mi.RayFlags.Minimal
+        specular = int(flag.DeltaReflection) | int(flag.DeltaTransmission)
+        self.has_delta = any(f & specular for f in flags)
         self.media = all_media(scene, sensors)
         self.has_grids = any(not m.is_homogeneous() for m in self.media)
         self.has_null_media = self.has_grids or any(_is_coloured(m) for m in self.media)
@@ -259,7 +262,7 @@ def check_scene(scene, sensor, plugin, media=False):
     if not media and has_media(scene, sensor):
         raise UnsupportedScene(
             f"{plugin}: participating media are not supported by this surface integrator; use "
-            '"bdpt" or "volpath"'
+            '"bdpt", "bdpm" or "volpath"'
         )
     check_emitters(scene, plugin)
     if mi.has_flag(sensor.film().flags(), mi.FilmFlags.Special):

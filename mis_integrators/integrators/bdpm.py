@@ -13,18 +13,20 @@ from ..core.film import splat_samples
 from ..core.packing import rounded_up
 from ..core.recording import lanes, recorder
 from ..core.spectra import channel_mean
-from ..core.traits import SceneTraits, lookup
+from ..core.traits import SceneTraits, UnsupportedScene, check_media, check_scene, has_media, lookup
 from ..lights.lights import Lights
 from ..paths.camera import film_sample_count, film_size
 from ..paths.layers import CHANNELS, SPLIT
 from ..paths.light_classes import LightClasses
 from ..paths.lobes import narrow_bsdfs
 from ..paths.setting import World
+from ..photons.beams import Beams, gather_along, mean_count_along, read_beams
 from ..photons.coverage import covered_share
 from ..photons.gather import QueryVertices, gather_photons, mean_photon_count
 from ..photons.grid import PhotonMap, build_photon_map, smallest_cell
 from ..photons.queries import Queries, read_queries, trace_camera_paths
 from ..photons.trace import trace_light_paths
+from ..photons.volume import VolumeMap, build_volume_map
 from ..pilot.direct_paths import MOST_PATHS
 from ..pilot.setting import PilotSetting
 from .common import MOST_LIGHT_PATHS, IterativeIntegrator
@@ -34,8 +36,9 @@ from .schedule import read_radius
 
 SPARE_PHOTONS = 1 << 20
 """Unused room beyond half of a photon buffer that is worth the time to record the passes anew."""
-CAMERA_CHUNK = 1 << 21
-"""Camera paths traced at once at most; larger films are traced in parts (bounds memory)."""
+CAMERA_CHUNK, CHUNK_IN_MEDIA = 1 << 21, 1 << 19
+"""Camera paths traced at once at most, and in scenes with media, where each has beams; larger films
+are traced in parts (bounds memory)."""
 
 
 class BDPM(IterativeIntegrator):
@@ -111,8 +114,14 @@ class BDPM(IterativeIntegrator):
     light of two or more segments, and caustics, which next-event estimation cannot make. The number
     of iterations is the number of samples per pixel over ``camera_paths``.
 
-    The estimate is consistent: its bias vanishes with the radius. Participating media, polarised
-    variants, gradients and the film ``specfilm`` are refused by name.
+    In scenes with participating media, which need ``bdd`` 0, light sub-paths scatter in these, too,
+    and leave volume photons there; a camera path goes straight on to the first smooth surface, and
+    gathers the volume photons along its way (Jarosz et al. 2008, the beam radiance estimate). They
+    carry all light that media scatter, their single scattering included.
+
+    The estimate is consistent: its bias vanishes with the radius. Polarised variants, gradients and
+    the film ``specfilm`` are refused by name; in media also phase functions of flakes and
+    ``hide_emitters``.
 
     .. tabs::
         .. code-tab:: xml
@@ -130,6 +139,24 @@ class BDPM(IterativeIntegrator):
     """
 
     LAYERS = *CHANNELS, *SPLIT
+    MEDIA = True
+    """Whether participating media are supported."""
+
+    def check(self, scene, sensor):
+        check_scene(scene, sensor, self.plugin, self.MEDIA)
+        check_media(scene, sensor, self.plugin)
+        if not has_media(scene, sensor):
+            return
+        if self.hide_emitters:
+            raise UnsupportedScene(
+                f'{self.plugin}: parameter "hide_emitters" is not supported in scenes with '
+                'participating media; use "volpath"'
+            )
+        if self.bdd:
+            raise UnsupportedScene(
+                f'{self.plugin}: parameter "bdd" = {self.bdd} is not supported in scenes with '
+                "participating media, where only 0 is"
+            )
 
     def read_parameters(self, parameters):
         self.read_photon_parameters(parameters)
@@ -166,8 +193,10 @@ class BDPMSession(PilotedSession):
 
     def __init__(self, integrator, scene, sensor, seed, iterations):
         super().__init__(integrator, scene, sensor, seed, iterations)
-        self.traits = SceneTraits(scene)
+        self.traits = SceneTraits(scene, sensor)
         self.lights = Lights.seen_by(scene, sensor, integrator.plugin)
+        if self.traits.has_media:
+            self.lights.find_media(sensor, integrator.plugin)
         self.world = World(scene, self.lights, self.traits)
         self.light_path_count = integrator.photon_count or min(
             film_sample_count(sensor), MOST_LIGHT_PATHS
@@ -179,12 +208,19 @@ class BDPMSession(PilotedSession):
             or (self.traits.has_delta and (depth < 0 or depth >= 3))
         )
         self.has_indirect = not self.lights.dark and (depth < 0 or depth >= integrator.bdd + 3)
-        self.narrow = narrow_bsdfs(scene) if self.passes_narrow and self.has_indirect else None
+        self.has_volume = (
+            self.traits.has_media and not self.lights.dark and (depth < 0 or depth >= 2)
+        )
+        self.narrow = None
+        if self.passes_narrow and self.has_indirect and not self.traits.has_media:
+            self.narrow = narrow_bsdfs(scene)
         self.one_vertex = not self.traits.has_mixed and (
             (integrator.bdd == 0 and self.narrow is None) or not self.has_caustics
         )
-        self.split_paths(CAMERA_CHUNK)
+        self.split_paths(CHUNK_IN_MEDIA if self.has_volume else CAMERA_CHUNK)
         self.photon_capacity = rounded_up(3 * self.light_path_count)
+        self.volume_capacity = rounded_up(3 * self.light_path_count) if self.traits.has_media else 0
+        self.beam_capacity = self._beam_room(self.chunk)
         self.vertex_capacity = self._vertex_room(self.chunk)
         if integrator.initial_radius:
             self.radii = dict.fromkeys(self.kinds(), integrator.initial_radius)
@@ -211,7 +247,11 @@ class BDPMSession(PilotedSession):
     def kinds(self):
         return [
             kind
-            for kind, needed in (("caustic", self.has_caustics), ("indirect", self.has_indirect))
+            for kind, needed in (
+                ("caustic", self.has_caustics),
+                ("indirect", self.has_indirect),
+                ("volume", self.has_volume),
+            )
             if needed
         ]
 
@@ -262,6 +302,9 @@ class BDPMSession(PilotedSession):
             return 0
         return paths if self.one_vertex else 2 * paths
 
+    def _beam_room(self, paths):
+        return 2 * paths if self.has_volume else 0
+
     # ------------------------------------------------------------------ passes
 
     def _freeze(self):
@@ -282,6 +325,7 @@ class BDPMSession(PilotedSession):
             self.photon_capacity,
             light_state=self._light_state(spectral),
             marked=self.integrator.splits_light,
+            volume_capacity=self.volume_capacity,
         )
 
     def _light_state(self, spectral):
@@ -292,15 +336,18 @@ class BDPMSession(PilotedSession):
         """The weights of camera paths (a `mis.state.MergeState`); None where there are none."""
         return None
 
-    def _trace_camera(self, camera_pass, capacity, spectral, first=1.0, beyond=None, classes=None):
-        """Traces the paths of a `CameraPass`, with room for so many vertices; other arguments as of
-        `trace_camera_paths`."""
+    def _trace_camera(
+        self, camera_pass, capacity, beams, spectral, first=1.0, beyond=None, classes=None
+    ):
+        """Traces the paths of a `CameraPass`, with room for so many vertices and beams; other
+        arguments as of `trace_camera_paths`."""
         queries = Queries(
             self.last_vertex,
             capacity,
             self.has_caustics,
             self.has_indirect,
             self.one_vertex,
+            beams,
             self.narrow if self.passes_narrow else None,
         )
         return trace_camera_paths(
@@ -315,8 +362,18 @@ class BDPMSession(PilotedSession):
         )
 
     def _gather(self, photon_map, vertices, kind, radii, spectral, grey=False):
-        """What photons of one kind bring to each vertex, for each radius (and class: see
-        `gather_photons`)."""
+        """What photons of one kind bring to each vertex, volume photons to each beam, for each
+        radius (and class: see `gather_photons`)."""
+        if kind == "volume":
+            return gather_along(
+                photon_map,
+                Beams.read(vertices["beams"], spectral["wavelengths"]),
+                radii,
+                self.light_path_count,
+                self.integrator.max_depth,
+                grey,
+                self.integrator.splits_light,
+            )
         return self._merge(photon_map, read_queries(vertices), kind, radii, spectral, grey)
 
     def _merge(self, photon_map, record, kind, radii, spectral, grey=False, weigh=None, scale=1):
@@ -349,11 +406,15 @@ class BDPMSession(PilotedSession):
             probed &= lookup(self.traits.lambertian, bsdf, mi.Bool, probed)
         return dr.select(probed, covered_share(scene, record, radius, seed, probed), 1)
 
-    def _per_path(self, values, vertices, paths):
-        """Sums values of the vertices for each of `paths` camera paths."""
-        if self.one_vertex:
+    def _per_path(self, values, vertices, kind, paths):
+        """Sums values of the vertices, or beams, for each of `paths` camera paths."""
+        if kind == "volume":
+            vertices = read_beams(vertices["beams"])
+        elif self.one_vertex:
             return values
-        vertices, total = read_queries(vertices), dr.zeros(type(values), paths)
+        else:
+            vertices = read_queries(vertices)
+        total = dr.zeros(type(values), paths)
         dr.scatter_reduce(
             dr.ReduceOp.Add,
             total,
@@ -365,6 +426,10 @@ class BDPMSession(PilotedSession):
         return total
 
     def _map(self, photons, kind, radius):
+        if self.traits.has_media:
+            *photons, in_media = photons
+            if kind == "volume":
+                return build_volume_map(*in_media, radius, self.volume_capacity)
         mis_words = photons[3] if kind == "indirect" and len(photons) > 3 else None
         return build_photon_map(
             *photons[:3],
@@ -373,6 +438,14 @@ class BDPMSession(PilotedSession):
             self.photon_capacity,
             kind,
             mis_words,
+        )
+
+    def _map_again(self, arrays, kind, radius):
+        """The map of the arrays of one."""
+        if kind == "volume":
+            return VolumeMap.with_grid(arrays, radius, self.volume_capacity)
+        return PhotonMap.with_grid(
+            arrays, self.traits.bounds, self._cell(radius), self.photon_capacity
         )
 
     def _cell(self, radius):
@@ -391,7 +464,7 @@ class BDPMSession(PilotedSession):
         if kept:
             classes = LightClasses(self.chunk, None, ("met", "next_event"))
         radiance, alpha, position, vertices, count = self._trace_camera(
-            camera_pass, self.vertex_capacity, spectral, 1.0, beyond, classes
+            camera_pass, self.vertex_capacity, self.beam_capacity, spectral, 1.0, beyond, classes
         )
         if classes is not None:
             dr.eval(radiance, alpha, position, vertices, count, classes.entries)
@@ -399,9 +472,7 @@ class BDPMSession(PilotedSession):
         elif radii:
             dr.eval(radiance, alpha, position, vertices, count)
         for kind, radius in radii.items():
-            photon_map = PhotonMap.with_grid(
-                maps[kind], self.traits.bounds, self._cell(radius), self.photon_capacity
-            )
+            photon_map = self._map_again(maps[kind], kind, radius)
             parts = self._gather(photon_map, vertices, kind, [radius], spectral)
             if self.corrected[kind]:
                 correction = dr.rcp(
@@ -409,7 +480,7 @@ class BDPMSession(PilotedSession):
                 )
                 parts = [gathered * correction for gathered in parts]
             for number, gathered in enumerate(parts):
-                gathered = self._per_path(gathered, vertices, self.chunk)
+                gathered = self._per_path(gathered, vertices, kind, self.chunk)
                 gathered = gathered if beyond is None else gathered * beyond
                 radiance += gathered
                 if self.integrator.splits_light:
@@ -428,7 +499,7 @@ class BDPMSession(PilotedSession):
             there,
             1 if beyond is None else dr.rcp(beyond),
             classes or (),
-        ), count
+        ), {"vertices": count, "beams": vertices.get("beam_count")}
 
     # ------------------------------------------------------------------ iterations
 
@@ -445,7 +516,13 @@ class BDPMSession(PilotedSession):
                 spectral,
             )
             dr.eval(photons)
-            found = self.photons_found = int(photons[2][0])
+            found = int(photons[2][0])
+            in_media = int(photons[-1][2][0]) if self.traits.has_media else 0
+            self.photons_found = found + in_media
+            if in_media > self.volume_capacity:
+                self.volume_capacity = rounded_up(in_media + in_media // 8)
+                self._freeze()
+                continue
             room = rounded_up(found + found // 8 + 1024)
             spare = self.photon_capacity - 2 * room
             if found <= self.photon_capacity and (self._sized or spare < SPARE_PHOTONS):
@@ -464,7 +541,7 @@ class BDPMSession(PilotedSession):
 
         def render(chunk, first):
             while True:
-                block, count = self._camera_pass(
+                block, wanted = self._camera_pass(
                     self.scene,
                     self.sensor,
                     self._tables,
@@ -475,14 +552,22 @@ class BDPMSession(PilotedSession):
                     radii,
                     self.direct_light.beyond,
                 )
-                wanted = 0 if self.one_vertex else int(dr.max(count)[0])
-                if wanted <= self.vertex_capacity or not radii:
+                wanted, beams = self._wanted(wanted)
+                if not radii or (wanted <= self.vertex_capacity and beams <= self.beam_capacity):
                     return (block,)
-                self.vertex_capacity = rounded_up(wanted + wanted // 8)
+                if wanted > self.vertex_capacity:
+                    self.vertex_capacity = rounded_up(wanted + wanted // 8)
+                if beams > self.beam_capacity:
+                    self.beam_capacity = rounded_up(beams + beams // 8)
                 self._freeze()
 
         (block,) = self.sum_of_chunks(render)
         return self.direct_light.add_to(block, iteration, spectral)
+
+    def _wanted(self, counts):
+        """How many vertices and beams a camera pass would have kept."""
+        vertices = 0 if self.one_vertex else int(dr.max(counts["vertices"])[0])
+        return vertices, 0 if counts["beams"] is None else int(counts["beams"][0])
 
 
 class SubsetPasses:
@@ -490,13 +575,15 @@ class SubsetPasses:
 
     def __init__(self, session, setting, pixels):
         self.session, self.setting, self.pixels = session, setting, pixels
-        self._record_camera(session._vertex_room(pixels.paths) * (1 if session.one_vertex else 4))
+        room = session._vertex_room(pixels.paths) * (1 if session.one_vertex else 4)
+        self._record_camera(room, 4 * session._beam_room(pixels.paths))
         self._record_gather()
         self._covered = session.recorded(session._covered)
 
-    def _record_camera(self, capacity):
+    def _record_camera(self, capacity, beams):
         session, pixels = self.session, self.pixels
-        self.capacity, stride = capacity, pixels.stride * pixels.camera_paths
+        self.capacity, self.beam_capacity = capacity, beams
+        stride = pixels.stride * pixels.camera_paths
         back = (
             1 - pixels.count * stride
         ) % 2**32  # from a path of the last pixel to the next one of the first
@@ -511,6 +598,7 @@ class SubsetPasses:
                     stride=stride,
                 ),
                 capacity,
+                beams,
                 spectral,
                 0.0,
                 mi.Float(1),
@@ -523,19 +611,19 @@ class SubsetPasses:
         return self.session.direct_light.measured().mean[np.arange(pixels.count) * pixels.stride]
 
     def _record_gather(self):
-        session, kinds = self.session, self.setting.kinds
-        self.photon_capacity = session.photon_capacity
+        session = self.session
+        self.photon_capacity = session.photon_capacity, session.volume_capacity
         self._gather = session.recorded(
             lambda scene, tables, photons, vertices, radii, spectral: {
                 kind: session._gather(
-                    session._map(photons, kind, radii[-1]),
+                    session._map(photons, kind, radii[kind][-1]),
                     vertices,
                     kind,
-                    radii,
+                    radii[kind],
                     spectral,
                     grey=True,
                 )
-                for kind in kinds
+                for kind in radii
             }
         )
 
@@ -543,7 +631,7 @@ class SubsetPasses:
         session = self.session
         spectral = session._spectral(number)
         photons = session._photons(number, spectral)
-        if self.photon_capacity != session.photon_capacity:
+        if self.photon_capacity != (session.photon_capacity, session.volume_capacity):
             self._record_gather()
         sequence = session._sequence(number, CAMERA, self.pixels.camera_paths)
         radiance, vertices = self._trace_camera(sequence, spectral)
@@ -557,16 +645,22 @@ class SubsetPasses:
             radiance, _, _, vertices, count = self._camera(
                 session.scene, session.sensor, session._tables, sequence, spectral
             )
-            found = 0 if session.one_vertex else int(dr.max(count)[0])
-            if found <= self.capacity:
+            counts = {"vertices": count, "beams": vertices.get("beam_count")}
+            found, beams = session._wanted(counts)
+            if found <= self.capacity and beams <= self.beam_capacity:
                 return radiance, vertices
-            self._record_camera(found + found // 8)
+            self._record_camera(
+                max(self.capacity, found + found // 8), max(self.beam_capacity, beams + beams // 8)
+            )
 
     def gather(self, photons, vertices, radii, seed, spectral):
-        """What photons bring to the camera paths, by kind and whether it is corrected at edges:
-        (radii, groups, pixels)."""
+        """What photons bring to the camera paths, for the radii of each kind, by kind and whether
+        it is corrected at edges: (radii, groups, pixels)."""
         session, estimates = self.session, {}
-        radii = [dr.opaque(mi.Float, float(radius)) for radius in radii]
+        radii = {
+            kind: [dr.opaque(mi.Float, float(radius)) for radius in ladder]
+            for kind, ladder in radii.items()
+        }
         gathered = self._gather(session.scene, session._tables, photons, vertices, radii, spectral)
         for kind, values in gathered.items():
             for corrected in self.setting.corrections(kind):
@@ -576,20 +670,23 @@ class SubsetPasses:
                         * dr.rcp(
                             self._covered(session.scene, session._tables, vertices, radius, seed)
                         )
-                        for value, radius in zip(values, radii)
+                        for value, radius in zip(values, radii[kind])
                     ]
                 estimates[kind, corrected] = np.array(
                     [
-                        self.by_pixel(session._per_path(value, vertices, self.pixels.paths))
+                        self.by_pixel(session._per_path(value, vertices, kind, self.pixels.paths))
                         for value in values
                     ]
                 )
         return estimates
 
     def mean_photon_count(self, photons, vertices, kind, radius):
-        """Photons of a kind within `radius` of a vertex, on average."""
+        """Photons of a kind within `radius` of a vertex, or of a path's beams, on average."""
         radius = dr.opaque(mi.Float, radius)
         photon_map = self.session._map(photons, kind, radius)
+        if kind == "volume":
+            beams = Beams.read(vertices["beams"], self.session._spectral(0)["wavelengths"])
+            return mean_count_along(photon_map, beams, radius, self.pixels.paths)
         return mean_photon_count(photon_map, read_queries(vertices), radius)
 
     def by_pixel(self, values):

@@ -14,6 +14,7 @@ class WeightedBDPM(BDPM):
     `first_vertex + strategies - 1`."""
 
     first_vertex = 0
+    MEDIA = False
 
     def settings(self):
         settings = super().settings()

@@ -10,7 +10,7 @@ import mitsuba as mi
 
 from ..core.random import next_1d_and_2d, next_2d
 from .camera_rays import sample_camera_ray
-from .media import begin_flights, interaction_at, medium_behind, next_hit, sample_phase
+from .media import begin_flights, interaction_at, medium_behind, sample_phase
 from .roulette import russian_roulette
 from .setting import CameraPass, Limits, ListedPass, World
 
@@ -87,6 +87,11 @@ def start_camera_paths(camera_pass: CameraPass | ListedPass):
     return path, active, numbers, mi.Ray3f(ray), weight, splat, aperture
 
 
+def whole_or_nothing(visible):
+    """The coverage of paths: one where they are `visible`, as of `CameraArrival`."""
+    return dr.select(visible, mi.Float(1), mi.Float(0))
+
+
 def with_gaps(first, skip, n_paths: int, camera_paths: int):
     """What a `CameraPass` with a `stride` of one takes as `first` to leave out `skip` numbers after
     each pixel's `camera_paths`."""
@@ -135,6 +140,20 @@ class CameraVisitor(Protocol):
         """The state before the first surface. `splat`: positions on the film; `aperture`: samples
         that chose the points of the lens."""
 
+    def travel(
+        self,
+        state: list[Any],
+        ray: Array,
+        flight: list[Any],
+        numbers: Any,
+        throughput: Array,
+        path: Array,
+        depth: Array,
+        active: Array,
+    ) -> tuple[list[Any], Array, Array, list[Any], Array]:
+        """In scenes with media: moves sub-paths after `depth` segments to where they scatter or
+        meet a surface next: `(state, hit, ray, flight, throughput)`, as `media.next_hit`."""
+
     def emission(self, state: list[Any], at: CameraArrival, active: Array) -> Array:
         """Radiance of a light that is met. Not called in scenes without lights that can be met."""
 
@@ -162,6 +181,9 @@ class CameraVisitor(Protocol):
     def cross(self, before: list[Any], after: list[Any], crosses: Array) -> list[Any]:
         """In scenes with media: the state, where sub-paths have passed straight through a surface,
         from those before they arrived and after they left."""
+
+    def alpha(self, state: list[Any], visible: Array) -> Array:
+        """Coverage of the paths in the end; `visible`: as of `CameraArrival`."""
 
 
 @dr.syntax
@@ -192,8 +214,8 @@ def trace_camera(
 
     flight = begin_flights(traits, camera_pass.sensor.get_medium())
     if dr.hint(traits.has_media, mode="scalar"):
-        hit, ray, flight, throughput = next_hit(
-            scene, traits, ray, flight, numbers, throughput, active
+        state, hit, ray, flight, throughput = visitor.travel(
+            state, ray, flight, numbers, throughput, path, depth, active
         )
     else:
         hit = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
@@ -252,10 +274,10 @@ def trace_camera(
             rng, throughput, dr.max(throughput), eta, begun, active
         )
         if dr.hint(traits.has_media, mode="scalar"):
-            hit, ray, flight, throughput = next_hit(
-                scene, traits, ray, flight, numbers, throughput, active
+            state, hit, ray, flight, throughput = visitor.travel(
+                state, ray, flight, numbers, throughput, path, depth, active
             )
         else:
             hit = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
 
-    return radiance, dr.select(visible, mi.Float(1), mi.Float(0)), splat
+    return radiance, visitor.alpha(state, visible), splat

@@ -15,7 +15,7 @@ import mitsuba as mi
 from ..core.packing import Store
 from ..core.records import Layout
 from ..core.spectra import channel_mean
-from .camera import trace_camera, within_crop
+from .camera import trace_camera, whole_or_nothing, within_crop
 from .sensor import Lens
 from .setting import CameraPass, Limits, World
 from .subpaths import NO_PARENT, keep_vertex, new_vertices, vertex_layout
@@ -187,6 +187,9 @@ class StepVisitor:
         left = leave(self.soften, left, si, at.vertex_bsdf, value, p_forward, p_back, wo, smoothly)
         density = dr.select(delta, 0, p_forward * dr.abs(dr.dot(si.n, wo)))
         return [number, parent, density, mi.Interaction3f(si), left], weight, active
+
+    def alpha(self, state, visible):
+        return whole_or_nothing(visible)
 
 
 def trace_camera_vertices(

@@ -22,6 +22,8 @@ FAINT = 0.05
 """Tuned: transmittance below which the estimate on the way to a light plays roulette."""
 
 
+LONGEST = 1e18
+"""Stands for the length of a way without end."""
 FLIGHT = 1 << 16
 """Where paths draw their numbers for free flights (`PathNumbers.at`): beyond those of vertices."""
 FLIGHT_SALT, SHADOW_SALT = 0x666C7900, 0x73686164
@@ -184,6 +186,97 @@ def fly(scene, traits, ray, medium, draws, active):
     return hit, ray, medium, scatters, weight
 
 
+# --- Straight on ------------------------------------------------------------------------------
+
+
+@dr.syntax
+def pass_straight(scene, traits, ray, medium, draws, keep, active):
+    """Moves rays straight through media, and through boundaries with the plain BSDF `null`, to the
+    surface that they meet: nothing scatters them on the way.
+
+    `draws`: a `VertexNumbers`. Returns `(hit, ray, medium, kept)`, as `fly` does, but for `kept`:
+    the share of light that gets along; exact in homogeneous media, in others estimated by ratio
+    tracking (Novak et al. 2014), whose tentative collisions cut the way into pieces. Where the
+    share is faint, the way is cut, too, and goes on by roulette.
+
+    `keep(start, medium, length, kept, normal, surface, mask)` is called for each piece in a medium:
+    `start` is a ray from its beginning, `kept` the share there; `normal` is that of the surface
+    which the ray meets, `surface` the distance to it (infinite: none). Along a piece, the share
+    falls with the extinction of homogeneous media, and is constant in others.
+    """
+    ray = mi.Ray3f(ray)
+    medium = mi.MediumPtr(medium)
+    going = mi.Bool(active)
+    rng = own_stream(draws, FLIGHT_SALT)
+    hit = dr.zeros(mi.PreliminaryIntersection3f)
+    kept = mi.Spectrum(1)
+    passed = mi.Float(0)
+    normal = mi.Normal3f(0, 0, 1)
+    fresh = mi.Bool(True)  # the next surface is not known yet
+    scattering = int(mi.BSDFFlags.Delta) | int(mi.BSDFFlags.Smooth)  # Null among them
+    while dr.hint(going, label="straight on"):
+        look = going & fresh
+        hit[look] = scene.ray_intersect_preliminary(ray, coherent=False, active=look)
+        look &= hit.is_valid()
+        normal[look] = hit.compute_surface_interaction(ray, mi.RayFlags.Minimal, look).n
+        fresh = mi.Bool(False)
+
+        # ---- Media: one piece
+        inside = going & (medium != None)  # noqa: E711 (array comparison)
+        stretch = mi.Ray3f(ray)
+        stretch.maxt = dr.minimum(ray.maxt, hit.t)
+        near, far, majorant = section(medium, stretch, inside)
+        start = dr.maximum(near, passed)
+        far = dr.minimum(far, LONGEST)
+        inside &= (majorant > 0) & (start < far)
+        _, _, sigma_t = medium.get_scattering_coefficients(
+            point_in(medium, ray.o, ray.time, ray.wavelengths, -ray.d), inside
+        )
+        least = dr.rcp(dr.maximum(dr.min(sigma_t), 1e-30))
+        t = start + dr.log(dr.max(kept) * (1 / FAINT)) * least  # where it is faint
+        grid = mi.Bool(False)
+        if dr.hint(traits.has_grids, mode="scalar"):
+            grid = inside & ~medium.is_homogeneous()
+            t[grid] = start - dr.log(1 - rng.next_float32(grid)) * dr.rcp(
+                dr.maximum(majorant, 1e-30)
+            )
+        cut = inside & (t < far)
+        t = dr.minimum(t, far)
+        begin = mi.Ray3f(ray)
+        begin.o = ray(start)
+        keep(begin, medium, t - start, kept, normal, hit.t - start, inside)
+        kept[inside & ~grid] = kept * dr.exp(-sigma_t * (t - start))
+        if dr.hint(traits.has_grids, mode="scalar"):
+            collided = grid & cut
+            null, _, probability = collision(
+                medium, ray(t), majorant, ray.time, ray.wavelengths, collided, -ray.d
+            )
+            kept[collided] = kept * null * probability
+        passed[cut] = t
+
+        # ---- Boundaries
+        met = going & ~cut & hit.is_valid()
+        surface = hit.compute_surface_interaction(ray, traits.boundary_flags, met)
+        bsdf = surface.bsdf()
+        crosses = (
+            met & ~hit.shape.is_emitter() & ((bsdf.flags() & scattering) == int(mi.BSDFFlags.Null))
+        )
+        kept[crosses] = kept * bsdf.eval_null_transmission(surface, crosses)
+        medium[crosses & surface.is_medium_transition()] = surface.target_medium(ray.d)
+        ray.o[crosses] = surface.spawn_ray(ray.d).o
+        passed[crosses] = 0
+        fresh |= crosses
+
+        # ---- Roulette
+        strength = dr.max(kept)
+        faint = going & (strength <= 1.001 * FAINT)
+        chance = strength * (0.5 / FAINT)
+        survives = rng.next_float32(faint) < chance
+        kept[faint] = dr.select(survives, kept * dr.rcp(dr.maximum(chance, 1e-30)), 0)
+        going &= (cut | crosses) & (~faint | survives)
+    return hit, ray, medium, kept
+
+
 def begin_flights(traits, medium):
     """What a path carries through media: the medium, the number of its next flight, and whether it
     scatters in the medium where it has arrived. Nothing in scenes without media."""
@@ -200,6 +293,16 @@ def next_hit(scene, traits, ray, flight, numbers, throughput, active):
         scene, traits, ray, medium, numbers.at(FLIGHT + number), active
     )
     return hit, ray, [medium, number + 1, scatters], throughput * weight
+
+
+def next_hit_straight_on(scene, traits, ray, flight, numbers, keep, active):
+    """As `next_hit`, for paths that nothing in media scatters (`pass_straight`, with `keep`); in
+    place of the throughput, the share of light that gets along."""
+    medium, number, scatters = flight
+    hit, ray, medium, kept = pass_straight(
+        scene, traits, ray, medium, numbers.at(FLIGHT + number), keep, active
+    )
+    return hit, ray, [medium, number + 1, scatters], kept
 
 
 def interaction_at(hit, ray, scatters, active):

@@ -18,10 +18,10 @@ import mitsuba as mi
 
 from ..core.packing import Store
 from ..core.records import Layout
-from .camera import trace_camera, within_crop
+from .camera import trace_camera, whole_or_nothing, within_crop
 from .light import trace_light
 from .light_classes import class_of, scattered_history, start_of_camera_path
-from .media import direct_light
+from .media import direct_light, next_hit
 from .sensor import Lens
 from .setting import CameraPass, LightPass, Limits, World
 from .vertex import Sides, VertexBSDF, facing, scattered_mean
@@ -153,10 +153,10 @@ def seen_normal(vertex):
     return dr.mulsign(vertex["n"], dr.dot(vertex["n"], vertex["towards"]))
 
 
-def _selected(mask, yes, no):
+def selected(mask, yes, no):
     """Element by element, of states that hold lists, too."""
     return [
-        _selected(mask, a, b) if isinstance(a, list) else dr.select(mask, a, b)
+        selected(mask, a, b) if isinstance(a, list) else dr.select(mask, a, b)
         for a, b in zip(yes, no)
     ]
 
@@ -261,7 +261,7 @@ class VertexVisitor:
         return [number, parent, density, mi.Point3f(si.p), sums, mark]
 
     def cross(self, before, after, crosses):
-        return [after[0], *_selected(crosses, before[1:], after[1:])]
+        return [after[0], *selected(crosses, before[1:], after[1:])]
 
 
 def trace_light_subpaths(
@@ -310,6 +310,10 @@ class CameraVertexVisitor:
         origin, sums = dr.zeros(mi.Interaction3f), self.weights.blank(n_paths)
         history = [] if self.classes is None else start_of_camera_path()
         return [mi.UInt32(0), mi.UInt32(NO_PARENT), mi.Float(0), origin, sums, history]
+
+    def travel(self, state, ray, flight, numbers, throughput, path, depth, active):
+        hit = next_hit(self.scene, self.traits, ray, flight, numbers, throughput, active)
+        return state, *hit
 
     def emission(self, state, at, active):
         _, _, density, origin, sums, history = state
@@ -407,7 +411,10 @@ class CameraVertexVisitor:
         return [number, parent, density, mi.Interaction3f(si), sums, history], weight, active
 
     def cross(self, before, after, crosses):
-        return [after[0], *_selected(crosses, before[1:], after[1:])]
+        return [after[0], *selected(crosses, before[1:], after[1:])]
+
+    def alpha(self, state, visible):
+        return whole_or_nothing(visible)
 
 
 def trace_camera_subpaths(

@@ -99,11 +99,28 @@ class PhotonMap:
         return cls(Grid(bbox, cell, table_size(capacity)), **arrays)
 
 
+def sort_by_cell(grid, p, active):
+    """Sorts photons at `p` by the grid's cells: `(start, target)`, the first photon of each table
+    entry, and the place of each photon. Three passes: count, prefix sum, scatter (the last one is
+    left to the caller)."""
+    size = grid.size
+    coordinates = grid.coordinates(p)
+    slot = grid.row(coordinates.y, coordinates.z) + dr.minimum(
+        mi.UInt32(coordinates.x), longest_row(size) - 4
+    )
+    counts = dr.zeros(mi.UInt32, size + longest_row(size))
+    rank = dr.scatter_inc(counts, slot, active)
+    dr.eval(counts, rank, slot)
+    start = dr.prefix_sum(counts)
+    dr.eval(start)
+    return start, dr.gather(mi.UInt32, start, slot, active) + rank
+
+
 def build_photon_map(surface, power, count, bbox, cell, capacity: int, kind: str, mis_words=None):
     """Sorts photons into a grid of cells of edge `cell` (width one) over `bbox`.
 
     `kind`: "all", "caustic" or "indirect" selects the photons; `mis_words` (None: there are none)
-    stay unsorted. Three passes over the photons: count, prefix sum, scatter.
+    stay unsorted.
     """
     size = table_size(capacity)
     grid = Grid(bbox, cell, size)
@@ -113,16 +130,7 @@ def build_photon_map(surface, power, count, bbox, cell, capacity: int, kind: str
     landing = landing_of(record)
     if kind != "all":
         active &= landing.caustic == (kind == "caustic")
-    coordinates = grid.coordinates(landing.p)
-    slot = grid.row(coordinates.y, coordinates.z) + dr.minimum(
-        mi.UInt32(coordinates.x), longest_row(size) - 4
-    )
-    counts = dr.zeros(mi.UInt32, size + longest_row(size))
-    rank = dr.scatter_inc(counts, slot, active)
-    dr.eval(counts, rank, slot)
-    start = dr.prefix_sum(counts)
-    dr.eval(start)
-    target = dr.gather(mi.UInt32, start, slot, active) + rank
+    start, target = sort_by_cell(grid, landing.p, active)
     sorted_surface = surface_layout().room(capacity)
     surface_layout().write(sorted_surface, record, target, active)
     sorted_power = power_layout().move(power, index, target, active)
@@ -136,24 +144,31 @@ def build_photon_map(surface, power, count, bbox, cell, capacity: int, kind: str
 
 def for_each_photon(photon_map, p, radius, active, visit, state):
     """Calls `visit(index, landing, offset, distance_squared, hit, state) -> state` for photons
-    within `radius` of `p`.
+    within `radius` of `p` (see `visit_hits`).
+
+    `hit` marks the lanes whose photon belongs to the row that has been read (another one may share
+    its place); `landing` is the photon's `Landing`, `offset` its position minus `p`. `state` is a
+    tuple of Dr.Jit arrays.
+    """
+    return visit_hits(DiskQuery(photon_map, p, radius, active), visit, state)
+
+
+def visit_hits(query, visit, state):
+    """Calls `visit`, as of `for_each_photon`, for the photons that a `Query` finds.
 
     Lanes of a CPU's SIMD unit wait for one another in every loop, and two photons in three of the
     cells around `p` miss, so what is dear to do with a hit must not go in step with the misses. Row
     by row of cells, runs of up to `RUN` photons are tested for distance only; the hits of a run are
     kept as a word of bits. Once a lane keeps `KEPT_RUNS` runs with hits, or has seen all rows, the
-    hits of all of these are visited. `hit` marks the lanes whose photon belongs to the row that has
-    been read (another one may share its place); `landing` is the photon's `Landing`, `offset` its
-    position minus `p`. `state` is a tuple of Dr.Jit arrays.
+    hits of all of these are visited.
     """
-    query = _Query(photon_map, p, radius, active)
 
     def meet(runs, state):
         start, hits, row = runs[0]
         index = start + dr.tzcnt(hits)
         landing, offset = query.read(index)
         own = query.row_of(landing.p) == row
-        state = visit(index, landing, offset, dr.squared_norm(offset), own, state)
+        state = visit(index, landing, offset, query.distance_squared(offset), own, state)
         hits &= hits - 1
         return _chosen(hits == 0, [*runs[1:], _no_run()], [(start, hits, row), *runs[1:]]), state
 
@@ -177,16 +192,70 @@ def for_each_photon(photon_map, p, radius, active, visit, state):
     )[-1]
 
 
-class _Query:
-    """The rows of cells within `radius` of points `p`, one after the other.
+class Query:
+    """The rows of cells near something, one after the other; the photons of each row are tested in
+    runs.
 
-    A place among them is the row (y, z), and where in a row longer than a run the query has
+    A subclass says which rows there are (`begin`, `unfinished`, `next_row`), where the photons of
+    each are (`photons_of_row`, `number`), what is read of them (`read`), and which are hits
+    (`is_hit`). A place is what tells the row, and where in a row longer than a run the query has
     stopped: the next photon and the row's end (0, 0 before the row).
     """
 
-    def __init__(self, photon_map, p, radius, active):
-        self.photon_map, self.grid, self.p = photon_map, photon_map.grid, p
+    def __init__(self, photon_map, radius):
+        self.photon_map, self.grid = photon_map, photon_map.grid
         self.radius_squared = dr.square(radius)
+
+    def distance_squared(self, offset):
+        """Squared distance of photons that lie so far from the query's point."""
+        return dr.squared_norm(offset)
+
+    def is_hit(self, offset):
+        """Whether they lie within the radius."""
+        return self.distance_squared(offset) < self.radius_squared
+
+    def row_of(self, position):
+        """Number of the row in which photons lie."""
+        own = self.grid.coordinates(position)
+        return self.grid.row_number(own.y, own.z)
+
+    def search(self, place, runs):
+        """Tests one run of photons: the next place, and the kept runs with this one before them if
+        it has hits."""
+        *row, start, end = place
+        first, last = self.photons_of_row(*row)
+        on = start < end  # still in a row that is longer than a run
+        start, end = dr.select(on, start, first), dr.select(on, end, last)
+        until = dr.minimum(start + RUN, end)
+        run = start, self._hits(start, until), self.number(*row)
+        runs = _chosen(run[1] != 0, [run, *runs[:-1]], runs)
+        done = until >= end
+        row = self.next_row(*row, done)
+        return (*row, dr.select(done, 0, until), dr.select(done, 0, end)), runs
+
+    def _hits(self, start, until):
+        """Which photons of a run are hits: a bit each."""
+
+        def test(index, bit, hits):
+            _, offset = self.read(index)
+            hit = self.is_hit(offset)
+            return index + 1, bit << 1, hits | dr.select(hit, bit, 0)
+
+        *_, hits = dr.while_loop(
+            (mi.UInt32(start), mi.UInt32(1), mi.UInt32(0)),
+            lambda index, bit, hits: index < until,
+            test,
+            label="photons tested",
+        )
+        return hits
+
+
+class DiskQuery(Query):
+    """The rows (y, z) within `radius` of points `p`."""
+
+    def __init__(self, photon_map, p, radius, active):
+        super().__init__(photon_map, radius)
+        self.p = p
         inverse = dr.rcp(self.grid.cell)
         self.local = (p - self.grid.origin) * inverse
         self.reach = radius * inverse * 1.0001
@@ -212,41 +281,19 @@ class _Query:
         landing = read_landing(self.photon_map.surface, index)
         return landing, landing.p - self.p
 
-    def row_of(self, position):
-        """Number of the row in which photons lie."""
-        own = self.grid.coordinates(position)
-        return self.grid.row_number(own.y, own.z)
+    def photons_of_row(self, y, z):
+        """First photon, and the one after the last, of the cells of a row within the radius."""
+        return _photons_of_row(self.photon_map, y, z, self.local, self.reach)
 
-    def search(self, place, runs):
-        """Tests one run of photons: the next place, and the kept runs with this one before them if
-        it has hits."""
-        y, z, start, end = place
-        first, last = _photons_of_row(self.photon_map, y, z, self.local, self.reach)
-        on = start < end  # still in a row that is longer than a run
-        start, end = dr.select(on, start, first), dr.select(on, end, last)
-        until = dr.minimum(start + RUN, end)
-        run = start, self._hits(start, until), self.grid.row_number(y, z)
-        runs = _chosen(run[1] != 0, [run, *runs[:-1]], runs)
-        done, wrap = until >= end, y >= self.last_y
+    def number(self, y, z):
+        """The row's number."""
+        return self.grid.row_number(y, z)
+
+    def next_row(self, y, z, done):
+        """The row after this one, where that is `done`."""
+        wrap = y >= self.last_y
         z = dr.select(done & wrap, z + 1, z)
-        y = dr.select(done, dr.select(wrap, self.first_y, y + 1), y)
-        return (y, z, dr.select(done, 0, until), dr.select(done, 0, end)), runs
-
-    def _hits(self, start, until):
-        """Which photons of a run lie within the radius: a bit each."""
-
-        def test(index, bit, hits):
-            _, offset = self.read(index)
-            hit = dr.squared_norm(offset) < self.radius_squared
-            return index + 1, bit << 1, hits | dr.select(hit, bit, 0)
-
-        *_, hits = dr.while_loop(
-            (mi.UInt32(start), mi.UInt32(1), mi.UInt32(0)),
-            lambda index, bit, hits: index < until,
-            test,
-            label="photons tested",
-        )
-        return hits
+        return dr.select(done, dr.select(wrap, self.first_y, y + 1), y), z
 
 
 def _no_run():

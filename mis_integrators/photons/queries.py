@@ -9,14 +9,19 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from ..core.packing import Store
+from ..core.packing import Store, pack_direction
 from ..core.recording import lanes
 from ..core.records import Layout
+from ..core.spectra import channel_mean
 from ..core.traits import lookup
 from ..lights.lights import mis_power
-from ..paths.camera import trace_camera
+from ..paths.camera import trace_camera, whole_or_nothing
 from ..paths.light_classes import class_of, scattered_history, start_of_camera_path
+from ..paths.media import direct_light, next_hit_straight_on
 from ..paths.setting import CameraPass, Limits, ListedPass, World
+from ..paths.subpaths import selected
+from ..paths.vertex import Sides
+from .beams import beam_layout, new_beams
 
 LAST_VERTEX = 1 << 31
 """Bit of a vertex' depth that says that all photons are wanted there, else only caustic ones."""
@@ -78,9 +83,10 @@ class Queries:
 
     `bdd`: the last smooth camera vertex, counted from 0; `capacity`: vertices that there is room
     for (under weights, in each section); `has_caustics`, `has_indirect`: kinds of photons that
-    there are; `one_vertex`: no path asks twice, and each owns the place of its number; `narrow`: a
-    registry table of BSDFs at which none but caustic photons are gathered, and which the `bdd` does
-    not count (None: there are none).
+    there are; `one_vertex`: no path asks twice, and each owns the place of its number; `beams`: how
+    many beams through media there is room for (0: none are kept); `narrow`: a registry table of
+    BSDFs at which none but caustic photons are gathered, and which the `bdd` does not count (None:
+    there are none).
     """
 
     bdd: int
@@ -88,6 +94,7 @@ class Queries:
     has_caustics: bool
     has_indirect: bool
     one_vertex: bool
+    beams: int = 0
     narrow: Any = None
 
 
@@ -100,8 +107,9 @@ class QueryVisitor:
     Its state: smooth vertices left behind, `narrow` ones not counted (the last one counts as the
     `bdd`-th); whether there was any of these; whether the last vertex scattered by a delta
     function; the density of the last smooth scattering; the last smooth vertex; the weight of
-    direct light there; how many times light counts that is found there; the state of `weights`; and
-    with `classes` what these carry along.
+    direct light there; how many times light counts that is found there; the state of `weights`;
+    with `classes` what these carry along; and in scenes with media the share of light that has got
+    through these, straight on.
     """
 
     def __init__(self, world, limits, queries, weights, first, beyond, classes):
@@ -117,6 +125,11 @@ class QueryVisitor:
             ),
             count=dr.zeros(mi.UInt32, self.sections),
         )
+        self.deepest = limits.max_depth - 1 if limits.max_depth > 0 else None
+        if queries.beams:
+            self.store.beams = new_beams(queries.beams)
+            self.store.beam_room = dr.opaque(mi.UInt32, queries.beams)
+            self.store.beam_count = dr.zeros(mi.UInt32, 1)
 
     def begin(self, n_paths, splat, aperture):
         sums = [] if self.weights is None else self.weights.init(n_paths)
@@ -124,10 +137,47 @@ class QueryVisitor:
         one = mi.Float(1)
         history = [] if self.classes is None else start_of_camera_path()
         begun = [mi.UInt32(0), mi.Bool(False), mi.Bool(False), one, origin, mi.Spectrum(1)]
-        return [*begun, mi.Float(self.first), sums, history]
+        clear = [mi.Spectrum(1)] if self.traits.has_media else []
+        return [*begun, mi.Float(self.first), sums, history, clear]
+
+    def travel(self, state, ray, flight, numbers, throughput, path, depth, active):
+        *others, clear = state
+        keep = self._keep_beams(state[0], throughput, path, depth + 1)
+        hit, ray, flight, kept = next_hit_straight_on(
+            self.scene, self.traits, ray, flight, numbers, keep, active
+        )
+        return [*others, [clear[0] * kept]], hit, ray, flight, throughput * kept
+
+    def _keep_beams(self, vertex, throughput, path, depth):
+        """What keeps the beams of paths before their first smooth vertex (see `pass_straight`)."""
+        if not self.queries.beams:
+            return lambda *piece: None
+        store, wanted = self.store, vertex == 0
+        if self.deepest is not None:
+            wanted &= mi.Int32(depth) <= self.deepest
+
+        def keep(start, medium, length, kept, normal, surface, mask):
+            light = throughput * kept
+            mask = mask & wanted & (dr.max(light) > 0)
+            slot = dr.scatter_inc(store.beam_count, mi.UInt32(0), mask)
+            mask &= slot < store.beam_room
+            beam = {
+                "o": start.o,
+                "d": start.d,
+                "length": length,
+                "throughput": light,
+                "path": path,
+                "depth": depth,
+                "medium": medium,
+                "normal": pack_direction(normal),
+                "surface": surface,
+            }
+            beam_layout().write(store.beams, beam, slot, mask)
+
+        return keep
 
     def emission(self, state, at, active):
-        _, met, behind_delta, scatter_pdf, origin, share_here, times, sums, history = state
+        _, met, behind_delta, scatter_pdf, origin, share_here, times, sums, history, _ = state
         ds = mi.DirectionSample3f(self.scene, at.si, origin)
         shown = active & (~met | ~behind_delta)
         if self.hide_emitters:
@@ -146,7 +196,7 @@ class QueryVisitor:
         return state[0] <= self.bdd
 
     def arrive(self, state, at, rng, active):
-        vertex, met, behind_delta, scatter_pdf, origin, share_here, times, sums, history = state
+        vertex, met, behind_delta, scatter_pdf, origin, share_here, times, sums, *more = state
         weights, bsdf = self.weights, at.bsdf
         smooth = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
         at.ends = vertex >= self.bdd  # the path's last smooth vertex
@@ -158,21 +208,27 @@ class QueryVisitor:
             sums, share = weights.propagate(sums, at.si, bsdf, vertex, smooth)
             share_here = dr.select(smooth, share, share_here)
             at.ends |= weights.ends(bsdf, vertex, smooth)
-        state = [vertex, met, behind_delta, scatter_pdf, origin, share_here, times, sums, history]
+        state = [vertex, met, behind_delta, scatter_pdf, origin, share_here, times, sums, *more]
         direct = mi.Spectrum(0)
         if not self.lights.dark:
             direct = self._direct(state, at, rng, smooth) * times
             if self.classes is not None:
-                number = class_of(history[0] + 1, mi.Bool(False))
+                number = class_of(more[0][0] + 1, mi.Bool(False))
                 self.classes.add("next_event", at.path, number, direct, smooth)
         self._ask_for_photons(state, at, smooth)
         return state, direct
 
     def _direct(self, state, at, rng, smooth):
         """Radiance of direct light at smooth vertices, by next-event estimation."""
-        vertex, _, _, _, _, share_here, _, sums, _ = state
+        vertex, _, _, _, _, share_here, _, sums, *_ = state
         si, weights = at.si, self.weights
-        ds, light, light_pdf = self.lights.sample_direct(si, rng, smooth)
+        if self.traits.has_media:
+            sides = Sides.at(si, at.medium)
+            ds, light, light_pdf = direct_light(
+                self.scene, self.traits, self.lights, si, sides, rng, smooth
+            )
+        else:
+            ds, light, light_pdf = self.lights.sample_direct(si, rng, smooth)
         wo = si.to_local(ds.d)
         response, response_pdf = at.bsdf.eval_pdf(mi.BSDFContext(), si, wo, smooth)
         if self.by_light:
@@ -184,7 +240,7 @@ class QueryVisitor:
 
     def _ask_for_photons(self, state, at, smooth):
         """Stores the vertices at which photons are to be gathered."""
-        vertex, _, _, _, _, share_here, _, sums, history = state
+        vertex, _, _, _, _, share_here, _, sums, history, _ = state
         weights, store, queries = self.weights, self.store, self.queries
         last = at.ends | (weights is not None)
         wants = smooth & (dr.max(at.throughput) > 0)
@@ -216,7 +272,7 @@ class QueryVisitor:
             dr.scatter(store.vertices["first"], history[0] == 0, slot, wants)
 
     def leave(self, state, at, rng, bs, weight, delta, active):
-        vertex, met, _, scatter_pdf, origin, share_here, times, sums, history = state
+        vertex, met, _, scatter_pdf, origin, share_here, times, sums, history, clear = state
         if not self.traits.has_light_surfaces:
             active &= delta | ~at.ends
         scattered = active & ~delta
@@ -236,8 +292,17 @@ class QueryVisitor:
             times,
             sums,
             scattered_history(history, delta, active) if history else [],
+            clear,
         ]
         return state, weight, active
+
+    def cross(self, before, after, crosses):
+        return selected(crosses, before, after)
+
+    def alpha(self, state, visible):
+        if not self.traits.has_media:
+            return whole_or_nothing(visible)
+        return dr.select(visible, 1, 1 - channel_mean(state[-1][0]))
 
 
 def trace_camera_paths(
@@ -261,6 +326,11 @@ def trace_camera_paths(
     Returns `(radiance, alpha, splat position, vertices, count)`: the vertices at which photons are
     to be gathered, as made by `new_vertex_buffer`, and how many wanted a place in it (width one).
 
+    In scenes with media nothing scatters in these: the paths go straight through, and what light
+    they lack is that of volume photons along their way as far as the first smooth vertex. Where
+    `queries` have room for beams, `vertices` have two entries more, `beams` (see `beams.new_beams`)
+    and `beam_count`, how many wanted a place.
+
     With `weights` (a `mis.state.MergeState`) all photons are wanted at every smooth vertex, and
     direct light at each is weighted. The vertex buffer is then one section for each smooth vertex
     of the path, of `capacity` each (a path's last vertex in the last section), and `count` has one
@@ -273,4 +343,7 @@ def trace_camera_paths(
     """
     visitor = QueryVisitor(world, limits, queries, weights, first, beyond, classes)
     radiance, alpha, splat = trace_camera(world, limits, camera_pass, visitor)
-    return radiance, alpha, splat, visitor.store.vertices, visitor.store.count
+    store = visitor.store
+    if queries.beams:
+        store.vertices |= {"beams": store.beams, "beam_count": store.beam_count}
+    return radiance, alpha, splat, store.vertices, store.count

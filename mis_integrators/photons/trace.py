@@ -9,14 +9,17 @@ from ..core.packing import Store
 from ..core.records import write_packets
 from ..paths.light import trace_light
 from ..paths.setting import LightPass, Limits, World
+from ..paths.subpaths import selected
 from .photon import new_photons, write_photon
+from .volume import new_volume_photons, write_volume_photon
 
 
 class PhotonVisitor:
     """Stores photons (a `LightVisitor`). Its state is that of `light_state`, if there is one, and
-    if they are `marked`, whether what a sub-path met first scattered by a delta function."""
+    if they are `marked`, whether what a sub-path met first scattered by a delta function. In scenes
+    with media there is room for `volume_capacity` volume photons."""
 
-    def __init__(self, capacity, keep_direct, light_state, marked):
+    def __init__(self, capacity, keep_direct, light_state, marked, volume_capacity):
         self.keep_direct, self.light_state, self.marked = keep_direct, light_state, marked
         surface, power = new_photons(capacity)
         self.store = Store(
@@ -27,6 +30,10 @@ class PhotonVisitor:
         )
         if light_state is not None:
             self.store.mis_words = light_state.layout.room(capacity)
+        if volume_capacity:
+            self.store.place, self.store.volume_power = new_volume_photons(volume_capacity)
+            self.store.volume_room = dr.opaque(mi.UInt32, volume_capacity)
+            self.store.volume_count = dr.zeros(mi.UInt32, 1)
 
     def blank(self, lanes):
         return self.begin([])
@@ -44,6 +51,8 @@ class PhotonVisitor:
         if self.light_state is not None:
             words = self.light_state.words(sums)
             write_packets(self.store.mis_words, words, slot, keep)
+        if at.scatters is not None:
+            self._leave_in_medium(mark, at, active & at.scatters)
         return [sums, mark]
 
     def keep(self, at, mark, active):
@@ -66,11 +75,30 @@ class PhotonVisitor:
         write_photon(store.surface, store.power, slot, photon, keep)
         return slot, keep
 
+    def _leave_in_medium(self, mark, at, keep):
+        """Stores volume photons."""
+        store = self.store
+        slot = dr.scatter_inc(store.volume_count, mi.UInt32(0), keep)
+        keep &= slot < store.volume_room
+        photon = {
+            "p": at.si.p,
+            "towards": at.towards,
+            "flux": at.flux,
+            "depth": at.depth,
+            "medium": at.medium,
+        }
+        if self.marked:
+            photon["delta_at_light"] = mark[0]
+        write_volume_photon(store.place, store.volume_power, slot, photon, keep)
+
     def leave(self, state, at, wo, delta, active):
         sums, mark = state
         if self.light_state is not None:
             sums = self.light_state.scatter(sums, at.si, at.bsdf, wo, active & ~delta)
         return [sums, [dr.select(at.first, delta, before) for before in mark]]
+
+    def cross(self, before, after, crosses):
+        return selected(crosses, before, after)
 
 
 def trace_light_paths(
@@ -81,6 +109,7 @@ def trace_light_paths(
     keep_direct: bool = False,
     light_state=None,
     marked: bool = False,
+    volume_capacity: int = 0,
 ):
     """Traces the light sub-paths of a pass and stores photons on surfaces that scatter smoothly.
 
@@ -98,9 +127,17 @@ def trace_light_paths(
 
     With a `light_state` (a `mis.state.LightState`) the result has a fourth array: records of its
     `layout`. If they are to be `marked`, their flux is, see `photon.write_photon`.
+
+    In scenes with media, which need a `volume_capacity`, the last element of the result is a tuple
+    of its own, of the photons in media: all places where sub-paths scatter there, the first one
+    included. It is `(place, power, count)`, see `volume.new_volume_photons`.
     """
-    visitor = PhotonVisitor(capacity, keep_direct, light_state, marked)
+    visitor = PhotonVisitor(capacity, keep_direct, light_state, marked, volume_capacity)
     trace_light(world, limits, light_pass, visitor)
     store = visitor.store
     photons = store.surface, store.power, store.count
-    return photons if light_state is None else (*photons, store.mis_words)
+    if light_state is not None:
+        photons = *photons, store.mis_words
+    if volume_capacity:
+        photons = *photons, (store.place, store.volume_power, store.volume_count)
+    return photons

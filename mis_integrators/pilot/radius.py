@@ -52,7 +52,12 @@ def ladder(points: np.ndarray, weights: np.ndarray) -> np.ndarray | None:
         return None
     low, high = np.percentile(used, [2, 98], axis=1)
     spread = np.linalg.norm(high - low) / 3**0.5
-    return max(spread, 1e-6) * LARGEST_SHARE * STEP ** -np.arange(LADDER_STEPS - 1, -1, -1.0)
+    return ladder_from(max(spread, 1e-6) * LARGEST_SHARE)
+
+
+def ladder_from(largest: float) -> np.ndarray:
+    """The radii of a ladder with this one as its largest."""
+    return largest * STEP ** -np.arange(LADDER_STEPS - 1, -1, -1.0)
 
 
 def middle_index(radii: np.ndarray) -> int:

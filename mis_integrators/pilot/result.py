@@ -22,8 +22,9 @@ RADIUS_WITHOUT_VERTICES = 1e-3
 class PilotSamples(NamedTuple):
     """The estimates of all iterations of a pilot: mean over the channels of radiance."""
 
-    ladder: np.ndarray
-    """(radii,), ascending."""
+    ladder: dict[str, np.ndarray]
+    """By kind: (radii,), ascending. Kinds that no camera path gathers are missing here, and
+    below."""
     photons: dict[str, float]
     """By kind: photons within the ladder's largest radius of a vertex, on average."""
     gathered: dict[tuple[str, bool], np.ndarray]
@@ -110,17 +111,25 @@ class PilotResult:
             A choice that is kept, kind by kind, unless the error falls by more than the share
             `reluctance`.
         """
+        radius = RADIUS_WITHOUT_VERTICES * self.setting.extent
         if not self.errors:
-            radius = RADIUS_WITHOUT_VERTICES * self.setting.extent
             kinds = self.setting.kinds
             return Choice(dict.fromkeys(kinds, radius), dict.fromkeys(kinds, False), None)
-        chosen = {kind: self._best_radius(kind, count, kept, reluctance) for kind in self.photons}
+        chosen = {kind: self._best_radius(kind, count, kept, reluctance) for kind in self._met}
         choice = Choice(
-            {kind: found.radius for kind, found in chosen.items()},
-            {kind: found.corrected for kind, found in chosen.items()},
+            {
+                kind: chosen[kind].radius if kind in chosen else radius
+                for kind in self.setting.kinds
+            },
+            {kind: kind in chosen and chosen[kind].corrected for kind in self.setting.kinds},
             None,
         )
         return replace(choice, prediction=self._predict(choice, count))
+
+    @property
+    def _met(self) -> list[str]:
+        """The kinds of photons that camera paths gather."""
+        return list(self.errors["relmse"])
 
     def _best_radius(
         self, kind: str, count: float, kept: Choice | None, reluctance: float
@@ -140,8 +149,7 @@ class PilotResult:
         errors = {}
         for measure, by_kind in self.errors.items():
             found = [
-                by_kind[kind].at(radius, choice.corrected[kind])
-                for kind, radius in choice.radii.items()
+                by_kind[kind].at(choice.radii[kind], choice.corrected[kind]) for kind in by_kind
             ]
             errors[measure] = PredictedError(
                 sum(squared_bias for squared_bias, _ in found),
@@ -150,7 +158,7 @@ class PilotResult:
         return Prediction(
             errors,
             self.photon_light,
-            sum(self.gathered(kind, radius) for kind, radius in choice.radii.items()),
+            sum(self.gathered(kind, choice.radii[kind]) for kind in self._met),
             count / self.cost(choice),
             self.mean,
             self.pixels,
@@ -169,7 +177,7 @@ class PilotResult:
                     self.gathered(kind, radius), choice.corrected[kind], self.setting.camera_paths
                 )
                 for kind, radius in choice.radii.items()
-                if kind in self.photons
+                if kind in self._met
             ),
             default=1.0,
         )
@@ -187,20 +195,20 @@ def measure(
         nothing = np.zeros(pixels.count)
         return PilotResult(setting, pixels, seconds, {}, {}, {}, nothing, 0.0, 0.0)
     middle = {
-        kind: samples.gathered[kind, False][:, middle_index(samples.ladder)].mean(axis=1)
-        for kind in setting.kinds
+        kind: samples.gathered[kind, False][:, middle_index(ladder)].mean(axis=1)
+        for kind, ladder in samples.ladder.items()
     }  # (iterations, pixels)
     image = samples.direct.mean(axis=1) + sum(middle.values())
     mean = samples.seen + shrink_to_neighbours(image, neighbourhoods(setting.width, pixels))
     weights = {measure: weigh(mean) for measure, weigh in MEASURES.items()}
     errors: dict[str, dict[str, ErrorByRadius]] = {measure: {} for measure in MEASURES}
-    for kind in setting.kinds:
+    for kind, ladder in samples.ladder.items():
         by_correction = {
             corrected: samples.gathered[kind, corrected] for corrected in setting.corrections(kind)
         }
         for measure in MEASURES:
             errors[measure][kind] = error_by_radius(
-                samples.ladder,
+                ladder,
                 by_correction[False],
                 by_correction.get(True),
                 weights[measure],

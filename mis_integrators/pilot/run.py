@@ -7,7 +7,7 @@ from typing import Protocol
 
 import numpy as np
 
-from .radius import LARGEST_SHARE, ladder
+from .radius import LARGEST_SHARE, ladder, ladder_from
 from .result import PilotResult, PilotSamples, measure
 from .setting import PilotPixels, PilotSetting
 
@@ -20,6 +20,9 @@ PILOT_INDEX = 1 << 30
 """Iteration numbers of the pilot start here, so that its random numbers are its own."""
 MOST_PHOTONS = 160
 """Tuned: photons a vertex within the largest radius that is tried."""
+PROBED_SHARE = 8
+"""Volume photons within the largest radius are counted within one so many times smaller: their
+number grows with its square."""
 FEWEST_PHOTONS, WIDER = 1, 4
 """Tuned: photons a vertex within the largest radius, fewer than which tell nothing (the camera may
 see one point only): then radii so many times larger are tried, up to those that suit the whole
@@ -35,11 +38,12 @@ class PilotIteration(Protocol):
         none."""
 
     def mean_photon_count(self, kind: str, radius: float) -> float:
-        """Photons of a kind within `radius` of a vertex, on average."""
+        """Photons of a kind within `radius` of a vertex, on average; volume photons: of a path's
+        way through media."""
 
-    def gather(self, radii: np.ndarray) -> dict[tuple[str, bool], np.ndarray]:
-        """What photons bring, by kind and whether the estimate is corrected at edges: mean over the
-        channels, (radii, groups of camera paths, pixels)."""
+    def gather(self, radii: dict[str, np.ndarray]) -> dict[tuple[str, bool], np.ndarray]:
+        """What photons bring for the radii of each kind, by kind and whether the estimate is
+        corrected at edges: mean over the channels, (radii, groups of camera paths, pixels)."""
 
     def direct(self) -> np.ndarray:
         """Light that neither photons bring nor other paths see: mean over the channels, (groups,
@@ -70,7 +74,7 @@ def run_pilot(setting: PilotSetting, pixels: PilotPixels, passes: PilotPasses) -
     passes
         They trace those pixels, and gather all kinds and corrections of the setting.
     """
-    radii: np.ndarray | None = None
+    radii: dict[str, np.ndarray] | None = None
     photons: dict[str, float] = {}
     gathered: list[dict[tuple[str, bool], np.ndarray]] = []
     direct: list[np.ndarray] = []
@@ -80,16 +84,16 @@ def run_pilot(setting: PilotSetting, pixels: PilotPixels, passes: PilotPasses) -
         iteration = passes.trace(PILOT_INDEX + done - 1)
         if radii is None:
             radii, photons = choose_ladder(setting, iteration)
-        if radii is not None:
+        if radii:
             gathered.append(iteration.gather(radii))
             direct.append(iteration.direct())
         del iteration  # its photons' memory is free for those of the next
         seconds = time.perf_counter() - start
         spent += seconds if done > 1 else 0.0
-        if radii is None or has_enough(setting, done, spent):
+        if not radii or has_enough(setting, done, spent):
             break
     samples = None
-    if radii is not None:
+    if radii:
         estimates = {key: np.array([step[key] for step in gathered]) for key in gathered[0]}
         samples = PilotSamples(radii, photons, estimates, np.array(direct), passes.seen())
     return measure(setting, pixels, samples, seconds)
@@ -106,15 +110,35 @@ def has_enough(setting: PilotSetting, done: int, seconds: float) -> bool:
 
 def choose_ladder(
     setting: PilotSetting, iteration: PilotIteration
-) -> tuple[np.ndarray | None, dict[str, float]]:
-    """The radii to try, and by kind the photons within the largest of a vertex, on average. No
-    radii where no camera path meets a surface that gathers."""
+) -> tuple[dict[str, np.ndarray], dict[str, float]]:
+    """By kind the radii to try, and the photons within the largest of a vertex, on average. No
+    radii for kinds that no camera path gathers.
+
+    Photons on surfaces share their radii; volume photons have their own.
+    """
+    on_surfaces = [kind for kind in setting.kinds if kind != "volume"]
+    radii, photons = ladder_on_surfaces(setting, on_surfaces, iteration)
+    if "volume" in setting.kinds:
+        largest = LARGEST_SHARE * setting.extent / 3**0.5
+        probe = largest / PROBED_SHARE
+        count = iteration.mean_photon_count("volume", probe) * PROBED_SHARE**2
+        if count > 0:
+            largest *= min((MOST_PHOTONS / count) ** 0.5, 1)
+            radii["volume"] = ladder_from(largest)
+            photons["volume"] = min(count, MOST_PHOTONS)
+    return radii, photons
+
+
+def ladder_on_surfaces(
+    setting: PilotSetting, kinds: list[str], iteration: PilotIteration
+) -> tuple[dict[str, np.ndarray], dict[str, float]]:
+    """`choose_ladder` for the kinds of photons on surfaces."""
     radii = ladder(*iteration.points())
-    if radii is None:
-        return None, {}
+    if radii is None or not kinds:
+        return {}, {}
 
     def count(radii: np.ndarray) -> dict[str, float]:
-        return {kind: iteration.mean_photon_count(kind, float(radii[-1])) for kind in setting.kinds}
+        return {kind: iteration.mean_photon_count(kind, float(radii[-1])) for kind in kinds}
 
     photons = count(radii)
     largest = LARGEST_SHARE * setting.extent / 3**0.5
@@ -124,4 +148,4 @@ def choose_ladder(
     if most > MOST_PHOTONS:
         radii = radii * (MOST_PHOTONS / most) ** 0.5
         photons = count(radii)
-    return radii, photons
+    return dict.fromkeys(kinds, radii), photons

@@ -930,7 +930,7 @@ def test_rare_photons_get_no_smallest_radius(rgb):
     session = bdpm(bdd=0, photon_count=1, initial_radius=0.0).session(scene, seed=1, spp=4)
     setting = session.pilot_setting()
     samples = PilotSamples(
-        np.array([0.01 * 2**i for i in range(7)]),
+        {"indirect": np.array([0.01 * 2**i for i in range(7)])},
         {"indirect": 0.0},
         {("indirect", corrected): np.zeros((4, 7, 1, 256)) for corrected in (False, True)},
         np.ones((4, 1, 256)),

@@ -383,7 +383,7 @@ def test_states_behind_half_transparent_surfaces(rgb, kind):
 
 # --- What is refused ----------------------------------------------------------
 
-REFUSING = sorted(set(_plugins.PLUGINS) - {"bdpt", "bdpm_auto", "volpath_multiview"})
+REFUSING = sorted(set(_plugins.PLUGINS) - {"bdpm", "bdpt", "bdpm_auto", "volpath_multiview"})
 
 
 @pytest.mark.parametrize("plugin", REFUSING)

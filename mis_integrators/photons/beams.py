@@ -1,0 +1,276 @@
+"""The beam radiance estimate: light that volume photons bring to camera paths, along all of their
+way through media at once (Jarosz, Zwicker and Jensen 2008, The beam radiance estimate for
+volumetric photon mapping).
+
+A camera path goes straight through media (`paths.media.pass_straight`). Its pieces there are stored
+as beams. Photons within the radius of a beam count by a constant kernel on the disk across the
+beam, times the phase function and the share of light that gets from the photon to the camera.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from ..core.packing import read_mark, unpack_direction
+from ..core.recording import lanes
+from ..core.records import Layout
+from ..core.spectra import channel_mean
+from ..paths.light_classes import CLASSES, by_class, class_of
+from ..paths.media import point_in
+from .grid import Query, longest_row, visit_hits
+from .photon import read_power
+from .volume import number_of_medium, read_place
+
+SLACK = 2e-3
+"""Cells that queries reach beyond the radius, for rounding."""
+
+
+def beam_layout():
+    """Fields of a beam: its ray, `length`, the path's throughput at its beginning, the number of
+    the path, its depth in segments with this one, the medium, and the surface that its ray meets:
+    packed geometric `normal`, and distance (infinite: none)."""
+    return Layout(
+        {
+            "o": mi.Point3f,
+            "path": mi.UInt32,
+            "d": mi.Vector3f,
+            "depth": mi.UInt32,
+            "throughput": mi.Spectrum,
+            "length": mi.Float,
+            "medium": mi.MediumPtr,
+            "normal": mi.UInt32,
+            "surface": mi.Float,
+        }
+    )
+
+
+def new_beams(capacity):
+    """Room for `capacity` beams; unused ones are zero."""
+    return dr.zeros(mi.UInt32, beam_layout().words * capacity)
+
+
+def read_beams(words):
+    """All beams of a buffer, a dictionary of their fields."""
+    return beam_layout().read(words, lanes(beam_layout().capacity(words)))
+
+
+@dataclass
+class Beams:
+    """Beams of a buffer (`new_beams`), one a lane: the fields of `beam_layout`, which are `active`,
+    and the `extinction` by which light falls along them (zero in heterogeneous media)."""
+
+    o: mi.Point3f
+    d: mi.Vector3f
+    length: mi.Float
+    throughput: mi.Spectrum
+    path: mi.UInt32
+    depth: mi.UInt32
+    medium: mi.MediumPtr
+    normal: mi.Vector3f
+    surface: mi.Float
+    active: mi.Bool
+    extinction: mi.Spectrum
+    wavelengths: mi.Float
+
+    @classmethod
+    def read(cls, words, wavelengths):
+        """All beams of a buffer."""
+        record = read_beams(words)
+        active = dr.max(record["throughput"]) > 0
+        medium = dr.select(active, record["medium"], dr.zeros(mi.MediumPtr))
+        at_start = point_in(medium, record["o"], mi.Float(0), wavelengths, -record["d"])
+        even = active & medium.is_homogeneous()
+        _, _, sigma_t = medium.get_scattering_coefficients(at_start, even)
+        extinction = dr.select(even, sigma_t, 0)
+        normal = dr.normalize(unpack_direction(record["normal"]))
+        normal = dr.mulsign(normal, -dr.dot(normal, record["d"]))
+        record |= {"medium": medium, "normal": normal}
+        return cls(**record, active=active, extinction=extinction, wavelengths=wavelengths)
+
+    def before_surface(self, p):
+        """Whether points lie on the camera's side of the surface that ends the way: on that of its
+        tangent plane. Behind a thin wall there may be light that does not get through."""
+        height = dr.dot(p - self.o - self.d * self.surface, self.normal)
+        return ~dr.isfinite(self.surface) | (height > 0)
+
+    def phase(self, p, towards, active):
+        """The phase function [1/sr] at points `p`, for light from `towards` that goes on to the
+        camera."""
+        medium = dr.select(active, self.medium, dr.zeros(mi.MediumPtr))
+        mei = point_in(medium, p, mi.Float(0), self.wavelengths, -self.d)
+        value, _ = medium.phase_function().eval_pdf(
+            mi.PhaseFunctionContext(None), mei, towards, active
+        )
+        return value
+
+
+class BeamQuery(Query):
+    """The rows within `radius` of beams.
+
+    Rows (y, z) are visited in slabs of the axis along which the beam is longer, the `main` one.
+    A row's place is that of its slab, and the rows of the slab before it. The beam begins where it
+    enters the `box` of the photons, `skipped` after its own beginning.
+    """
+
+    def __init__(self, photon_map, beams, radius):
+        super().__init__(photon_map, radius)
+        grid, box, active = self.grid, photon_map.box, beams.active
+        margin = 1.001 * radius
+        self.skipped, end = _within(box.min - margin, box.max + margin, beams)
+        active = active & (self.skipped < end)
+        self.o = beams.o + beams.d * dr.select(active, self.skipped, 0)
+        self.d, self.length = beams.d, dr.select(active, end - self.skipped, 0)
+        inverse = dr.rcp(grid.cell)
+        self.reach = radius * inverse * 1.0001 + SLACK
+        o, d = (self.o - grid.origin) * inverse, self.d * inverse
+        self.main_y = dr.abs(d.y) >= dr.abs(d.z)
+        self.x = o.x, d.x
+        self.main = dr.select(self.main_y, o.y, o.z), dr.select(self.main_y, d.y, d.z)
+        self.other = dr.select(self.main_y, o.z, o.y), dr.select(self.main_y, d.z, d.y)
+        self.first, self.last = self._cells(self.main, 0, self.length)
+        self.last = dr.select(active, self.last, self.first - 1)
+
+    def _cells(self, line, begin, end):
+        """First and last cell within reach of a stretch, along an axis."""
+        a, b = line[0] + line[1] * begin, line[0] + line[1] * end
+        first = dr.floor(dr.minimum(a, b) - self.reach)
+        last = dr.floor(dr.maximum(a, b) + self.reach)
+        return mi.Int32(first), mi.Int32(last)
+
+    def _near(self, line, cell, begin, end):
+        """The part of a stretch that is within reach of a cell, along an axis."""
+        inverse = dr.select(dr.abs(line[1]) > 1e-20, dr.rcp(line[1]), 1e20)
+        cell = mi.Float(cell)
+        a = (cell - self.reach - line[0]) * inverse
+        b = (cell + 1 + self.reach - line[0]) * inverse
+        return dr.maximum(dr.minimum(a, b), begin), dr.minimum(dr.maximum(a, b), end)
+
+    def _slab(self, slab):
+        """The part of the beam within reach of a slab, and the first and last row there."""
+        begin, end = self._near(self.main, slab, 0, self.length)
+        first, last = self._cells(self.other, begin, end)
+        return begin, end, first, dr.select(begin <= end, last, first - 1)
+
+    def _row(self, slab, row):
+        """Cell coordinates (y, z) of a row."""
+        return dr.select(self.main_y, slab, row) + 2, dr.select(self.main_y, row, slab) + 2
+
+    def begin(self):
+        return mi.Int32(self.first), mi.Int32(0), mi.UInt32(0), mi.UInt32(0)
+
+    def unfinished(self, place):
+        return place[0] <= self.last
+
+    def read(self, index):
+        """The `VolumeLanding` of photons `index`, and its offset from the beam's beginning."""
+        landing = read_place(self.photon_map.place, index)
+        return landing, landing.p - self.o
+
+    def distance_squared(self, offset):
+        """Squared distance from the beam's line."""
+        return dr.squared_norm(offset - self.d * dr.dot(offset, self.d))
+
+    def is_hit(self, offset):
+        along = dr.dot(offset, self.d)
+        near = dr.squared_norm(offset - self.d * along) < self.radius_squared
+        return near & (along >= 0) & (along < self.length)
+
+    def photons_of_row(self, slab, number):
+        """First photon, and the one after the last, of the cells of a row within reach."""
+        begin, end, first, last = self._slab(slab)
+        row = first + number
+        begin, end = self._near(self.other, row, begin, end)
+        first_x, last_x = self._cells(self.x, begin, end)
+        most = longest_row(self.grid.size) - 4
+        first_x, last_x = dr.clip(first_x + 2, 0, most), dr.clip(last_x + 2, -1, most)
+        near = (begin <= end) & (row <= last) & (last_x >= first_x)
+        base = self.grid.row(*self._row(slab, row))
+        start = self.photon_map.start
+        return (
+            dr.gather(mi.UInt32, start, base + mi.UInt32(first_x), near),
+            dr.gather(mi.UInt32, start, base + mi.UInt32(last_x) + 1, near),
+        )
+
+    def number(self, slab, number):
+        """The row's number."""
+        _, _, first, _ = self._slab(slab)
+        return self.grid.row_number(*self._row(slab, first + number))
+
+    def next_row(self, slab, number, done):
+        """The row after this one, where that is `done`."""
+        _, _, first, last = self._slab(slab)
+        wrap = first + number >= last
+        following = dr.select(done, dr.select(wrap, 0, number + 1), number)
+        return dr.select(done & wrap, slab + 1, slab), following
+
+
+def _within(low, high, beams):
+    """Where beams enter a box and leave it: distances from their beginning, the first one not
+    smaller than the second where they miss it."""
+    begin, end = mi.Float(0), mi.Float(beams.length)
+    for axis in range(3):
+        o, d = beams.o[axis], beams.d[axis]
+        inverse = dr.select(dr.abs(d) > 1e-20, dr.rcp(d), 1e20)
+        a, b = (low[axis] - o) * inverse, (high[axis] - o) * inverse
+        begin = dr.maximum(begin, dr.minimum(a, b))
+        end = dr.minimum(end, dr.maximum(a, b))
+    return begin, end
+
+
+def gather_along(photon_map, beams, radii, light_path_count, max_depth, grey=False, marked=False):
+    """Radiance that volume photons bring to camera paths along beams, for each radius of a list:
+    the sum over photons of phase function x flux x transmittance to the beam's beginning, over
+    (pi radius^2 x light sub-paths) (Jarosz et al. 2008, with a constant kernel).
+
+    Parameters and result are those of `gather.gather_photons`. Photons count for beams in their own
+    medium only, and not behind the surface that ends the beam.
+    """
+    query = BeamQuery(photon_map, beams, radii[-1])
+    own_medium = number_of_medium(beams.medium)
+    split = marked and not grey
+
+    def visit(index, landing, offset, distance_squared, hit, totals):
+        hit &= (landing.medium == own_medium) & beams.before_surface(landing.p)
+        if max_depth > 0:
+            hit &= landing.depth + beams.depth <= max_depth
+        flux, towards = read_power(photon_map.power, index, hit)
+        if marked:
+            flux, delta_at_light = read_mark(flux)
+        along = query.skipped + dr.dot(offset, query.d)
+        value = flux * beams.phase(landing.p, dr.normalize(towards), hit)
+        value *= dr.exp(-beams.extinction * along)
+        if grey:
+            value = channel_mean(value * beams.throughput)
+        values = [value]
+        if split:
+            smooth = dr.select(landing.depth == 1, mi.UInt32(1), mi.UInt32(2))
+            values = by_class(class_of(smooth, delta_at_light), value)
+        inside = [hit & (distance_squared < dr.square(radius)) for radius in radii]
+        found = [dr.select(i, value, 0) for i in inside for value in values]
+        return tuple(total + value for total, value in zip(totals, found))
+
+    sums = [radius for radius in radii for _ in range(len(CLASSES) if split else 1)]
+    totals = visit_hits(query, visit, tuple(mi.Float(0) if grey else mi.Spectrum(0) for _ in sums))
+    factor = 1 if grey else beams.throughput
+    return [
+        dr.select(beams.active, total * factor / (dr.pi * dr.square(radius) * light_path_count), 0)
+        for total, radius in zip(totals, sums)
+    ]
+
+
+def mean_count_along(photon_map, beams, radius, paths):
+    """Photons within `radius` of the beams of a camera path, on average over `paths` of them (a
+    number)."""
+    query = BeamQuery(photon_map, beams, radius)
+    own_medium = number_of_medium(beams.medium)
+    (count,) = visit_hits(
+        query,
+        lambda index, landing, offset, distance_squared, hit, counts: (
+            counts[0] + dr.select(hit & (landing.medium == own_medium), mi.UInt32(1), 0),
+        ),
+        (mi.UInt32(0),),
+    )
+    return float(dr.sum(mi.Float(count))[0]) / paths

@@ -1,0 +1,137 @@
+"""Volume photons: what light sub-paths leave where they scatter in media, and the map of them.
+
+A photon carries its flux after the scattering's albedo, so that the sum of photons over a volume
+estimates the light that is scattered there: fluence times the scattering coefficient, integrated.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from ..core.packing import DEPTH_BITS, MAX_DEPTH, pack_direction, with_mark
+from ..core.records import Layout
+from .grid import Grid, longest_row, sort_by_cell, table_size
+from .photon import power_layout
+
+Array = Any
+
+CELL = 2.0
+"""Tuned: edge of a cell of the grid, in radii."""
+
+
+def place_layout():
+    """Position `p`; `word`: depth and medium, as of `pack_place`."""
+    return Layout({"p": mi.Point3f, "word": mi.UInt32})
+
+
+def pack_place(depth, medium):
+    """A path depth (saturated at `MAX_DEPTH`), and the number of a medium in 23 bits."""
+    return dr.minimum(depth, MAX_DEPTH) | (number_of_medium(medium) << DEPTH_BITS)
+
+
+def number_of_medium(medium):
+    """Dr.Jit's registry number of media (0: none)."""
+    return dr.reinterpret_array(mi.UInt32, medium)
+
+
+@dataclass
+class VolumeLanding:
+    """Where a volume photon was left: position, depth in segments, number of the medium."""
+
+    p: mi.Point3f
+    depth: mi.UInt32
+    medium: mi.UInt32
+
+
+def read_place(place, index, active=True):
+    """The `VolumeLanding` of photons `index`."""
+    record = place_layout().read(place, index, active)
+    word = record["word"]
+    return VolumeLanding(record["p"], word & MAX_DEPTH, word >> DEPTH_BITS)
+
+
+def new_volume_photons(capacity):
+    """Room for the two records of each volume photon: `(place, power)`; the latter as of
+    `photon.power_layout`."""
+    return place_layout().room(capacity), power_layout().room(capacity)
+
+
+def write_volume_photon(place, power, slot, photon, active):
+    """Writes photons to the places `slot`. `photon`: by name, `p`, `towards`, `flux`, `depth`,
+    `medium`, and where light is split into classes, `delta_at_light` (see
+    `photon.write_photon`)."""
+    word = pack_place(photon["depth"], photon["medium"])
+    place_layout().write(place, {"p": photon["p"], "word": word}, slot, active)
+    flux = photon["flux"]
+    if "delta_at_light" in photon:
+        flux = with_mark(flux, photon["delta_at_light"])
+    towards = pack_direction(photon["towards"])
+    power_layout().write(power, {"flux": flux, "towards": towards}, slot, active)
+
+
+@dataclass
+class Box:
+    """A bounding box (as `mi.BoundingBox3f`, which no recording takes)."""
+
+    min: mi.Point3f
+    max: mi.Point3f
+
+
+class VolumeMap:
+    """Sorted volume photons: their `box`, a `grid` over it, `start` (first photon of each table
+    entry), `place` and `power`."""
+
+    def __init__(self, box, grid, start, place, power):
+        self.box, self.grid, self.start, self.place, self.power = box, grid, start, place, power
+
+    def arrays(self):
+        """What a recorded function can take; `with_grid` makes the map of it again."""
+        names = "start", "place", "power"
+        return {
+            **{name: getattr(self, name) for name in names},
+            "low": self.box.min,
+            "high": self.box.max,
+        }
+
+    @classmethod
+    def with_grid(cls, arrays, radius, capacity: int):
+        """The map of `arrays`, built for the same radius and capacity."""
+        arrays = dict(arrays)
+        box = Box(arrays.pop("low"), arrays.pop("high"))
+        return cls(box, volume_grid(box, radius, capacity), **arrays)
+
+
+def volume_grid(box, radius, capacity):
+    """The grid for queries of a radius (width one)."""
+    size = table_size(capacity)
+    extent = box.max.x - box.min.x
+    return Grid(box, dr.maximum(CELL * radius, extent / (longest_row(size) - 8)), size)
+
+
+def build_volume_map(place, power, count, radius, capacity: int):
+    """Sorts volume photons into a grid over the box that holds them all."""
+    index = dr.arange(mi.UInt32, capacity)
+    active = index < dr.gather(mi.UInt32, count, 0)
+    record = place_layout().read(place, index, active)
+    p = record["p"]
+    box = Box(
+        mi.Point3f(*(_extreme(dr.min, x, active, dr.inf) for x in p)),
+        mi.Point3f(*(_extreme(dr.max, x, active, -dr.inf) for x in p)),
+    )
+    grid = volume_grid(box, radius, capacity)
+    start, target = sort_by_cell(grid, p, active)
+    sorted_place = place_layout().room(capacity)
+    place_layout().write(sorted_place, record, target, active)
+    sorted_power = power_layout().move(power, index, target, active)
+    dr.eval(sorted_place, sorted_power)
+    return VolumeMap(box, grid, start, sorted_place, sorted_power)
+
+
+def _extreme(reduce, values, active, neutral):
+    """The smallest or largest of the active values; zero where there are none."""
+    found = reduce(dr.select(active, values, neutral))
+    return dr.select(dr.isfinite(found), found, 0)

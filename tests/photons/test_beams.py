@@ -1,0 +1,320 @@
+"""Volume photons and the beams that gather them: the map against brute force, records, memory, and
+the pieces of a way through media."""
+
+from mis_integrators.core.packing import pack_direction
+from mis_integrators.core.sequences import SampleSequence
+from mis_integrators.core.traits import SceneTraits
+from mis_integrators.paths.media import pass_straight
+from mis_integrators.photons.beams import Beams, beam_layout, gather_along, mean_count_along
+from mis_integrators.photons.grid import longest_row, table_size
+from mis_integrators.photons.volume import (
+    VolumeMap,
+    build_volume_map,
+    new_volume_photons,
+    number_of_medium,
+    place_layout,
+    read_place,
+    write_volume_photon,
+)
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from comparing import Estimate, differences
+from foggy import container, grid, pockets
+from test_bdpt_media import FOG, ball, homogeneous
+
+SIGMA = 0.7
+
+
+def media():
+    """Two media, which a scene keeps alive."""
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "a": container(homogeneous(SIGMA, 1.0)),
+            "b": container(homogeneous(2.0, 1.0), at=(5, 0, 0)),
+        }
+    )
+    by_id = {shape.id(): shape.interior_medium() for shape in scene.shapes()}
+    return scene, by_id["a"], by_id["b"]
+
+
+def photon_map(points, flux, medium, radius, depth=1):
+    """The map of volume photons, NumPy (n, 3) and (n,)."""
+    count, capacity = len(points), len(points) + 3
+    place, power = new_volume_photons(capacity)
+    photon = {
+        "p": mi.Point3f(np.float32(points).T.copy()),
+        "towards": mi.Vector3f(0, 0, 1),
+        "flux": mi.Spectrum(mi.Float(np.float32(flux))),
+        "depth": mi.UInt32(depth),
+        "medium": mi.MediumPtr(medium),
+    }
+    write_volume_photon(place, power, dr.arange(mi.UInt32, count), photon, True)
+    return build_volume_map(place, power, mi.UInt32([count]), mi.Float([radius]), capacity)
+
+
+def beams(o, d, length, medium, depth=1, normal=(0, 0, 1), surface=dr.inf):
+    """Beams (NumPy (m, 3), (m, 3), (m,)) in a medium, on rays that meet a surface."""
+    words = beam_layout().room(len(o))
+    values = {
+        "o": mi.Point3f(np.float32(o).T.copy()),
+        "path": dr.arange(mi.UInt32, len(o)),
+        "d": mi.Vector3f(np.float32(d).T.copy()),
+        "depth": mi.UInt32(depth),
+        "throughput": mi.Spectrum(1),
+        "length": mi.Float(np.float32(length)),
+        "medium": mi.MediumPtr(medium),
+        "normal": pack_direction(mi.Vector3f(*map(float, normal))),
+        "surface": mi.Float(surface),
+    }
+    beam_layout().write(words, values, dr.arange(mi.UInt32, len(o)))
+    return Beams.read(words, [])
+
+
+def expected(points, flux, o, d, length, radius, sigma=SIGMA):
+    """What the beams gather, by brute force: isotropic scattering."""
+    offset = points[None] - o[:, None]
+    along = (offset * d[:, None]).sum(-1)
+    apart = np.linalg.norm(offset - along[..., None] * d[:, None], axis=-1)
+    hit = (apart < radius) & (along >= 0) & (along < length[:, None])
+    light = hit * flux[None] * np.exp(-sigma * along * hit) / (4 * np.pi)
+    return light.sum(axis=1) / (np.pi * radius**2), hit.sum()
+
+
+def directions(rng, kind, count):
+    if kind == "anywhere":
+        d = rng.normal(size=(count, 3))
+        return d / np.linalg.norm(d, axis=1)[:, None]
+    axes = np.concatenate([np.eye(3), -np.eye(3)])
+    return axes[rng.integers(0, 6, count)]
+
+
+@pytest.mark.parametrize("kind", ["anywhere", "along an axis"])
+@pytest.mark.parametrize("radius, length", [(0.3, 2.0), (0.05, np.inf), (1.5, 8.0), (0.05, 0.04)])
+def test_beams_find_what_brute_force_finds(rgb, kind, radius, length):
+    """Beams that begin within the photons' box and outside of it, short ones and endless ones, and
+    radii from a fraction of the box to all of it."""
+    rng = np.random.default_rng(int(100 * radius))
+    _scene, medium, _ = media()
+    points = rng.uniform(-1, 2, (3000, 3)).astype(np.float32).astype(float)
+    flux = rng.uniform(0.5, 2, 3000).astype(np.float32).astype(float)
+    o = rng.uniform(-4, 5, (500, 3)).astype(np.float32).astype(float)
+    o[:200] = points[:200]  # the photon itself is at the edge of its beam
+    o[:200] -= 0.01
+    d = directions(rng, kind, 500).astype(np.float32).astype(float)
+    lengths = np.where(np.arange(500) % 5 == 0, 0.5 * min(length, 4), length)
+    built = photon_map(points, flux, medium, radius)
+    (found,) = gather_along(
+        built, beams(o, d, np.minimum(lengths, 1e18), medium), [mi.Float(radius)], 1, -1
+    )
+    right, hits = expected(points, flux, o, d, lengths, radius)
+    assert hits > 20
+    found = np.array(found)[0]
+    # A photon right at the edge of a disk may be found by one and not by the other.
+    close = np.abs(found - right) <= 1e-3 * right + 1e-6
+    assert np.mean(close) > 0.995 and abs(found.sum() / right.sum() - 1) < 1e-3
+
+
+def test_several_radii_are_those_of_each(rgb):
+    rng = np.random.default_rng(3)
+    _scene, medium, _ = media()
+    points, flux = rng.uniform(-1, 1, (2000, 3)), rng.uniform(0.5, 2, 2000)
+    o, d = rng.uniform(-1, 1, (200, 3)), directions(rng, "anywhere", 200)
+    length, radii = np.full(200, 1.0), [0.1, 0.2, 0.4]
+    built = photon_map(points, flux, medium, radii[-1])
+    those = beams(o, d, length, medium)
+    together = gather_along(built, those, [mi.Float(r) for r in radii], 1, -1, grey=True)
+    for radius, found in zip(radii, together):
+        right, _ = expected(points, flux, o, d, length, radius)
+        assert np.sum(found) == pytest.approx(right.sum(), rel=1e-3)
+    right, hits = expected(points, flux, o, d, length, 0.4)
+    assert mean_count_along(built, those, mi.Float(0.4), 100) == pytest.approx(hits / 100, rel=1e-3)
+
+
+def test_photons_of_another_medium_do_not_count(rgb):
+    _scene, first, second = media()
+    points, flux = np.zeros((5, 3)), np.ones(5)
+    built = photon_map(points, flux, first, 0.1)
+    o, d, length = np.array([[0, 0, -1.0]]), np.array([[0, 0, 1.0]]), np.array([3.0])
+    inside, outside = (
+        gather_along(built, beams(o, d, length, medium), [mi.Float(0.1)], 1, -1)[0]
+        for medium in (first, second)
+    )
+    assert np.array(inside).max() > 0 and np.array(outside).max() == 0
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize("height, found", [(0.05, True), (-0.05, False)])
+def test_photons_behind_a_wall_do_not_count(rgb, height, found, sign):
+    """A beam ends on a slanting wall; a photon beside it, less far along, lies before that wall or
+    behind it. The side of the wall's normal does not matter."""
+    _scene, medium, _ = media()
+    normal, along_wall = np.array([0.6, 0.0, -0.8]), np.array([0.8, 0.0, 0.6])
+    point = np.array([0, 0, 2.0]) - 0.3 * along_wall + height * normal
+    built = photon_map(point[None], np.ones(1), medium, 0.5)
+    o, d, length = np.array([[0, 0, 0.0]]), np.array([[0, 0, 1.0]]), np.array([2.0])
+    those = beams(o, d, length, medium, normal=sign * normal, surface=2.0)
+    (light,) = gather_along(built, those, [mi.Float(0.5)], 1, -1)
+    assert mean_count_along(built, those, mi.Float(0.5), 1) == 1
+    assert (np.array(light).max() > 0) == found
+
+
+@pytest.mark.parametrize("max_depth, found", [(-1, True), (6, False), (7, True)])
+def test_depths_add_up(rgb, max_depth, found):
+    """A photon after four segments and a beam that is the third one."""
+    _scene, medium, _ = media()
+    built = photon_map(np.zeros((1, 3)), np.ones(1), medium, 0.1, depth=4)
+    o, d, length = np.array([[0, 0, -1.0]]), np.array([[0, 0, 1.0]]), np.array([3.0])
+    those = beams(o, d, length, medium, depth=3)
+    (light,) = gather_along(built, those, [mi.Float(0.1)], 1, max_depth)
+    assert (np.array(light).max() > 0) == found
+
+
+def test_no_photons(rgb):
+    _scene, medium, _ = media()
+    place, power = new_volume_photons(8)
+    built = build_volume_map(place, power, mi.UInt32([0]), mi.Float([0.1]), 8)
+    o, d, length = np.array([[0, 0, -1.0]]), np.array([[0, 0, 1.0]]), np.array([3.0])
+    (light,) = gather_along(built, beams(o, d, length, medium), [mi.Float(0.1)], 1, -1)
+    assert np.array(light).tolist() == [[0]] * 3
+
+
+def test_records_hold_what_was_written(rgb):
+    """Depths saturate; media are told apart."""
+    _scene, first, second = media()
+    place, power = new_volume_photons(2)
+    media_of = dr.select(mi.Bool([True, False]), mi.MediumPtr(first), mi.MediumPtr(second))
+    photon = {
+        "p": mi.Point3f([1, 2], [3, 4], [5, 6]),
+        "towards": mi.Vector3f(0, 0, 1),
+        "flux": mi.Spectrum(1),
+        "depth": mi.UInt32([7, 100000]),
+        "medium": media_of,
+    }
+    write_volume_photon(place, power, dr.arange(mi.UInt32, 2), photon, True)
+    landing = read_place(place, dr.arange(mi.UInt32, 2))
+    assert np.array(landing.p).tolist() == [[1, 2], [3, 4], [5, 6]]
+    assert np.array(landing.depth).tolist() == [7, 511]
+    assert np.array(landing.medium == number_of_medium(media_of)).all()
+
+
+def test_ten_million_photons_fit_into_two_gibibytes(rgb):
+    """Records, unsorted and sorted; the table's counts and first photons; rank and table entry of
+    each photon."""
+    count = 10**7
+    place, power = new_volume_photons(1000)
+    record = 4 * (dr.width(place) + dr.width(power)) / 1000
+    assert record == 32
+    size = table_size(count)
+    total = 2 * record * count + 2 * 4 * (size + longest_row(size)) + 2 * 4 * count
+    assert total < 2 * 2**30
+    _scene, medium, _ = media()
+    arrays = photon_map(np.zeros((1000, 3)), np.ones(1000), medium, 0.1).arrays()
+    built = VolumeMap.with_grid(arrays, mi.Float([0.1]), 1003)
+    assert dr.width(built.place) == place_layout().words * 1003
+    assert built.grid.size == table_size(1003) and dr.width(built.start) == built.grid.size * 5 // 4
+
+
+# --- The way through media ----------------------------------------------------
+
+COUNT = 1 << 14
+
+
+def straight(scene, o, d):
+    """What `pass_straight` finds along a ray: the hits' distances, the share that gets there, and
+    the pieces `(first, last, share at first, path)`."""
+    traits = SceneTraits(scene)
+    sequence = SampleSequence(mi.UInt32(5), mi.UInt32(0), 1, False)
+    draws = sequence.of_paths(dr.arange(mi.UInt32, COUNT)).at(0)
+    ray = mi.Ray3f(dr.zeros(mi.Point3f, COUNT) + mi.Point3f(*o), mi.Vector3f(*d))
+    room = 64 * COUNT
+    store = type("Pieces", (), {})()
+    store.count = dr.zeros(mi.UInt32, 1)
+    store.values = dr.zeros(mi.Float, 4 * room)
+
+    def keep(start, medium, length, kept, normal, surface, mask):
+        slot = dr.scatter_inc(store.count, mi.UInt32(0), mask)
+        first = dr.dot(start.o - mi.Point3f(*o), mi.Vector3f(*d))
+        path = mi.Float(dr.arange(mi.UInt32, COUNT))
+        for place, value in enumerate((first, first + length, kept[0], path)):
+            dr.scatter(store.values, value, 4 * slot + place, mask)
+
+    none = dr.zeros(mi.MediumPtr, COUNT)
+    hit, ray, _, kept = pass_straight(scene, traits, ray, none, draws, keep, True)
+    dr.eval(hit, ray, kept, store.values, store.count)
+    number = int(store.count[0])
+    assert number < room
+    end = np.array(dr.dot(ray(hit.t) - mi.Point3f(*o), mi.Vector3f(*d)))
+    return end, np.array(kept), np.array(store.values).reshape(-1, 4)[:number]
+
+
+def share_along(pieces, depths, sigma=0.0):
+    """Mean share of light, over the paths, at each depth: what the pieces there say."""
+    found = []
+    for depth in depths:
+        here = (pieces[:, 0] <= depth) & (depth < pieces[:, 1])
+        share = pieces[here, 2] * np.exp(-sigma * (depth - pieces[here, 0]))
+        values = np.bincount(pieces[here, 3].astype(int), share, minlength=COUNT)
+        found.append([group.mean() for group in np.split(values, 64)])
+    return Estimate.of(np.array(found).T[:, :, None])
+
+
+@pytest.mark.parametrize("sigma", [0.4, 5.0])
+def test_pieces_of_a_homogeneous_medium(rgb, sigma):
+    """From boundary to boundary with Beer's law along them; where light is faint, by roulette with
+    the same mean."""
+    scene = mi.load_dict(
+        {"type": "scene", "cube": container(homogeneous(sigma)), "wall": ball({"type": "diffuse"},
+         0.5, center=[0, 0, -3])}
+    )  # fmt: skip
+    end, kept, pieces = straight(scene, (0.1, 0, 4), (0, 0, -1))
+    depths = np.array([3.1, 3.5, 4.0, 4.9])
+    exact = Estimate.exact(np.exp(-sigma * (depths - 3))[:, None])
+    found = share_along(pieces, depths, sigma)
+    assert not differences(found, exact, slack=1e-3)
+    assert np.sqrt(found.error2.max()) < 0.002
+    law = np.exp(-2 * sigma)
+    assert abs(kept[0].mean() - law) < 6 * kept[0].std() / COUNT**0.5 + 1e-3 * law
+    going = kept[0] > 0
+    np.testing.assert_allclose(end[going], 7 - np.sqrt(0.25 - 0.01), atol=1e-3)
+    assert going.all() == (sigma < 1), "no roulette where light is strong"
+
+
+def test_pieces_of_a_heterogeneous_medium(rgb):
+    """Their mean share is the transmittance, known from as many cells as the ray meets."""
+    medium = grid(pockets, scale=2.0)
+    scene = mi.load_dict({"type": "scene", "cube": container(medium)})
+    _, kept, pieces = straight(scene, (0.1, -0.2, 3), (0, 0, -1))
+    depths = np.linspace(2.05, 3.95, 9)
+    fine = np.linspace(2, 4, 4001)
+    middle = 0.5 * (fine[1:] + fine[:-1])
+    mei = dr.zeros(mi.MediumInteraction3f, len(middle))
+    mei.p = mi.Point3f(0.1, -0.2, mi.Float(3 - middle))
+    mei.medium = scene.shapes()[0].interior_medium()
+    _, _, sigma_t = mei.medium.get_scattering_coefficients(mei)
+    thickness = np.concatenate([[0], np.cumsum(np.array(sigma_t)[0] * np.diff(fine))])
+    exact = np.exp(-np.interp(depths, fine, thickness))
+    found = share_along(pieces, depths)
+    assert not differences(found, Estimate.exact(exact[:, None]), slack=2e-3)
+    assert np.sqrt(found.error2.max()) < 0.01
+    law = np.exp(-thickness[-1])
+    assert abs(kept[0].mean() - law) < 6 * kept[0].std() / COUNT**0.5 + 2e-3 * law
+
+
+def test_boundaries_within_one_another(rgb):
+    """Pieces end at each boundary."""
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "fog": {**homogeneous(0.2), "id": "fog"},
+            "outer": container(FOG),
+            "inner": {**container(homogeneous(1.0), 0.5), "exterior": FOG},
+        }
+    )
+    _, kept, pieces = straight(scene, (0.1, 0.2, 3), (0, 0, -1))
+    ends = np.unique(np.round(pieces[:, :2], 2), axis=0)
+    np.testing.assert_allclose(ends, [[2, 2.5], [2.5, 3.5], [3.5, 4]], atol=0.011)
+    np.testing.assert_allclose(kept, np.exp(-(0.2 + 1.0)), rtol=1e-3)
