@@ -52,9 +52,9 @@ class BDPM(IterativeIntegrator):
 
      * - bdd
        - |int|
-       - Backward diffuse depth: the camera vertex at which photons are gathered, counted over
-         vertices that scatter smoothly, from
-         0. Direct light is estimated at every vertex up to it. (Default: 1)
+       - Backward diffuse depth: the camera vertex at which photons are gathered, counted from 0
+         over vertices that scatter smoothly and have no narrow lobes. Direct light is estimated at
+         every vertex up to it. (Default: 1)
      * - photon_count
        - |int|
        - Light sub-paths an iteration; 0 stands for as many as the cropped film has pixels.

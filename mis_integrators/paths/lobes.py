@@ -59,7 +59,7 @@ def concentration(bsdfs):
     si.dp_du, si.dp_dv = mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0)
     si.t = mi.Float(1)
     if mi.is_spectral:
-        si.wavelengths = mi.sample_rgb_spectrum(mi.Wavelength(0.5))[0]
+        si.wavelengths = mi.sample_rgb_spectrum(mi.sample_shifted(mi.Float(0.5)))[0]
     choice, u, v, s, t = *sobol(index, mi.UInt32(1), 3), *sobol(index, mi.UInt32(2), 2)
     si.uv = mi.Point2f(s, t)
     context = mi.BSDFContext(mi.TransportMode.Radiance, int(mi.BSDFFlags.Smooth))

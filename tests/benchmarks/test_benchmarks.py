@@ -598,3 +598,59 @@ def test_whether_bdpm_auto_is_behind(tmp_path, module):
 def test_random_rooms_are_the_same_each_time(module):
     rooms = module("common.rooms")
     assert rooms.room(3) == rooms.room(3) != rooms.room(4)
+
+
+def test_published_forms_change_what_they_name(module):
+    """Every form of the ladder: its plugin takes its parameters, and while it renders the
+    integrator has the values that it names."""
+    published, methods = module("experiments.published"), module("common.methods")
+    changed = module("common.tuned").changed
+    from mis_integrators.integrators import resampled
+    from mis_integrators.mis import resampling as bounded
+    from mis_integrators.resampling import proposals
+
+    seen = set()
+    for label, (method, values) in published.LADDER.items():
+        parsed = methods.parse_method(method)
+        plugin = mi.load_dict({"type": parsed.plugin, **parsed.parameters})
+        assert plugin.published == label.startswith("published")
+        with changed(values):
+            seen.add(
+                (
+                    resampled.PublishedWeights,
+                    resampled.ResampledWeights,
+                    resampled.guessed_weight,
+                    bounded.BLIND_SHARE,
+                    bounded.LEAST_GAIN,
+                    bounded.MOST_GAIN,
+                    proposals.BLIND_SHARE,
+                    proposals.UNIFORM_SHARE,
+                )
+            )
+    # `published`, `bounded` and both with path densities change nothing; all others differ.
+    assert len(seen) == len(published.LADDER) - 3
+    assert resampled.PublishedWeights not in (published.WithBounds, published.WithoutLengths)
+
+
+def test_common_noise_is_that_of_blocks(module):
+    """Means of 8 x 8 pixels; what does not fill a block is left out."""
+    published = module("experiments.published")
+    image = np.zeros((17, 24, 3))
+    image[:8, 8:16] = 2.0
+    image[16] = 100.0
+    blocks = published._blocks(image)
+    assert blocks.shape == (2, 3, 3)
+    assert np.array_equal(blocks[..., 0], [[0, 2, 0], [0, 0, 0]])
+
+
+def test_distances_of_shifted_densities(module):
+    """Zero for what is the same, and of the stretches only the primary samples follow the target's
+    majorant."""
+    rows = module("experiments.multiview").density_distances()
+    assert len(rows) == 9
+    for row in rows:
+        assert 0 <= row["tentative"] <= 1 and row["tentative"] != row["real"]
+        if row["stretch"] == "primary_sample":
+            assert row["tentative"] < 0.02
+        elif row["base majorant"] != pytest.approx(1.05):
+            assert row["tentative"] > 0.1
