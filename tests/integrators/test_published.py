@@ -111,13 +111,14 @@ def paths_of(session, length):
 
 def assert_sums_to_one(total, weights, valid):
     total, valid = np.array(total), np.array(valid)
-    largest = max(np.abs(np.array(weight))[valid].max() for weight in weights)
-    assert valid.sum() > 50 and largest > 0.02
-    assert np.isfinite(total[valid]).all()
-    # Roundings of weights that are far larger than one; the ray from the light's side meets the
+    total = total[valid]
+    largest = np.max([np.abs(np.array(weight))[valid] for weight in weights], axis=0)
+    assert valid.sum() > 50 and np.median(largest) > 0.02
+    assert np.isfinite(total).all()
+    # Roundings of weights that may be far larger than one. The ray from the light's side meets the
     # vertex a rounding away, where a photon at the edge of the disk may count or not.
-    wrong = np.abs(total[valid] - 1) > 1e-3 * (1 + largest)
-    assert wrong.mean() < 0.02
+    wrong = np.abs(total - 1) > 1e-3 * (1 + largest)
+    assert wrong.mean() < 0.02, (wrong.mean(), np.quantile(np.abs(total - 1), [0.5, 0.9, 0.98]))
 
 
 @pytest.mark.parametrize(
