@@ -298,7 +298,7 @@ def measured_in_sphere(
 @pytest.mark.parametrize(
     "strategies, settings",
     [
-        (2, {"iterations": 200, "size": 24}),
+        (2, {"iterations": 200, "size": 24, "light_paths": 200}),
         # A gather for each pair of a vertex and a frozen photon: ten times the seconds.
         pytest.param(
             3,
