@@ -29,6 +29,7 @@ COLUMNS = (
     "cross share",
     "camera share",
     "photon share",
+    "F / N_F",
     "error of a share",
 )
 GROUPS = 8
@@ -122,6 +123,7 @@ def compare(opened: OpenScene, camera_paths: int, options: argparse.Namespace) -
                 "cross share": float(cross),
                 "camera share": float(of_camera),
                 "photon share": float(of_photons),
+                "F / N_F": float(light),
                 "error of a share": float(spread.std(axis=0, ddof=1).max() / GROUPS**0.5),
             }
         )

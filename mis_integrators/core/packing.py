@@ -115,10 +115,9 @@ def from_numpy(dtype, values):
     whenever that happens to be aligned in another way; so is the one that copies."""
     values = np.asarray(values, np.float32 if dr.is_float_v(dtype) else np.uint32)
     array = dtype(_aligned(values))
-    copy = array + dr.opaque(dtype, 0)  # (a gather of all would be the array itself)
-    dr.eval(copy)
-    dr.sync_thread()  # kernels wait for their turn, NumPy's memory is given back at once
-    return copy
+    array = array + dr.opaque(dtype, 0)  # (a gather of all would be the array itself)
+    dr.eval(array)
+    return array
 
 
 def _aligned(values):

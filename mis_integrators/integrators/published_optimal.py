@@ -98,7 +98,7 @@ class PublishedSession(BDPMSession):
         radii = self.radii_at(iteration)
         if not radii:
             return super()._render(iteration)
-        with no_garbage_collection():
+        with no_garbage_collection():  # as where passes are recorded: these are not
             return self._render_weighted(iteration, radii)
 
     def _render_weighted(self, iteration, radii):
@@ -241,7 +241,8 @@ class LightOfIteration:
         there are any."""
         there = (dr.max(record["throughput"]) > 0) & (link["before"] != NONE)
         index = link["before"] - (number - 1) * self.camera.capacity
-        return dr.select(there, index, 0), there  # what is not there may hold any number
+        # What is not there may hold any number, and Dr.Jit reads packets of records on masked lanes.
+        return dr.select(there, index, 0), there
 
     def _before(self, record, link, number, arrays):
         """What is known of the vertices before."""

@@ -5,6 +5,7 @@ from mis_integrators.mis import published
 from mis_integrators.photons.queries import LAST_VERTEX
 
 import drjit as dr
+import glossy_sphere
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -110,13 +111,14 @@ def paths_of(session, length):
 
 def assert_sums_to_one(total, weights, valid):
     total, valid = np.array(total), np.array(valid)
-    largest = max(np.abs(np.array(weight))[valid].max() for weight in weights)
-    assert valid.sum() > 50 and largest > 0.02
-    assert np.isfinite(total[valid]).all()
-    # Roundings of weights that are far larger than one; the ray from the light's side meets the
+    total = total[valid]
+    largest = np.max([np.abs(np.array(weight))[valid] for weight in weights], axis=0)
+    assert valid.sum() > 50 and np.median(largest) > 0.02
+    assert np.isfinite(total).all()
+    # Roundings of weights that may be far larger than one. The ray from the light's side meets the
     # vertex a rounding away, where a photon at the edge of the disk may count or not.
-    wrong = np.abs(total[valid] - 1) > 1e-3 * (1 + largest)
-    assert wrong.mean() < 0.02
+    wrong = np.abs(total - 1) > 1e-3 * (1 + largest)
+    assert wrong.mean() < 0.02, (wrong.mean(), np.quantile(np.abs(total - 1), [0.5, 0.9, 0.98]))
 
 
 @pytest.mark.parametrize(
@@ -233,7 +235,9 @@ def least_noise(strategies):
     return noise_of_three(0, *np.meshgrid(grid, grid)).min()
 
 
-def measured_in_sphere(strategies, weights, iterations, size):
+def measured_in_sphere(
+    strategies, weights, iterations, size, light_paths=LIGHT_PATHS, frozen=FROZEN_PATHS
+):
     """Variance of an iteration's pixel in the same unit, and its standard error over blocks of the
     image."""
     scene = mi.load_dict(
@@ -271,8 +275,8 @@ def measured_in_sphere(strategies, weights, iterations, size):
             "max_depth": strategies + 2,
             "rr_depth": 100,
             "initial_radius": SPHERE["radius"],
-            "photon_count": LIGHT_PATHS,
-            "frozen_photons": FROZEN_PATHS,
+            "photon_count": light_paths,
+            "frozen_photons": frozen,
             "variance": True,
             "sampler": "independent",
             "direct_paths": 1,
@@ -287,20 +291,29 @@ def measured_in_sphere(strategies, weights, iterations, size):
     share = SPHERE["radius"] ** 2 / 4
     flux = 4 * np.pi * SPHERE["intensity"]
     photon = SPHERE["albedo"] / np.pi * flux / (np.pi * SPHERE["radius"] ** 2)
-    unit = share / LIGHT_PATHS * photon**2
+    unit = share / light_paths * photon**2
     return blocks.mean() / unit, blocks.std(ddof=1) / 4 / unit
 
 
 @pytest.mark.parametrize(
-    "strategies, iterations, size",
-    [(2, 200, 24), pytest.param(3, 150, 16, marks=pytest.mark.full)],
+    "strategies, settings",
+    [
+        (2, {"iterations": 200, "size": 24, "light_paths": 200}),
+        # A gather for each pair of a vertex and a frozen photon: ten times the seconds.
+        pytest.param(
+            3,
+            {"iterations": 150, "size": 16, "light_paths": 50, "frozen": 20000},
+            marks=[pytest.mark.full, pytest.mark.timeout(1200)],
+        ),
+    ],
 )
-def test_least_noise_of_one_weight(rgb, strategies, iterations, size):
+def test_least_noise_of_one_weight(rgb, strategies, settings):
     """Where direct light and photons at the last vertex share a weight, published weights come
     within 5 % of the least noise (four standard errors of the measurement allowed below it, two
     above)."""
     least = least_noise(strategies)
-    measured, error = measured_in_sphere(strategies, "published", iterations, size)
+    measured, error = measured_in_sphere(strategies, "published", **settings)
+    print(f"{strategies} strategies: {measured / least:.3f}, error {error / least:.3f}")
     assert error < 0.02 * least
     assert least - 4 * error < measured < 1.05 * least + 2 * error, (
         measured / least,
@@ -315,6 +328,67 @@ def test_gain_of_weights_apart(rgb):
     rho = SPHERE["albedo"]
     assert apart == pytest.approx(0.5 * rho**4, rel=0.05)
     assert apart + 4 * error < 0.8 * least_noise(2)
+
+
+GLOSSY = {
+    "type": "roughconductor",
+    "material": "none",
+    "distribution": "ggx",
+    "alpha": 0.5,
+    "specular_reflectance": {"type": "rgb", "value": [0.9] * 3},
+}
+
+
+@pytest.mark.extended
+def test_least_noise_in_a_glossy_sphere(rgb):
+    """In a sphere of rough metal, seen and lit from its centre, the variance of single strategies
+    is what quadrature says (5 % for the finite disk, and three standard errors), and under
+    published weights it comes within 5 % of the least (two errors above that allowed)."""
+    intensity, size = 2.0, 16
+    world = glossy_sphere.glossy_sphere(mi.load_dict(GLOSSY), intensity)
+    disk = np.pi * SPHERE["radius"] ** 2
+    best = world.best(disk, LIGHT_PATHS)
+    assert best.max() > best.min() + 0.1  # the best weights do depend on the direction
+    film = {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}}
+    sensor = {"type": "perspective", "fov": 90, "near_clip": 0.001, "film": film}
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "room": {"type": "sphere", "flip_normals": True, "bsdf": GLOSSY},
+            "light": {"type": "point", "position": [0, 0, 0], "intensity": intensity},
+            "sensor": sensor,
+        }
+    )
+
+    def measured(iterations=200, **plugin):
+        integrator = mi.load_dict(
+            {
+                "max_depth": 4,
+                "rr_depth": 100,
+                "initial_radius": SPHERE["radius"],
+                "photon_count": LIGHT_PATHS,
+                "variance": True,
+                "sampler": "independent",
+                "direct_paths": 1,
+                **plugin,
+            }
+        )
+        session = integrator.session(scene, seed=1)
+        for _ in range(iterations):
+            session.iterate()
+        noise = session.image()[..., -3:].mean(-1) * iterations
+        blocks = noise.reshape(4, size // 4, 4, size // 4).mean(axis=(1, 3))
+        return blocks.mean(), blocks.std(ddof=1) / 4
+
+    for bdd in (0, 1):
+        noise, error = measured(type="bdpm", bdd=bdd)
+        expected = world.noise(np.full(best.shape, float(bdd)), disk, LIGHT_PATHS)
+        assert abs(noise - expected) < 0.05 * expected + 3 * error, (bdd, noise / expected)
+    noise, error = measured(type="bdpm_opt2", weights="published", frozen_photons=FROZEN_PATHS)
+    least = world.noise(best, disk, LIGHT_PATHS)
+    print(f"glossy: {noise / least:.3f}, error {error / least:.3f}")
+    assert error < 0.03 * least
+    assert least - 4 * error < noise < 1.05 * least + 2 * error, (noise / least, error / least)
 
 
 # --- Parameters ---------------------------------------------------------------
