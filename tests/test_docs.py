@@ -168,8 +168,7 @@ def test_docstrings_say_what_plugins_take(rgb, monkeypatch, plugin):
         default = re.search(r"\(Default: (?:yes, i\.e\. |no, i\.e\. )?(.*)\)$", text)
         assert default or not kind, name
         if default:
-            # What a default of another parameter rules out is no setting, but an attribute.
-            value = made.settings().get(name, getattr(made, name, None))
+            value = made.settings()[name]
             shown = (
                 str(value).lower()
                 if isinstance(value, bool)

@@ -59,7 +59,8 @@ class VolpathMultiview(IterativeIntegrator):
          unbiased and noisy, for comparison). (Default: ``mis``)
      * - beta
        - |float|
-       - Exponent of ``weights`` = ``power``, from 1 to 8; with other weights an error. (Default: 2)
+       - Exponent of ``weights`` = ``power``, from 1 to 8; with other weights anything but the
+         default is an error. (Default: 2)
      * - add_nulls
        - |bool|
        - Add null interactions to first segments until all views that see a pivot expect equally
@@ -121,7 +122,7 @@ class VolpathMultiview(IterativeIntegrator):
         self.shift = parameters.choice("shift", "majorant_optical_depth", tuple(SHIFTS))
         self.weights = parameters.choice("weights", "mis", HEURISTICS)
         self.beta = parameters.number("beta", 2.0, lambda x: 1 <= x <= 8, "from 1 to 8")
-        if self.weights != "power":
+        if self.weights != "power" and self.beta != 2:
             parameters.refuse("beta", 'only weights = "power" have an exponent')
         self.add_nulls = parameters.boolean("add_nulls", True)
 
@@ -136,7 +137,7 @@ class VolpathMultiview(IterativeIntegrator):
             **settings,
             "shift": self.shift,
             "weights": self.weights,
-            **({"beta": self.beta} if self.weights == "power" else {}),
+            "beta": self.beta,
             "add_nulls": self.add_nulls,
         }
 
