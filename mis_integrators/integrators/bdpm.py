@@ -326,7 +326,7 @@ class BDPMSession(PilotedSession):
         """The weights of camera paths (a `mis.state.MergeState`); None where there are none."""
         return None
 
-    def _trace_camera(self, camera_pass, capacity, beams, spectral, beyond=None, classes=None):
+    def _trace_camera(self, camera_pass, capacity, spectral, beyond=None, classes=None, beams=0):
         """Traces the paths of a `CameraPass`, with room for so many vertices and beams; `classes`
         as of `trace_camera_paths`."""
         queries = Queries(
@@ -442,7 +442,7 @@ class BDPMSession(PilotedSession):
         if self.integrator.splits_light:
             classes = LightClasses(self.chunk, None, ("met", "next_event"))
         radiance, alpha, position, vertices, count = self._trace_camera(
-            camera_pass, self.vertex_capacity, self.beam_capacity, spectral, beyond, classes
+            camera_pass, self.vertex_capacity, spectral, beyond, classes, self.beam_capacity
         )
         if classes is not None:
             dr.eval(radiance, alpha, position, vertices, count, classes.entries)
@@ -576,8 +576,8 @@ class SubsetPasses:
                     stride=stride,
                 ),
                 capacity,
-                beams,
                 spectral,
+                beams=beams,
             )
         )
 

@@ -118,6 +118,8 @@ class QueryVisitor:
             ),
             count=dr.zeros(mi.UInt32, self.sections),
         )
+        # Half transparent boundaries are none for the light that is met beyond the last vertex.
+        self.passes_masks = self.traits.has_media and self.traits.has_null_vertices
         self.deepest = limits.max_depth - 1 if limits.max_depth > 0 else None
         if queries.beams:
             self.store.beams = new_beams(queries.beams)
@@ -188,12 +190,14 @@ class QueryVisitor:
         return dr.select(shown, light * times, 0)
 
     def unfinished(self, state):
-        return state[0] <= self.bdd
+        return mi.Bool(True) if self.passes_masks else state[0] <= self.bdd
 
     def arrive(self, state, at, rng, active):
         vertex, behind_delta, scatter_pdf, origin, share_here, times, sums, history, clear = state
         weights, bsdf = self.weights, at.bsdf
         smooth = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+        if self.passes_masks:
+            smooth &= vertex <= self.bdd
         at.ends = vertex >= self.bdd  # the path's last smooth vertex
         if self.beyond is not None:
             times = dr.select(smooth & (vertex > 0), self.beyond, times)
@@ -268,6 +272,8 @@ class QueryVisitor:
         vertex, _, scatter_pdf, origin, share_here, times, sums, history, clear = state
         if not self.traits.has_light_surfaces:
             active &= delta | ~at.ends
+        if self.passes_masks:
+            active &= vertex <= self.bdd
         scattered = active & ~delta
         if self.weights is not None:
             sums = self.weights.scatter(sums, at.si, at.bsdf, bs, vertex, scattered)
