@@ -228,7 +228,7 @@ def test_classes_of_light_are_those_of_bdpt(rgb):
     finds."""
     aovs = ",".join(f"{name}:{name}" for name in ("direct", "indirect", "caustic"))
     glass = ball({"type": "dielectric"}, 0.8, exterior=FOG)
-    scene, means = fog_scene(homogeneous(0.5), floor=None, ball=glass), []
+    scene, means = fog_scene(homogeneous(0.5), ball=glass), []
     for integrator in (
         bdpm(initial_radius=0.03, aovs=aovs),
         mi.load_dict({"type": "bdpt", "max_depth": 6, "camera_paths": 16, "aovs": aovs}),
