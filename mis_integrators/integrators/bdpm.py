@@ -337,7 +337,7 @@ class BDPMSession(PilotedSession):
         return None
 
     def _trace_camera(
-        self, camera_pass, capacity, beams, spectral, first=1.0, beyond=None, classes=None
+        self, camera_pass, capacity, spectral, first=1.0, beyond=None, classes=None, beams=0
     ):
         """Traces the paths of a `CameraPass`, with room for so many vertices and beams; other
         arguments as of `trace_camera_paths`."""
@@ -464,7 +464,13 @@ class BDPMSession(PilotedSession):
         if kept:
             classes = LightClasses(self.chunk, None, ("met", "next_event"))
         radiance, alpha, position, vertices, count = self._trace_camera(
-            camera_pass, self.vertex_capacity, self.beam_capacity, spectral, 1.0, beyond, classes
+            camera_pass,
+            self.vertex_capacity,
+            spectral,
+            1.0,
+            beyond,
+            classes,
+            self.beam_capacity,
         )
         if classes is not None:
             dr.eval(radiance, alpha, position, vertices, count, classes.entries)
@@ -598,10 +604,10 @@ class SubsetPasses:
                     stride=stride,
                 ),
                 capacity,
-                beams,
                 spectral,
                 0.0,
                 mi.Float(1),
+                beams=beams,
             )
         )
 

@@ -125,6 +125,8 @@ class QueryVisitor:
             ),
             count=dr.zeros(mi.UInt32, self.sections),
         )
+        # Half transparent boundaries are none for the light that is met beyond the last vertex.
+        self.passes_masks = self.traits.has_media and self.traits.has_null_vertices
         self.deepest = limits.max_depth - 1 if limits.max_depth > 0 else None
         if queries.beams:
             self.store.beams = new_beams(queries.beams)
@@ -193,12 +195,14 @@ class QueryVisitor:
         return dr.select(shown, light * times, 0)
 
     def unfinished(self, state):
-        return state[0] <= self.bdd
+        return mi.Bool(True) if self.passes_masks else state[0] <= self.bdd
 
     def arrive(self, state, at, rng, active):
         vertex, met, behind_delta, scatter_pdf, origin, share_here, times, sums, *more = state
         weights, bsdf = self.weights, at.bsdf
         smooth = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+        if self.passes_masks:
+            smooth &= vertex <= self.bdd
         at.ends = vertex >= self.bdd  # the path's last smooth vertex
         if self.queries.narrow is not None:
             at.ends &= ~lookup(self.queries.narrow, bsdf, mi.Bool, smooth)
@@ -275,6 +279,8 @@ class QueryVisitor:
         vertex, met, _, scatter_pdf, origin, share_here, times, sums, history, clear = state
         if not self.traits.has_light_surfaces:
             active &= delta | ~at.ends
+        if self.passes_masks:
+            active &= vertex <= self.bdd
         scattered = active & ~delta
         if self.weights is not None:
             sums = self.weights.scatter(sums, at.si, at.bsdf, bs, vertex, scattered)

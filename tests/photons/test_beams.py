@@ -22,7 +22,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from comparing import Estimate, differences
-from foggy import container, grid, pockets
+from foggy import container, even, grid, pockets
 from test_bdpt_media import FOG, ball, homogeneous
 
 SIGMA = 0.7
@@ -283,9 +283,11 @@ def test_pieces_of_a_homogeneous_medium(rgb, sigma):
     assert going.all() == (sigma < 1), "no roulette where light is strong"
 
 
-def test_pieces_of_a_heterogeneous_medium(rgb):
-    """Their mean share is the transmittance, known from as many cells as the ray meets."""
-    medium = grid(pockets, scale=2.0)
+@pytest.mark.parametrize("density, scale", [(pockets, 2.0), (even, 4.0)])
+def test_pieces_of_a_heterogeneous_medium(rgb, density, scale):
+    """Their mean share is the transmittance, which is integrated in small steps; where it is faint,
+    too."""
+    medium = grid(density, scale=scale)
     scene = mi.load_dict({"type": "scene", "cube": container(medium)})
     _, kept, pieces = straight(scene, (0.1, -0.2, 3), (0, 0, -1))
     depths = np.linspace(2.05, 3.95, 9)
