@@ -66,17 +66,20 @@ PARTS = {
     "compare10": Part(
         f"compare --time 10 --seeds 1 --integrators {_CANDIDATES}",
         "compare",
-        (*_EFFORT, "relMSE", "MSE", "FLIP", "relMSE / best path", "MSE / best path"),
+        (*_EFFORT, "relMSE", "MSE", "FLIP", "artefacts", "relMSE / best path", "MSE / best path"),
     ),
     "denoised10": Part(
         "compare --denoise --time 10 --seeds 1 --integrators path path:sampler=multijitter"
-        " bdpm_opt3 bdpm_auto",
+        " bdpm:bdd=1 bdpm_opt2 bdpm_auto",
         "compare",
         (
             *_EFFORT,
             "denoised relMSE",
+            "denoised MSE",
             "denoised FLIP",
+            "denoised artefacts",
             "denoised relMSE / best path",
+            "denoised MSE / best path",
             "denoised FLIP / best path",
         ),
     ),
