@@ -241,7 +241,7 @@ class LightOfIteration:
         there are any."""
         there = (dr.max(record["throughput"]) > 0) & (link["before"] != NONE)
         index = link["before"] - (number - 1) * self.camera.capacity
-        # What is not there may hold any number, and Dr.Jit reads packets of records on masked lanes.
+        # What is not there may hold any number, and Dr.Jit reads packets of words on masked lanes.
         return dr.select(there, index, 0), there
 
     def _before(self, record, link, number, arrays):
