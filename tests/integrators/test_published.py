@@ -185,9 +185,10 @@ def test_three_weights_of_a_path_sum_to_one(variant_name, family, emitter):
     [
         ("rectangle", "mixed0", {"strategies": 2}, RGB),
         *extended(
-            ("rectangle", "lambertian", {"strategies": 3}, RGB),
+            # Few light sub-paths: with more the denominators are near zero, and fireflies hide all.
+            ("rectangle", "lambertian", {"strategies": 3, "photon_count": 1000}, RGB),
             ("constant", "lambertian", {"strategies": 2, "first_vertex": 1}, SPECTRAL),
-            ("point", "smooth1", {"strategies": 3}, MONO),
+            ("point", "rough", {"strategies": 3, "photon_count": 1000}, MONO),
         ),
     ],
 )
