@@ -93,7 +93,7 @@ def test_agrees_with_volpath(rgb, name):
     agree_with_volpath(SCENES[name](), 6, *visible)
 
 
-@pytest.mark.parametrize("variant_name", ["llvm_ad_spectral", *extended("llvm_ad_mono")])
+@pytest.mark.parametrize("variant_name", ["llvm_ad_mono", *extended("llvm_ad_spectral")])
 def test_agrees_in_other_variants(variant_name):
     """Wavelengths have extinctions of their own."""
     mi.set_variant(variant_name)
