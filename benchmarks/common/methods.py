@@ -43,9 +43,9 @@ COMPARED = (
 )
 """What is compared unless said otherwise; ratios are to the first."""
 VARIED = (
-    "bdpm:bdd=0",
-    "bdpm:bdd=1",
-    "bdpm:bdd=2",
+    "bdpm:bdd=0,pass_narrow=false",
+    "bdpm:bdd=1,pass_narrow=false",
+    "bdpm:bdd=2,pass_narrow=false",
     "bdpm_balance",
     "bdpm_opt3",
     "bdpm_opt2:mix_diffuse=true",

@@ -118,7 +118,8 @@ PARTS = {
         pictures={"stability_roughness.png": "images/charts/stability_roughness.png"},
     ),
     "variance": Part(
-        "variance --radius 0.02 --iterations 16 --integrators bdpm:bdd=0 bdpm:bdd=1"
+        "variance --radius 0.02 --iterations 16 --integrators bdpm:bdd=0,pass_narrow=false"
+        " bdpm:bdd=1,pass_narrow=false bdpm:bdd=0"
         " bdpm_balance:strategies=2 bdpm_opt2 bdpm_opt3 bdpm_opt2:mix_diffuse=true",
         "variance",
         ("method", "radius", "ratio to best single", "time ratio", "equal-time ratio"),

@@ -53,8 +53,13 @@ class BDPM(IterativeIntegrator):
      * - bdd
        - |int|
        - Backward diffuse depth: the camera vertex at which photons are gathered, counted from 0
-         over vertices that scatter smoothly and have no narrow lobes. Direct light is estimated at
-         every vertex up to it. (Default: 1)
+         over vertices that scatter smoothly. Direct light is estimated at every vertex up to it.
+         (Default: 1)
+     * - pass_narrow
+       - |bool|
+       - Whether paths pass surfaces with narrow lobes, as of smooth metal or frosted glass, without
+         gathering photons there, but for caustic ones; ``bdd`` does not count them then. (Default:
+         yes, i.e. |true|)
      * - photon_count
        - |int|
        - Light sub-paths an iteration; 0 stands for as many as the cropped film has pixels.
@@ -161,6 +166,7 @@ class BDPM(IterativeIntegrator):
     def read_parameters(self, parameters):
         self.read_photon_parameters(parameters)
         self.bdd = parameters.integer("bdd", 1, 0, "at least 0")
+        self.pass_narrow = parameters.boolean("pass_narrow", True)
 
     def read_photon_parameters(self, parameters):
         """Reads what concerns the photon map."""
@@ -182,6 +188,7 @@ class BDPM(IterativeIntegrator):
             "direct_paths": self.direct_paths,
             "denoised": self.denoised,
             "bdd": self.bdd,
+            "pass_narrow": self.pass_narrow,
         }
 
     def new_session(self, scene, sensor, seed, iterations):
@@ -212,7 +219,7 @@ class BDPMSession(PilotedSession):
             self.traits.has_media and not self.lights.dark and (depth < 0 or depth >= 2)
         )
         self.narrow = None
-        if self.passes_narrow and self.has_indirect and not self.traits.has_media:
+        if integrator.pass_narrow and self.has_indirect and not self.traits.has_media:
             self.narrow = narrow_bsdfs(scene)
         self.one_vertex = not self.traits.has_mixed and (
             (integrator.bdd == 0 and self.narrow is None) or not self.has_caustics
@@ -239,10 +246,6 @@ class BDPMSession(PilotedSession):
     def last_vertex(self):
         """The smooth camera vertex, counted from 0, beyond which no camera path is shaded."""
         return self.integrator.bdd
-
-    passes_narrow = True
-    """Whether surfaces with narrow lobes (`paths.lobes`) are passed, and photons gathered at later
-    ones."""
 
     def kinds(self):
         return [
@@ -348,7 +351,7 @@ class BDPMSession(PilotedSession):
             self.has_indirect,
             self.one_vertex,
             beams,
-            self.narrow if self.passes_narrow else None,
+            self.narrow,
         )
         return trace_camera_paths(
             self.world,

@@ -14,18 +14,18 @@ class WeightedBDPM(BDPM):
     `first_vertex + strategies - 1`."""
 
     first_vertex = 0
+    pass_narrow = False  # weights leave the light of narrow lobes to later vertices by themselves
     MEDIA = False
 
     def settings(self):
         settings = super().settings()
-        del settings["bdd"]
+        del settings["bdd"], settings["pass_narrow"]
         return {**settings, "strategies": self.strategies}
 
 
 class WeightedSession(BDPMSession):
     """Iterations of a `WeightedBDPM`. A subclass makes the weights."""
 
-    passes_narrow = False  # weights leave the light of narrow lobes to later vertices by themselves
     weighted_pilot = False
     """Whether the pilot of the automatic radius renders under the weights, made for
     `usual_radius()`; else it merges at the first vertex."""
