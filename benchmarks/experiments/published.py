@@ -81,7 +81,7 @@ def no_guess(z, joined):
     return 1.0
 
 
-PUBLISHED, WEIGHTS = "bdpt_ris:weights=published", "mis.published.PublishedWeights"
+PUBLISHED, WEIGHTS = "bdpt_ris:weights=published", "mis.published_resampling.PublishedWeights"
 GUESS: Mapping[str, object] = {"mis.resampling.guessed_weight": no_guess}
 POLE: Mapping[str, object] = {"mis.resampling.ResampledWeights": Unsoftened}
 LADDER: dict[str, tuple[str, Mapping[str, object]]] = {

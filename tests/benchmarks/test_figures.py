@@ -103,7 +103,7 @@ def test_every_part_is_a_command(figures, module):
     elsewhere = [Path("elsewhere/scene.xml")]
     for name, part in figures.PARTS.items():
         options = parse(part.command.split())
-        assert len(part.scenes(bundled)) in (1, 2, 4, 9), name
+        assert len(part.scenes(bundled)) in (1, 2, 5, 9), name
         assert (elsewhere[0] in part.scenes([*bundled, *elsewhere])) == (
             name in ("compare10", "denoised10", "throughput")
         )

@@ -88,8 +88,11 @@ USUAL = ("pockets", "coloured", "glass", "mask")
 def test_agrees_with_volpath(rgb, name):
     # All beams from within the fog share the few photons that are close to the sensor; and of the
     # light sub-paths from a sky, few meet the cube.
-    noisy = name in ("sensor within", "lens within", "sky", "sun")
-    visible = (0.05, 0.15) if noisy else (0.02, 0.06)
+    visible = (0.02, 0.06)
+    if name in ("sky", "sun"):
+        visible = (0.05, 0.15)
+    if name in ("sensor within", "lens within"):
+        visible = (0.2, 0.6)
     agree_with_volpath(SCENES[name](), 6, *visible)
 
 

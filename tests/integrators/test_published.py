@@ -1,7 +1,7 @@
 """`bdpm_opt` under the weights as they are printed: one weight function for all strategies, right
 means, and the least noise that one weight for direct light and photons allows."""
 
-from mis_integrators.mis import published
+from mis_integrators.mis import published_optimal as published
 from mis_integrators.photons.queries import LAST_VERTEX
 
 import drjit as dr
