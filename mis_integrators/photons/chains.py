@@ -90,7 +90,7 @@ class ChainVisitor(QueryVisitor):
 
     def __init__(self, world, limits, first, last, capacity, beyond):
         super().__init__(world, limits, Queries(last, 0, True, True, True), None, 1.0, beyond, None)
-        self.first, self.capacity, room = first, capacity, capacity * (last + 1)
+        self.kept_to, self.capacity, room = first, capacity, capacity * (last + 1)
         self.store = Store(
             words=dr.zeros(mi.UInt32, query_layout().words * room),
             links=link_layout().room(room),
@@ -106,7 +106,7 @@ class ChainVisitor(QueryVisitor):
     def emission(self, state, at, active):
         *base, (before, _, _, _) = state
         light = super().emission(base, at, active)
-        apart = active & (base[0] > self.first + 1) & (before != NONE)
+        apart = active & (base[0] > self.kept_to + 1) & (before != NONE)
         dr.scatter(self.store.met, light, before, apart & (dr.max(light) > 0))
         return dr.select(apart, 0, light)
 
@@ -130,7 +130,7 @@ class ChainVisitor(QueryVisitor):
         query_layout().write(self.store.words, query, here, wants)
         link = {"before": before, "f": f, "p": p}
         link_layout().write(self.store.links, link, here, wants)
-        apart = number > self.first
+        apart = number > self.kept_to
         dr.scatter(self.store.found, direct, here, wants & apart)
         here = dr.select(wants, here, mi.UInt32(NONE))
         return [*base, [before, here, f, p]], dr.select(apart, 0, direct)
@@ -200,7 +200,7 @@ class ChainedPhotonVisitor(PhotonVisitor):
     `f` and `p` there; the place of the photon at this surface."""
 
     def __init__(self, capacity, keep_direct):
-        super().__init__(capacity, keep_direct, None, False)
+        super().__init__(capacity, keep_direct, None, False, 0)
         self.store.words = dr.zeros(mi.UInt32, query_layout().words * capacity)
         self.store.links = link_layout().room(capacity)
 
