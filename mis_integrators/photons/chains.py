@@ -19,7 +19,7 @@ from ..core.spectra import channel_mean
 from ..paths.camera import trace_camera
 from ..paths.light import trace_light
 from .gather import SMALLEST_COSINE
-from .queries import LAST_VERTEX, Queries, QueryVisitor, query_layout
+from .queries import LAST_VERTEX, Queries, QueryVisitor, query_at, query_layout
 from .trace import PhotonVisitor
 
 NONE = (1 << 32) - 1
@@ -119,15 +119,7 @@ class ChainVisitor(QueryVisitor):
         here = dr.scatter_inc(self.store.count, number, wants)
         wants &= here < self.capacity
         here += number * self.capacity
-        query = {
-            "ray_o": at.ray.o,
-            "ray_d": at.ray.d,
-            "hit": at.hit,
-            "throughput": at.throughput,
-            "path": at.path,
-            "depth": at.depth | LAST_VERTEX,
-        }
-        query_layout().write(self.store.words, query, here, wants)
+        query_layout().write(self.store.words, query_at(at, mi.Bool(True)), here, wants)
         link = {"before": before, "f": f, "p": p}
         link_layout().write(self.store.links, link, here, wants)
         apart = number > self.kept_to

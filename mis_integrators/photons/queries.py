@@ -45,6 +45,19 @@ def query_layout():
     )
 
 
+def query_at(at, last):
+    """The record of `query_layout` of where a camera path has arrived (a `CameraArrival`); `last`:
+    whether all photons are wanted there."""
+    return {
+        "ray_o": at.ray.o,
+        "ray_d": at.ray.d,
+        "hit": at.hit,
+        "throughput": at.throughput,
+        "path": at.path,
+        "depth": at.depth | dr.select(last, mi.UInt32(LAST_VERTEX), mi.UInt32(0)),
+    }
+
+
 def weight_layout():
     """Fields of the weights there: their `STATE`, and the weight of direct light, `share`."""
     return Layout(dict.fromkeys((*STATE, "share"), mi.Spectrum))
@@ -260,15 +273,7 @@ class QueryVisitor:
             slot += section * queries.capacity
         if not queries.capacity:
             return
-        query = {
-            "ray_o": at.ray.o,
-            "ray_d": at.ray.d,
-            "hit": at.hit,
-            "throughput": at.throughput,
-            "path": at.path,
-            "depth": at.depth | dr.select(last, mi.UInt32(LAST_VERTEX), mi.UInt32(0)),
-        }
-        query_layout().write(store.vertices["words"], query, slot, wants)
+        query_layout().write(store.vertices["words"], query_at(at, last), slot, wants)
         if weights is not None:
             state = {**dict(zip(STATE, weights.stored(sums))), "share": share_here}
             weight_layout().write(store.vertices["weights"], state, slot, wants)
