@@ -29,6 +29,7 @@ from experiments import (  # noqa: E402
     multiview,
     opinions,
     overview,
+    parsimony,
     radius,
     resampling,
     sampling,
@@ -164,6 +165,11 @@ def _parser() -> argparse.ArgumentParser:
         default=[0.15, 0.5],
         metavar="SHARE",
         help="of the time that the second method has (default: 0.15 0.5)",
+    )
+
+    command = _measuring(commands, "parsimony", parsimony)
+    command.add_argument(
+        "--scale", type=_positive, default=1.0, help="film size, scene's own = 1 (default: 1)"
     )
 
     command = _measuring(commands, "choice", choice)

@@ -137,6 +137,11 @@ PARTS = {
         ),
         bundled=("cornell_point", "cornell_glossy"),
     ),
+    "parsimony": Part(
+        "parsimony",
+        "parsimony",
+        ("left out", "iteration with it / without", "all left out"),
+    ),
     "multiview": Part(
         "multiview --time 3 --seeds 3 --weights mis --no-lost-shares",
         "multiview",

@@ -191,6 +191,17 @@ def throughput(entries: Mapping[str, Entry]) -> str:
     return markdown(head, lines)
 
 
+def parsimony(entries: Mapping[str, Entry]) -> str:
+    """What a scene has no use for, and how much longer an iteration takes with a part of it."""
+    parts = sorted({row["left out"] for e in entries.values() for row in e["rows"]} - {None})
+    lines = []
+    for scene, entry in sorted(entries.items()):
+        found = {row["left out"]: row["iteration with it / without"] for row in entry["rows"]}
+        cells = [short(found[part]) if part in found else "needed" for part in parts]
+        lines.append([title(scene), entry["rows"][0]["all left out"] or "nothing", *cells])
+    return markdown(["scene", "left out", *(f"with {part}" for part in parts)], lines)
+
+
 def multiview(entries: Mapping[str, Entry]) -> str:
     """Variance times time of several views together over that of each alone."""
     head = ["scene", "views", "variance x time over that of `volpath`", "best view", "worst view"]
@@ -211,6 +222,7 @@ TABLES: dict[str, Callable[[Mapping[str, Entry]], str]] = {
     "stability": stability,
     "variance": variance,
     "throughput": throughput,
+    "parsimony": parsimony,
     "multiview": multiview,
 }
 """What makes each table, by the part that it is of."""

@@ -20,8 +20,9 @@ from ..core.traits import unfinite_data
 from ..core.untrusted import Malformed
 from . import checkpoint, cluster, compare, denoising, loading, output, reproduce, tev
 from .checkpoint import Checkpoint, CheckpointError
+from .explain import explanation
 from .options import parse, versions
-from .progress import Progress, complain
+from .progress import Progress, complain, tell
 from .render_loop import Chore, Clock, Interrupt, fewest_iterations, iterate
 from .request import Opened, Request
 from .target_error import TargetError
@@ -183,6 +184,8 @@ def _render_alone(options: argparse.Namespace, interrupt: Interrupt) -> int:
         return EXIT_INTERRUPTED
     if not options.quiet:
         complain(report, "")
+    if options.explain:
+        tell(*explanation(session.settings, opened.settings))
     if rival:
         first = compare.Rendered(opened, session.image(), clean, clock.rendering)
         return _compare(options, rival, first, interrupt)

@@ -44,6 +44,12 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     )
     for add_options in (_what, _how_long, _which_image, _comparison, _what_is_kept, _where):
         add_options(parser)
+    parser.add_argument(
+        "--explain",
+        action="store_true",
+        help="in the end, say what rendered and why: predicted errors of the candidates, merge "
+        "radii, what the scene had no use for",
+    )
     parser.add_argument("--quiet", action="store_true", help="print errors only")
     parser.add_argument("--version", action="version", version=versions())
     options = parser.parse_args(arguments)

@@ -90,6 +90,14 @@ def complain(text: str, who: str = "mis-render: ") -> None:
         print(f"{who}{text}", file=sys.stderr, flush=True)
 
 
+def tell(*parts: object) -> None:
+    """Print lines, or tables of rich, on standard error, if anybody reads them."""
+    with _nobody_may_listen():
+        console = rich.console.Console(file=sys.stderr, highlight=False)
+        for part in parts:
+            console.print(part, markup=False, soft_wrap=isinstance(part, str))
+
+
 @contextlib.contextmanager
 def _nobody_may_listen() -> Iterator[None]:
     """Standard error may be closed, or a pipe whose reader has gone (which ends the process, if

@@ -136,10 +136,10 @@ class SceneTraits:
 
     Attributes: `bounds` (bounding box), `has_delta` (perfectly specular or null scattering
     somewhere), `has_mixed` (BSDFs with both a smooth and a delta part), `has_rough` (smooth
-    scattering that is not Lambertian), `has_rough_glass` (rough refraction), `has_lambertian`,
-    `has_perturbed` (bump or normal maps), `has_light_surfaces` (emitters that a ray can meet: area
-    lights, environments), `lambertian`, `perturbed` (registry tables for BSDF pointers),
-    `has_media`, and with media those of `MediaTraits`.
+    scattering that is not Lambertian), `has_lambertian`, `has_perturbed` (bump or normal maps),
+    `has_light_surfaces` (emitters that a ray can meet: area lights, environments), `lambertian`,
+    `perturbed` (registry tables for BSDF pointers), `has_media`, and with media those of
+    `MediaTraits`.
     """
 
     def __init__(self, scene, sensor=None):
@@ -162,7 +162,6 @@ class SceneTraits:
         self.has_rough = any(
             (f & flag.Smooth) and not simple for f, simple in zip(flags, lambertian)
         )
-        self.has_rough_glass = any(f & flag.GlossyTransmission for f in flags)
         self.lambertian = registry_table(bsdfs, mi.BSDFPtr, lambertian, mi.Bool)
         delta = mi.EmitterFlags.DeltaPosition | mi.EmitterFlags.DeltaDirection
         self.has_light_surfaces = any(not (e.flags() & delta) for e in scene.emitters())

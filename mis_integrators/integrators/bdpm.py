@@ -28,7 +28,7 @@ from ..photons.queries import Queries, read_queries, trace_camera_paths
 from ..photons.trace import trace_light_paths
 from ..photons.volume import VolumeMap, build_volume_map
 from ..pilot.direct_paths import MOST_PATHS
-from ..pilot.setting import PilotSetting
+from ..pilot.setting import PilotSetting, pilot_light_paths
 from .common import MOST_LIGHT_PATHS, IterativeIntegrator
 from .direct_light import DirectLight
 from .piloted import PilotedSession
@@ -205,9 +205,9 @@ class BDPMSession(PilotedSession):
         if self.traits.has_media:
             self.lights.find_media(sensor, integrator.plugin)
         self.world = World(scene, self.lights, self.traits)
-        self.light_path_count = integrator.photon_count or min(
+        self.iteration_light_paths = self.light_path_count = integrator.photon_count or min(
             film_sample_count(sensor), MOST_LIGHT_PATHS
-        )
+        )  # the latter are fewer in a pilot
         depth = integrator.max_depth
         unreachable = self.lights.needs_photons_for_direct_light()
         self.has_caustics = not self.lights.dark and (
@@ -225,15 +225,13 @@ class BDPMSession(PilotedSession):
             (integrator.bdd == 0 and self.narrow is None) or not self.has_caustics
         )
         self.split_paths(CHUNK_IN_MEDIA if self.has_volume else CAMERA_CHUNK)
-        self.photon_capacity = rounded_up(3 * self.light_path_count)
-        self.volume_capacity = rounded_up(3 * self.light_path_count) if self.traits.has_media else 0
+        self._make_room_for_photons()
         self.beam_capacity = self._beam_room(self.chunk)
         self.vertex_capacity = self._vertex_room(self.chunk)
         if integrator.initial_radius:
             self.radii = dict.fromkeys(self.kinds(), integrator.initial_radius)
         self.corrected = dict.fromkeys(self.kinds(), False)
         self.photons_found = 0  # by the last light pass
-        self._sized = False
         self.recorded = recorder()
         self.direct_light = DirectLight(self)
         self._freeze()
@@ -241,6 +239,17 @@ class BDPMSession(PilotedSession):
     @property
     def settings(self):
         return {**super().settings, "photon_count": self.light_path_count}
+
+    @property
+    def left_out(self):
+        needed = {
+            "caustic photons": self.has_caustics,
+            "indirect photons": self.has_indirect,
+            "media": self.traits.has_media,
+            "narrow lobes": self.narrow is not None or not self.integrator.pass_narrow,
+            "emission met by chance": self.traits.has_light_surfaces,
+        }
+        return [part for part, flag in needed.items() if not flag]
 
     @property
     def last_vertex(self):
@@ -258,6 +267,11 @@ class BDPMSession(PilotedSession):
             if needed
         ]
 
+    def _make_room_for_photons(self):
+        self.photon_capacity = rounded_up(3 * self.light_path_count)
+        self.volume_capacity = self.photon_capacity if self.traits.has_media else 0
+        self._sized = False
+
     def _record_camera_pass(self):
         self._camera_pass = self.recorded(self._render_chunk)
 
@@ -269,14 +283,32 @@ class BDPMSession(PilotedSession):
             float(dr.norm(self.traits.bounds.extents())),
             tuple(self.kinds()),
             integrator.bdd == 0,
+            self.narrow is not None,
             self.camera_paths,
             self.iterations_planned,
             self.seconds,
+            self.iteration_light_paths / self.light_path_count,
             integrator.denoised,
         )
 
     def pilot_passes(self, setting, pixels):
         return SubsetPasses(self, setting, pixels)
+
+    def _run_pilot(self):
+        """With a pilot's light sub-paths."""
+        if self.radii is not None:
+            return super()._run_pilot()
+        self._use_light_paths(pilot_light_paths(self.iteration_light_paths))
+        pilot = super()._run_pilot()
+        self._use_light_paths(self.iteration_light_paths)
+        return pilot
+
+    def _use_light_paths(self, count):
+        """Traces so many in each light pass from now on."""
+        if count != self.light_path_count:
+            self.light_path_count = count
+            self._make_room_for_photons()
+            self._freeze()
 
     def start(self):
         super().start()

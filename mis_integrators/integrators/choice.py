@@ -18,7 +18,6 @@ import numpy as np
 from ..core.recording import lanes
 from ..core.spectra import channel_mean
 from ..core.stratified_variance import contrasts, extrapolated
-from ..core.traits import SceneTraits
 from ..paths.layers import written
 from ..paths.path_length_statistics import mean_segments
 from ..pilot.denoiser import LEFT
@@ -27,7 +26,7 @@ from ..pilot.setting import UNPLANNED_ITERATIONS
 from . import costs
 from .unidirectional import PathSession
 
-CANDIDATES = {"path": {}, "bdpm": {"bdd": 0}, "bdpm_opt2": {}, "bdpm_opt3": {}}
+CANDIDATES = {"path": {}, "bdpm": {"bdd": 0}, "bdpm_opt3": {}}
 """Plugins that may be chosen, and their parameters."""
 FOR_DENOISERS = {"bdpm": {"bdd": 1}}
 """Parameters in place of these where the image will be denoised."""
@@ -98,27 +97,27 @@ def handed_on(integrator):
     }
 
 
-def photon_mapper(traits, iterations, seconds, denoised):
-    """The plugin that stands for all photon mappers in a scene of these `SceneTraits`.
+def photon_mapper(iterations, seconds, denoised):
+    """The plugin that stands for all photon mappers.
 
     For a denoiser photons are gathered at the second vertex: nearly all noise is then that of
-    camera paths, which it takes away. Else two strategies are within a third of the best number of
-    them, and are one where all smooth surfaces are diffuse; but within and behind rough glass
-    camera paths meet it twice before photons are of use. Short renders have one strategy."""
+    camera paths, which it takes away. Else three strategies are near the best number of them in
+    every scene, and are one where all smooth surfaces are diffuse. Short renders have one
+    strategy."""
     if denoised:
         return "bdpm"
     if seconds is not None and seconds < SHORT_SECONDS:
         return "bdpm"
     if seconds is None and iterations is not None and iterations < SHORT_ITERATIONS:
         return "bdpm"
-    return "bdpm_opt3" if traits.has_rough_glass else "bdpm_opt2"
+    return "bdpm_opt3"
 
 
 def choose(integrator, scene, sensor, seed, iterations, seconds):
     """The `Decision` for a render of so many iterations, or of so many seconds (either may be
     `None`)."""
     path = PathSession(integrator, scene, sensor, seed, iterations)
-    plugin = photon_mapper(SceneTraits(scene), iterations, seconds, integrator.denoised)
+    plugin = photon_mapper(iterations, seconds, integrator.denoised)
     photons = new_session(plugin, integrator, scene, sensor, seed, iterations)
     alone = (plugin, photons) if integrator.splits_light else ("path", path)
     if not photons.kinds():

@@ -336,14 +336,21 @@ class IterativeSession:
         return self.integrator.about_samplers([self.sensor])
 
     @property
+    def left_out(self):
+        """What is not traced, stored or gathered because the scene has no use for it: names."""
+        return []
+
+    @property
     def settings(self):
-        """Names and values that reproduce the image, together with the scene."""
-        return {
+        """Names and values that reproduce the image, together with the scene; and what was
+        `left_out`, if anything was."""
+        settings = {
             "integrator": self.integrator.plugin,
             **self.integrator.settings(),
             "camera_paths": self.camera_paths,
             "seed": self.seed,
         }
+        return {**settings, "left_out": ", ".join(self.left_out)} if self.left_out else settings
 
     @under_render_lock
     def iterate(self, iteration=None):

@@ -124,7 +124,7 @@ class PilotedSession(IterativeSession):
     def _choose_by_clock(self, pilot, begun):
         """Chooses for a guess of how many iterations there is time for since `begun`, measures what
         one takes with that choice, and chooses again."""
-        guess = LIKE_A_PILOT * pilot.seconds
+        guess = LIKE_A_PILOT * pilot.seconds * pilot.setting.light_paths
         left = max(begun + self.seconds - time.perf_counter(), guess)
         first = pilot.choose(left / guess)
         self._take(first)

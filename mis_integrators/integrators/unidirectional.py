@@ -63,6 +63,10 @@ class PathSession(IterativeSession):
         self.split_paths(CHUNK)
 
     @property
+    def left_out(self):
+        return ["photons"]
+
+    @property
     def settings(self):
         return {**super().settings, "integrator": "path"}
 

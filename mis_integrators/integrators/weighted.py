@@ -40,6 +40,10 @@ class WeightedSession(BDPMSession):
             self.integrator.strategies - 1 if self._weighted else 0
         )
 
+    @property
+    def left_out(self):
+        return [*super().left_out, *([] if self._weighted else ["weights"])]
+
     def mixes(self):
         """Whether the scene has paths that several strategies make."""
         return True

@@ -60,8 +60,9 @@ def photon_variance(
     radii: np.ndarray,
     samples: np.ndarray,
     weights: np.ndarray,
-    at_first_vertex: bool = True,
+    photons_only: bool = True,
     alike: bool = False,
+    light_paths: float = 1.0,
 ) -> np.ndarray:
     """V(R), one a radius.
 
@@ -71,17 +72,19 @@ def photon_variance(
         Estimates of independent iterations; see `denoiser.variance_left`.
     weights : (pixels,)
         See `relative_weights`.
-    at_first_vertex
-        Whether the vertices that gather are those which the camera sees, so that all noise is that
-        of photons.
+    photons_only
+        Whether all noise is that of photons: the vertices that gather are those which the camera
+        sees.
     alike
         Whether photons are alike, as those of a caustic; see `bounded_by_larger_disks`.
+    light_paths
+        How many times as many light sub-paths as in these iterations V is for: noise of photons
+        falls with their number.
     """
     variance = np.array([trimmed_mean(values) for values in weights * variance_left(samples)])
     disks = np.count_nonzero(samples.mean(axis=2), axis=(0, 2)) if alike else None
-    return bounded_by_larger_disks(
-        radii, variance, 0.0 if at_first_vertex else variance.min(), disks
-    )
+    floor = 0.0 if photons_only else variance.min()
+    return floor + (bounded_by_larger_disks(radii, variance, floor, disks) - floor) / light_paths
 
 
 def bounded_by_larger_disks(

@@ -76,7 +76,7 @@ class ErrorByRadius(NamedTuple):
     squared_bias: dict[bool, np.ndarray]
     """At the fine radii."""
     variance: dict[bool, np.ndarray]
-    """Of an iteration like the pilot's, at the ladder."""
+    """Of an iteration of the render, at the ladder."""
 
     def at(self, radius: float, corrected: bool) -> tuple[float, float]:
         """Squared bias and variance at a radius."""
@@ -92,8 +92,9 @@ def error_by_radius(
     plain: np.ndarray,
     corrected: np.ndarray | None,
     weights: np.ndarray,
-    at_first_vertex: bool = True,
+    photons_only: bool = True,
     alike: bool = False,
+    light_paths: float = 1.0,
 ) -> ErrorByRadius:
     """The `ErrorByRadius` of estimates at the `radii` of the ladder.
 
@@ -105,14 +106,14 @@ def error_by_radius(
         The same corrected at edges.
     weights : (pixels,)
         Of the pixels' squared errors, see `noise.MEASURES`.
-    at_first_vertex, alike
+    photons_only, alike, light_paths
         See `noise.photon_variance`.
     """
     fine = np.exp(np.linspace(np.log(radii[0]), np.log(radii[-1]), 16 * len(radii)))
     if not np.any(plain):
         return ErrorByRadius(radii, fine, {}, {})
     variance = {
-        which: photon_variance(radii, samples, weights, at_first_vertex, alike)
+        which: photon_variance(radii, samples, weights, photons_only, alike, light_paths)
         for which, samples in ((False, plain), (True, corrected))
         if samples is not None
     }

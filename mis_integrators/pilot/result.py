@@ -89,7 +89,7 @@ class PilotResult:
     seconds: float
     """Of the pilot's last iteration."""
     photons: dict[str, float]
-    """As in `PilotSamples`."""
+    """As in `PilotSamples`, but of an iteration of the render."""
     errors: dict[str, dict[str, ErrorByRadius]]
     """By measure, and by kind of photons."""
     direct: dict[str, float]
@@ -212,15 +212,16 @@ def measure(
                 by_correction[False],
                 by_correction.get(True),
                 weights[measure],
-                setting.at_first_vertex,
+                setting.at_first_vertex and not setting.passes_lobes,
                 kind == "caustic",
+                setting.light_paths,
             )
     caustics = np.mean(middle["caustic"]) if "caustic" in middle else 0.0
     return PilotResult(
         setting,
         pixels,
         seconds,
-        samples.photons,
+        {kind: count * setting.light_paths for kind, count in samples.photons.items()},
         errors,
         {measure: direct_variance(samples.direct, weights[measure]) for measure in MEASURES},
         mean,

@@ -11,6 +11,9 @@ from .denoiser import GROUPS
 
 PILOT_PATHS = 4096
 """Tuned: camera paths of a pilot's iteration, about."""
+PILOT_LIGHT_PATHS = 1 << 17
+"""Light sub-paths of a pilot's iteration, where the render's have more than twice as many: what
+more of them would tell follows from these."""
 MOST_CAMERA_PATHS = 16
 """Camera paths of a pixel: more of them change little of an iteration's noise, which is then that
 of photons."""
@@ -34,12 +37,16 @@ class PilotSetting:
     """Photon maps: `caustic`, `indirect`, or both."""
     at_first_vertex: bool
     """Whether photons are gathered at the first smooth vertex, which the camera sees."""
+    passes_lobes: bool
+    """Whether camera paths pass narrow lobes before that, so that they make noise, too."""
     camera_paths: int
     """Camera paths a pixel and iteration."""
     iterations: int | None
     """Iterations planned, if their number is."""
     seconds: float | None
     """Seconds planned, if those are."""
+    light_paths: float = 1.0
+    """Light sub-paths of an iteration over those of one of the pilot's."""
     denoised: bool = False
     """Whether the errors that count are those that a denoiser leaves (see `denoiser`)."""
 
@@ -54,6 +61,11 @@ class PilotSetting:
         the surfaces' edges, and only where the camera sees the vertices: deeper ones are spread
         over the scene, and their blur averages out."""
         return (False, True) if kind == "indirect" and self.at_first_vertex else (False,)
+
+
+def pilot_light_paths(count: int) -> int:
+    """Light sub-paths of a pilot's iteration for a render with so many."""
+    return count if count <= 2 * PILOT_LIGHT_PATHS else PILOT_LIGHT_PATHS
 
 
 @dataclass(frozen=True)

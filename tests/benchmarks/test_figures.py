@@ -105,7 +105,7 @@ def test_every_part_is_a_command(figures, module):
         options = parse(part.command.split())
         assert len(part.scenes(bundled)) in (1, 2, 5, 9), name
         assert (elsewhere[0] in part.scenes([*bundled, *elsewhere])) == (
-            name in ("compare10", "denoised10", "throughput")
+            name in ("compare10", "denoised10", "parsimony", "throughput")
         )
         for label in ("path", "bdpm_auto") if hasattr(options, "denoise") else ():
             assert label in [method.label for method in options.integrators]

@@ -20,7 +20,7 @@ from foggy import grid as smoke
 from foggy import world as foggy_world
 from selection import extended
 from test_against_path import MONO, RGB, SPECTRAL, caustic_scene
-from test_bdpm import box_scene, glossy_box, last_words
+from test_bdpm import glossy_box, last_words
 from worlds import diffuse, film, look, path, tray
 
 
@@ -293,24 +293,7 @@ def test_a_path_of_given_time_keeps_the_processor_busy(rgb, monkeypatch, seconds
         assert variance * samples == pytest.approx(single.parts[measure][1], rel=0.3)
 
 
-@pytest.mark.parametrize(
-    "material, chosen",
-    [
-        ({"type": "roughdielectric", "alpha": 0.1}, "bdpm_opt3"),
-        ({"type": "roughplastic"}, "bdpm_opt2"),
-        ({"type": "dielectric"}, "bdpm_opt2"),
-    ],
-)
-def test_rough_glass_is_for_three_strategies(rgb, monkeypatch, material, chosen):
-    """Its two sides are in the way of what photons are good at."""
-    set_price_of_path(monkeypatch, 1e4)
-    ball = {"type": "sphere", "center": [0, -1.3, 0.4], "radius": 0.3, "bsdf": material}
-    scene = box_scene(ball=ball)
-    assert decided(scene, 32).settings["choice"] == chosen
-    assert decided(scene, 31).settings["choice"] == "bdpm"
-
-
-@pytest.mark.parametrize("seconds, chosen", [(4.9, "bdpm"), (5.0, "bdpm_opt2")])
+@pytest.mark.parametrize("seconds, chosen", [(4.9, "bdpm"), (5.0, "bdpm_opt3")])
 def test_short_renders_learn_no_weights(rgb, monkeypatch, seconds, chosen):
     """By the time that is planned where one is, whatever number of samples is planned too."""
     set_price_of_path(monkeypatch, 1e4)
@@ -369,7 +352,7 @@ def test_image_is_that_of_the_integrator_chosen(variant_name, spp):
     while session.iterations < session.iterations_planned:
         session.iterate()
     settings = session.settings
-    assert settings["choice"] == ("bdpm" if spp < 32 else "bdpm_opt2")
+    assert settings["choice"] == ("bdpm" if spp < 32 else "bdpm_opt3")
     given = {"bdd": 0} if settings["choice"] == "bdpm" else {}
     alone = mi.load_dict(
         {"type": settings["choice"], "max_depth": 4, "variance": True, **given}

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 def test_pixels_lie_all_over_the_film(width, height, camera_paths):
     """In all rows and columns that they can reach, and about as many paths as a pilot has."""
     setting = PilotSetting(
-        width, width * height, 1.0, ("indirect",), True, camera_paths, None, None, None
+        width, width * height, 1.0, ("indirect",), True, False, camera_paths, None, None, None
     )
     pixels = pilot_pixels(setting)
     last = (pixels.count - 1) * pixels.stride
