@@ -188,27 +188,33 @@ def test_depth_is_that_of_volpath(rgb, max_depth):
     agree_with_volpath(scene, max_depth, whole=0.02, block=0.05)
 
 
-@pytest.mark.parametrize(
-    "max_depth, opacity, radius, fov", [(2, 0.3, 0.9, 20.0), (4, 0.03, 0.5, 40.0)]
-)
-def test_half_transparent_surfaces(rgb, max_depth, opacity, radius, fov):
-    """All that is seen, and most light, comes through a mask: paths that pass it go on as if it
-    were not there, and their weights with them."""
+def curtain(opacity, radius, fov):
+    """Fog behind a half transparent ball, which fills most of the view."""
     mask = {"type": "mask", "opacity": opacity, "nested": {"type": "twosided", "nested": diffuse()}}
-    scene = fog_scene(
+    return fog_scene(
         homogeneous(1.5, 0.95),
         view((0, 0.3, 4.2), fov=fov),
         floor=None,
         curtain=ball(mask, radius, exterior=FOG, interior=FOG),
         sky={"type": "constant", "radiance": grey(0.4)},
     )
-    agree_with_volpath(scene, max_depth, whole=0.01, block=0.02)
+
+
+@pytest.mark.parametrize(
+    "max_depth, opacity, radius, fov", [(2, 0.3, 0.9, 20.0), (4, 0.03, 0.5, 40.0)]
+)
+def test_half_transparent_surfaces(rgb, max_depth, opacity, radius, fov):
+    """All that is seen, and most light, comes through a mask: paths that pass it go on as if it
+    were not there, and their weights with them."""
+    agree_with_volpath(curtain(opacity, radius, fov), max_depth, whole=0.01, block=0.02)
 
 
 # --- Closed forms -------------------------------------------------------------
 
 
 NEAR_CLIP = 0.5
+SIGMA_T, POINT = 0.7, (1.5, 0.3, 0.4)
+"""Of `point_in_fog`: extinction, and the place of the light."""
 
 
 def single_scattering(sigma_t, albedo, g, light, pixels, half_width, distance):
@@ -237,13 +243,13 @@ def single_scattering(sigma_t, albedo, g, light, pixels, half_width, distance):
 def point_in_fog(albedo, g):
     """A point light in an infinite medium without any shape, and the means of the image and of its
     quarters, of light that has scattered once."""
-    sigma_t, distance, half_width, at = 0.7, 2.0, 0.5, (1.5, 0.3, 0.4)
-    medium = homogeneous(sigma_t, albedo, hg(g))
+    distance, half_width = 2.0, 0.5
+    medium = homogeneous(SIGMA_T, albedo, hg(g))
     scene = mi.load_dict(
         {
             "type": "scene",
             "fog": {**medium, "id": "fog"},
-            "light": {"type": "point", "position": list(at), "intensity": 1.0},
+            "light": {"type": "point", "position": list(POINT), "intensity": 1.0},
             "sensor": {
                 **view((0, 0, distance), fov=np.degrees(2 * np.arctan(half_width / distance))),
                 "to_world": look((0, 0, distance), (0, 0, 0), (0, 1, 0)),
@@ -252,7 +258,7 @@ def point_in_fog(albedo, g):
             },
         }
     )
-    picture = single_scattering(sigma_t, albedo, g, at, 16, half_width, distance)
+    picture = single_scattering(SIGMA_T, albedo, g, POINT, 16, half_width, distance)
     return scene, Estimate.exact(np.repeat(block_means(picture[:, :, None], 2), 3, axis=1))
 
 
