@@ -37,6 +37,8 @@ SHIFTS = "tests/volume/test_shifts.py"
 VIEWS = "tests/volume/test_multiview.py"
 BDPM = "tests/integrators/test_bdpm.py"
 BDPT = "tests/integrators/test_bdpt.py"
+FOG = "tests/integrators/test_bdpt_media.py"
+RIS_FOG = "tests/integrators/test_bdpt_ris_media.py"
 RIS = "tests/integrators/test_bdpt_ris.py"
 BALANCE = "tests/integrators/test_balance.py"
 OPTIMAL = "tests/integrators/test_weights_in_renders.py"
@@ -103,6 +105,13 @@ MUTATIONS = [
         f"{BDPT}::test_weights_sum_to_one",
     ),
     Mutation(
+        "mis/vertex_merging.py",
+        "return dr.select(in_medium(n), 0, self.eta)",
+        "return self.eta",
+        "weights count merges in media, which nothing makes",
+        f"{FOG}::test_weights_sum_to_one",
+    ),
+    Mutation(
         "mis/resampling.py",
         "return [dr.select(density > 0, better * theory.reciprocal(density), 0)",
         "return [dr.select(density > 0, theory.reciprocal(density), 0)",
@@ -137,7 +146,21 @@ MUTATIONS = [
         "a draw forgets that its cache point was one of several",
         f"{RIS}::test_point_in_sphere",
     ),
+    Mutation(
+        "integrators/resampled.py",
+        "carried *= seen",
+        "pass",
+        "media take nothing of what is drawn",
+        f"{RIS_FOG}::test_single_scattering_in_closed_form",
+    ),
     # ------------------------------------------------------------------ paths
+    Mutation(
+        "paths/camera_vertices.py",
+        "return [after[0], *selected(crosses, before[1:], after[1:])]",
+        "return after",
+        "steps of camera paths end at half transparent surfaces that they pass",
+        f"{RIS_FOG}::test_half_transparent_surfaces",
+    ),
     Mutation(
         "paths/roulette.py",
         "return dr.select(plays, throughput * dr.rcp(survival), throughput), active",

@@ -124,9 +124,11 @@ def show_comparison(rows: list[Row], measurement: Measurement, options: argparse
     ]
     base = measurement.base.method.label
     title = f"{measurement.opened.name}: {much}, {options.seeds} seeds, ratios to {base}"
-    show(title, shown, COLUMNS)
+    # Artefacts are counted beside `path`, where it is among the methods.
+    show(title, shown, [name for name in COLUMNS if name in shown[0]])
     if options.denoise:
-        show(f"{title}, all denoised", rows, DENOISED_COLUMNS)
+        denoised = [name for name in DENOISED_COLUMNS if name in rows[0]]
+        show(f"{title}, all denoised", rows, denoised)
     for label, reason in measurement.failures.items():
         console.print(f"{label} cannot render {measurement.opened.name}: {reason}")
 

@@ -18,7 +18,7 @@ from ..core.film import (
 from ..core.packing import rounded_up
 from ..core.random import next_2d, vertex_streams
 from ..core.recording import lanes, recorder
-from ..core.traits import SceneTraits, UnsupportedScene, check_media, check_scene, has_media
+from ..core.traits import SceneTraits
 from ..lights.lights import Lights
 from ..mis.vertex_merging import ConnectionWeights
 from ..paths.camera import with_gaps
@@ -28,7 +28,12 @@ from ..paths.light_classes import LightClasses, by_class, class_of
 from ..paths.sensor import Lens
 from ..paths.setting import World
 from ..paths.subpaths import Kept, read_vertices, trace_camera_subpaths, trace_light_subpaths
-from .common import MOST_LIGHT_PATHS, IterativeIntegrator, IterativeSession
+from .common import (
+    MOST_LIGHT_PATHS,
+    IterativeIntegrator,
+    IterativeSession,
+    check_scene_and_media,
+)
 from .pyramid import Ledger, camera_images, sensor_images, technique_channels, with_rest
 
 CHUNK = 1 << 19
@@ -144,17 +149,8 @@ class BDPT(IterativeIntegrator):
             "technique_weights": self.technique_weights,
         }
 
-    MEDIA = True
-    """Whether participating media are supported."""
-
     def check(self, scene, sensor):
-        check_scene(scene, sensor, self.plugin, self.MEDIA)
-        check_media(scene, sensor, self.plugin)
-        if self.hide_emitters and has_media(scene, sensor):
-            raise UnsupportedScene(
-                f'{self.plugin}: parameter "hide_emitters" is not supported in scenes with '
-                'participating media; use "volpath"'
-            )
+        check_scene_and_media(self, scene, sensor)
 
     def new_session(self, scene, sensor, seed, iterations):
         return BDPTSession(self, scene, sensor, seed, iterations)

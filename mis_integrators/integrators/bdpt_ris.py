@@ -113,8 +113,9 @@ class BDPTRIS(ResampledIntegrator):
     emission that camera paths meet are techniques beside it, and the weights of all know that the
     connections were resampled (Nabata, Iwasaki and Dobashi 2020). Unbiased.
 
-    Participating media, polarised variants, gradients and the film ``specfilm`` are refused by
-    name.
+    In participating media vertices are drawn and joined as on surfaces; media of flakes,
+    ``hide_emitters`` and the value ``published`` of ``weights`` are refused there. Polarised
+    variants, gradients and the film ``specfilm`` are refused by name.
 
     .. tabs::
         .. code-tab:: xml

@@ -16,7 +16,15 @@ from ..core.random import mix, reversed_bits
 from ..core.recording import settle
 from ..core.render_lock import RENDER_LOCK, under_render_lock
 from ..core.sequences import SampleSequence
-from ..core.traits import UnsupportedScene, check_film, check_scene, check_variant, unfinite_data
+from ..core.traits import (
+    UnsupportedScene,
+    check_film,
+    check_media,
+    check_scene,
+    check_variant,
+    has_media,
+    unfinite_data,
+)
 from ..core.untrusted import Fields
 from ..paths.camera import film_sample_count, with_gaps
 from ..paths.layers import CHANNELS, channel_names, render_layers, written
@@ -34,6 +42,22 @@ MOST_PATHS = 2**32 - 1
 """Camera paths of an iteration at most: their numbers have 32 bits."""
 MOST_LIGHT_PATHS = 2**28
 """Light sub-paths of an iteration at most: the words of their photons are numbered with 32 bits."""
+
+
+def check_scene_and_media(integrator, scene, sensor, refused=()):
+    """Raises `UnsupportedScene` for what integrators that join vertices in media cannot render;
+    `refused`: parameters that are not supported in media, as a message has them, each with what to
+    use instead."""
+    check_scene(scene, sensor, integrator.plugin, True)
+    check_media(scene, sensor, integrator.plugin)
+    if integrator.hide_emitters:
+        refused = (*refused, ('"hide_emitters"', '"volpath"'))
+    if refused and has_media(scene, sensor):
+        parameter, instead = refused[0]
+        raise UnsupportedScene(
+            f"{integrator.plugin}: parameter {parameter} is not supported in scenes with "
+            f"participating media; use {instead}"
+        )
 
 
 class IterativeIntegrator(mi.AdjointIntegrator):

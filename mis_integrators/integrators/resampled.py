@@ -16,7 +16,7 @@ from ..core.film import (
     with_colour,
 )
 from ..core.packing import from_numpy, rounded_up
-from ..core.random import mix, next_2d, vertex_streams
+from ..core.random import mix, next_2d, own_stream, vertex_streams
 from ..core.recording import lanes, recorder
 from ..core.spectra import channel_mean
 from ..core.traits import SceneTraits
@@ -35,6 +35,7 @@ from ..paths.connect import join_sensor
 from ..paths.layers import CHANNELS, SPLIT
 from ..paths.light_classes import LightClasses, by_class, class_of
 from ..paths.light_starts import sample_light_starts
+from ..paths.media import SHADOW_SALT
 from ..paths.sensor import Lens
 from ..paths.setting import World
 from ..paths.subpaths import (
@@ -44,14 +45,14 @@ from ..paths.subpaths import (
     trace_light_subpaths,
     vertex_bsdf_of,
 )
-from ..paths.vertex import scattered_mean
+from ..paths.vertex import facing
 from ..resampling.cache_pmfs import CachePmfs, cumulative_pmfs
 from ..resampling.cache_points import CacheGrid
-from ..resampling.cache_targets import TARGETS, CacheTargets, integrals
+from ..resampling.cache_targets import TARGETS, CacheTargets, integrals, receiving_cosine
 from ..resampling.light_vertices import END, LightVertices, list_light_vertices
-from ..resampling.proposals import Proposals, cumulative_sums
+from ..resampling.proposals import Proposals, arriving, cumulative_sums
 from ..weights import resampling
-from .common import IterativeIntegrator, IterativeSession
+from .common import IterativeIntegrator, IterativeSession, check_scene_and_media
 
 CHUNK = 1 << 18
 """Camera paths, and as many light sub-paths, traced at once at most; larger films are traced in
@@ -117,6 +118,10 @@ class ResampledIntegrator(IterativeIntegrator):
             "light_tracing": self.light_tracing,
         }
 
+    def check(self, scene, sensor):
+        published = ('"weights" = published', '"bounded"')
+        check_scene_and_media(self, scene, sensor, [published] if self.published else [])
+
     def new_session(self, scene, sensor, seed, iterations):
         return ResampledSession(self, scene, sensor, seed, iterations)
 
@@ -144,8 +149,10 @@ class ResampledSession(IterativeSession):
 
     def __init__(self, integrator, scene, sensor, seed, iterations):
         super().__init__(integrator, scene, sensor, seed, iterations)
-        self.traits = SceneTraits(scene)
+        self.traits = SceneTraits(scene, sensor)
         self.lights = Lights.seen_by(scene, sensor, integrator.plugin)
+        if self.traits.has_media:
+            self.lights.find_media(sensor, integrator.plugin)
         self.world = World(scene, self.lights, self.traits)
         self.split_paths(CHUNK)
         width, height = sensor.film().crop_size()
@@ -165,11 +172,16 @@ class ResampledSession(IterativeSession):
         )
         self.expected_weight = expected_weight(sensor.film(), integrator.camera_paths)
         self.recorded = recorder()
-        self.grid = CacheGrid(mi.Point3f(0), mi.Normal3f(0, 0, 1), integrator.cache_neighbors)
+        self.grid = self._grid(mi.Point3f(0), mi.Normal3f(0, 0, 1))
         self.records, self.shares = uniform_tables(self.grid)
         self.cache = self.known = self.first_light = None
         self.published_tables, self.next_tables = unknown_tables(1), {}
         self._freeze()
+
+    def _grid(self, points, normals):
+        return CacheGrid(
+            points, normals, self.integrator.cache_neighbors, bool(self.traits.has_media)
+        )
 
     def _share_light(self):
         """How many light sub-paths are traced: enough in any case for what is drawn from and for
@@ -235,6 +247,7 @@ class ResampledSession(IterativeSession):
             integrator.resamples,
             integrator.aware and not integrator.published,
             self.ratio,
+            self.traits,
         )
 
     # ------------------------------------------------------------------ passes
@@ -280,7 +293,7 @@ class ResampledSession(IterativeSession):
 
     def _targets(self, scene, sensor, tables, sequence, subpaths, first, cache, spectral, target):
         """q*/p of every light vertex of M sub-paths (from the number `first` on) at every cache
-        point if nothing stood between, row by row; whether nothing does; what makes their
+        point if nothing stood between, row by row; whether nothing does (`_seen`); what makes their
         `LightVertices`; how many vertices they have; `guessed_weight`. `subpaths`: as of
         `trace_light_subpaths`."""
         light, count, lengths = subpaths
@@ -303,9 +316,7 @@ class ResampledSession(IterativeSession):
         if self.integrator.published:
             r = sent.mean * self._cache_targets(spectral["wavelengths"]).received(z, sent.d, active)
         elif target == TARGETS[0]:
-            cosine = dr.dot(seen_normal(z), sent.d)
-            cosine = dr.select(z["through"], dr.abs(cosine), dr.maximum(cosine, 0))
-            r = channel_mean(sent.light) * cosine
+            r = channel_mean(sent.light) * receiving_cosine(self.traits, z, sent.d)
         else:
             r = channel_mean(
                 sent.light
@@ -314,7 +325,10 @@ class ResampledSession(IterativeSession):
                 )[0]
             )
         active &= (r > 0) & dr.isfinite(r)
-        seen = ends.unblocked(scene, z["p"], z["n"], sent, active)
+        rng = vertex_streams(point, end, sequence.own_seed())
+        seen = self._seen(scene, ends, z, sent, spectral, rng, active)
+        if self.traits.has_media:
+            seen = channel_mean(seen)
         return (
             dr.select(active, r, 0),
             seen,
@@ -322,8 +336,15 @@ class ResampledSession(IterativeSession):
             places,
             found,
             dr.select(end < dr.gather(mi.UInt32, ends.count, 0), sent.vertices, 0),
-            guessed_weight(z, sent),
+            guessed_weight(self.traits, z, sent),
         )
+
+    def _seen(self, scene, ends, z, sent, spectral, rng, active):
+        """Whether camera vertices `z` (records) see the `ends` that sent `sent`; in scenes with
+        media the share of light (spectrum) that gets there."""
+        if self.traits.has_media:
+            return ends.transmitted(scene, z, sent, spectral["wavelengths"], rng, active)
+        return ends.unblocked(scene, z["p"], z["n"], sent, active)
 
     def _own_targets(self, scene, sensor, tables, sequence, subpaths, cache, spectral):
         """What pmfs are made of: q*/p of the first M sub-paths for the target at hand, times the
@@ -362,7 +383,7 @@ class ResampledSession(IterativeSession):
         and what they are made of."""
         M, room = self.integrator.resampled_light_paths, self.capacity["ends"]
         if self.integrator.published:
-            r = dr.select(seen, r, 0)
+            r = arriving(r, seen)
             pmfs = *cumulative_pmfs(r, M + room), r
             dr.eval(pmfs)
             return pmfs
@@ -420,7 +441,12 @@ class ResampledSession(IterativeSession):
         value, forward, back = vertex_bsdf.f_and_pdfs(z["towards"], sent.d, active)
         carried = z["throughput"] * value * sent.light
         active &= (dr.max(carried) > 0) & dr.all(dr.isfinite(carried))
-        active = ends.unblocked(scene, z["p"], z["n"], sent, active)
+        seen = self._seen(scene, ends, z, sent, spectral, own_stream(rng, SHADOW_SALT), active)
+        if self.traits.has_media:
+            carried *= seen
+            active &= dr.max(seen) > 0
+        else:
+            active = seen
         own, per = self._of_draw(weights, pmf, z, sent, row, which, drawn, active)
         scattering = vertex_bsdf, value, forward, back
         share = self._share(weights, own, camera, z, sent, scattering, segments, active)
@@ -467,7 +493,7 @@ class ResampledSession(IterativeSession):
     def _own_gain(self, weights, z, sent, active):
         """Gain of the technique that joins a light vertex, which sends `sent`, to a camera
         vertex."""
-        cosine = dr.abs(dr.dot(z["n"], sent.d))
+        cosine = facing(self.traits, z["n"], sent.d)
         return weights.gain(
             sent.mean * weights.softened(cosine, dr.square(sent.distance)),
             weights.row(z["p"], z["n"], sent.d),
@@ -479,11 +505,11 @@ class ResampledSession(IterativeSession):
         """Weight w_t of a connection with the gain `own` among all techniques of its joint path.
         `scattering`: the `VertexBSDF` at the camera vertex `z`, and what its `f_and_pdfs` says."""
         vertex_bsdf, value, forward, back = scattering
-        cosine = dr.abs(dr.dot(z["n"], sent.d))
+        cosine = facing(self.traits, z["n"], sent.d)
         end = LightEnd(
             sent.pdf_area * cosine,
             sent.mean * dr.rcp(dr.maximum(sent.pdf_area, 1e-20)),
-            scattered_mean(value, z["n"], sent.d),
+            vertex_bsdf.scattered_mean(value, sent.d, active),
             back,
             segments,
             weights.kernels_of_vertex(z["row"], z["p"], vertex_bsdf, sent.d, active),
@@ -526,11 +552,8 @@ class ResampledSession(IterativeSession):
         index = lanes(self.capacity["light"])
         active = index < dr.gather(mi.UInt32, count, 0)
         y = read_vertices(light, index, active, states=END)
-        aperture = (
-            next_2d(vertex_streams(y["path"], y["number"], seed))
-            if sensor.needs_aperture_sample()
-            else mi.Point2f(0.5)
-        )
+        rng = vertex_streams(y["path"], y["number"], seed)
+        aperture = next_2d(rng) if sensor.needs_aperture_sample() else mi.Point2f(0.5)
         joined = join_sensor(
             self.world,
             self.limits,
@@ -540,6 +563,7 @@ class ResampledSession(IterativeSession):
             aperture,
             spectral["wavelengths"],
             active,
+            rng,
         )
         value = joined.value * (self.weights().seen_by_sensor(joined, y) / self.ratio)
         channels = list(colour_channels(value, spectral["sensor_matrix"]))
@@ -570,10 +594,8 @@ class ResampledSession(IterativeSession):
             traced[3], vertices, max(min(wanted, MOST_PAIRS // (M + self.capacity["ends"])), 1)
         )
         published = self.integrator.published
-        self.grid = CacheGrid(
-            self.cache["p"],
-            self.cache["n"] if published else seen_normal(self.cache),
-            self.integrator.cache_neighbors,
+        self.grid = self._grid(
+            self.cache["p"], self.cache["n"] if published else seen_normal(self.cache)
         )
         self.records, self.shares = uniform_tables(self.grid)
         self.published_tables = unknown_tables(dr.width(self.cache["depth"]))
@@ -613,7 +635,7 @@ class ResampledSession(IterativeSession):
         iteration."""
         M = self.integrator.resampled_light_paths
         width = M + self.capacity["ends"]
-        found = integrals(dr.select(seen, r, 0), vertices, LENGTHS, width, M)
+        found = integrals(arriving(r, seen), vertices, LENGTHS, width, M)
         self.next_tables = {iteration: published_tables(*found)}
 
     def _cache_points(self, camera, vertices, count):
@@ -632,7 +654,8 @@ class ResampledSession(IterativeSession):
         cache = read_vertices(camera, from_numpy(mi.UInt32, chosen), active, states=STEP)
         cache = {
             name: cache[name]
-            for name in ("p", "n", "ns", "towards", "value", "density", "depth", "hit", "d_vcm")
+            for name in ("p", "n", "ns", "towards", "value", "density", "depth", "d_vcm")
+            + ("hit", "above", "below")
             if name in cache
         }
         cache["through"] = dr.full(mi.Bool, False, count)
@@ -671,7 +694,7 @@ class ResampledSession(IterativeSession):
                 np.array(x).reshape(points, M + self.capacity["ends"])[:, :used] for x in (r, seen)
             )
             length = np.minimum(np.array(vertices)[:used], LENGTHS) - 1
-            Q_s += np.where(seen, r, 0) @ np.eye(LENGTHS)[length]
+            Q_s += (r * seen) @ np.eye(LENGTHS)[length]
             Q_blind += r.sum(axis=1)
             ends_s += np.bincount(length, minlength=LENGTHS)
         return Q_s / (sets * M), Q_blind / (sets * M), ends_s / (sets * M)

@@ -11,7 +11,8 @@ from ..core.recording import lanes
 from ..core.untrusted import Fields
 from ..mis.vertex_merging import ConnectionWeights
 from ..paths.light_classes import CLASSES, LightClasses
-from ..paths.subpaths import read_vertices
+from ..paths.subpaths import on_surfaces, read_vertices
+from ..paths.vertex import in_medium
 from ..photons.gather import KeptVertices, gather_photons
 from ..photons.grid import smallest_cell
 from ..photons.vertex_map import state_of, vertex_map
@@ -57,8 +58,9 @@ class VCM(BDPT):
     by Veach's heuristic, with the density of merges as Georgiev et al. 2012 have it, which takes
     each light sub-path for a sample of its own.
 
-    Consistent: the bias of merging vanishes with the radius. Participating media, polarised
-    variants, gradients and the film ``specfilm`` are refused by name.
+    Consistent: the bias of merging vanishes with the radius. In participating media the techniques
+    of :monosp:`bdpt` make vertices, and surfaces alone merge; media of flakes and ``hide_emitters``
+    are refused there. Polarised variants, gradients and the film ``specfilm`` are refused by name.
 
     .. tabs::
         .. code-tab:: xml
@@ -89,8 +91,6 @@ class VCM(BDPT):
             "initial_radius": self.initial_radius,
             "alpha": self.alpha,
         }
-
-    MEDIA = False
 
     def new_session(self, scene, sensor, seed, iterations):
         return VCMSession(self, scene, sensor, seed, iterations)
@@ -139,9 +139,9 @@ class VCMSession(BDPTSession):
             fields.finish()
 
     def _choose_radius(self, spectral):
-        """A share of the spread of the vertices that camera paths meet first: the diagonal, over
-        the root of three, of the box that leaves out 2 % of them at either end of each axis. Of the
-        scene's bounds where they meet none."""
+        """A share of the spread of the vertices on surfaces that camera paths meet first: the
+        diagonal, over the root of three, of the box that leaves out 2 % of them at either end of
+        each axis. Of the scene's bounds where they meet none."""
         self.radius = 1e-3 * float(dr.norm(self.traits.bounds.extents()))
         if not self.bidirectional:
             return
@@ -160,8 +160,10 @@ class VCMSession(BDPTSession):
         found = int(count[0])
         if not found:
             return
-        vertices = read_vertices(camera, dr.arange(mi.UInt32, found), True, ("p", "number"))
-        points = to_numpy(vertices["p"])[:, np.array(vertices["number"]) == 0]
+        fields = ("p", "number", "n")
+        vertices = read_vertices(camera, dr.arange(mi.UInt32, found), True, fields)
+        merged = (vertices["number"] == 0) & ~in_medium(vertices["n"])
+        points = to_numpy(vertices["p"])[:, np.array(merged)]
         if points.shape[1]:
             low, high = np.percentile(points, [2, 98], axis=1)
             self.radius = max(
@@ -171,10 +173,12 @@ class VCMSession(BDPTSession):
     def weights(self, spectral):
         plain = super().weights(spectral)
         eta = dr.pi * dr.square(spectral["radius"]) * self.light_chunk
-        return ConnectionWeights(self.lights, plain.beta, plain.ratio, eta)
+        return ConnectionWeights(self.lights, plain.beta, plain.ratio, eta, plain.media)
 
     def _merge_vertices(self, scene, tables, radiance, camera, count, light, spectral, entries):
         vertices, light_count, _ = light
+        if self.traits.has_media:
+            vertices, light_count = on_surfaces(vertices, light_count, self.capacity["light"])
         cell = dr.maximum(
             spectral["radius"],
             dr.opaque(mi.Float, smallest_cell(self.traits.bounds, self.capacity["light"])),
@@ -185,6 +189,8 @@ class VCMSession(BDPTSession):
         index = lanes(self.capacity["camera"])
         active = index < dr.gather(mi.UInt32, count, 0)
         z = read_vertices(camera, index, active)
+        if self.traits.has_media:
+            active &= ~in_medium(z["n"])
         weights = self.weights(spectral)
 
         def weigh(index, f, p, back, active):

@@ -35,7 +35,7 @@ class PublishedWeights(ResampledWeights):
     """
 
     def __init__(self, lights, targets, Q, shares, uniform, M, N, ratio):
-        super().__init__(lights, targets.grid, None, shares, M, N, True, ratio)
+        super().__init__(lights, targets.grid, None, shares, M, N, True, ratio, targets.traits)
         self.targets, self.Q, self.uniform = targets, Q, uniform
         self.kernels = tuple(f"kernel.{number}" for number in range(targets.grid.neighbors))
         self.light_kernels = tuple(f"light_{name}" for name in self.kernels)
@@ -97,8 +97,8 @@ class PublishedWeights(ResampledWeights):
     def init_light(self, si, source, reachable, active, flux):
         return [*super().init_light(si, source, reachable, active, flux), si, mi.Float(0)]
 
-    def scatter(self, state, p_forward, p_back, delta, scattered):
-        after = super().scatter(state, p_forward, p_back, delta, scattered)
+    def scatter(self, state, p_forward, p_back, delta, scattered, n):
+        after = super().scatter(state, p_forward, p_back, delta, scattered, n)
         return [*after[:-1], state[2]]
 
     def gain_of_start(self, si, ds, made, strength, active):

@@ -14,8 +14,8 @@ made once from the light sub-paths of the first iteration (which weights by dens
 weights depend neither on an iteration's own light sub-paths nor on its pmfs, and the
 sum of the techniques stays unbiased. h is the spacing of the cache points: the cached pmf, made for
 their places, does not know that G has a pole at z. Left out are visibility (the ends of a joint
-path see each other), the camera's BSDF of `f_y_f_yz`, the guess of the weight that the pmfs contain
-(`guessed_weight`), and delta functions' weights; colours enter by channel means.
+path see each other), transmittance, the camera's BSDF of `f_y_f_yz`, the guess of the weight that
+the pmfs contain (`guessed_weight`), and delta functions' weights; colours enter by channel means.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ import numpy as np
 from ..core.packing import from_numpy
 from ..core.spectra import channel_mean
 from ..paths.light_starts import seen_from
+from ..paths.vertex import facing, in_medium
 from ..resampling.light_vertices import END
 from ..resampling.proposals import BLIND_SHARE, uniform_share
 from ..weights import bidirectional as theory
@@ -48,22 +49,24 @@ class ResampledWeights:
     """`lights`, `grid` (a `CacheGrid`), `records` (float, two a row: a + c, b), `shares` (float,
     `LENGTHS` a row), M light sub-paths, N draws; `aware`: whether the weights know of the
     resampling (else every technique has the density of its path alone); `ratio`: N_t, light
-    sub-paths that are joined to the sensor over camera paths, of all the film."""
+    sub-paths that are joined to the sensor over camera paths, of all the film; `traits`: a
+    `SceneTraits`."""
 
     states = END
     kernels: tuple[str, ...] = ()
     light_kernels: tuple[str, ...] = ()
     """What vertices and hits keep besides (`paths.camera_vertices`): nothing."""
 
-    def __init__(self, lights, grid, records, shares, M, N, aware, ratio):
+    def __init__(self, lights, grid, records, shares, M, N, aware, ratio, traits):
         self.lights, self.grid, self.records, self.shares = lights, grid, records, shares
         self.M, self.N, self.aware, self.ratio = M, N, aware, ratio
+        self.traits = traits
 
     # ------------------------------------------------------------------ resampling
 
     def row(self, p, n, d):
-        """Row of a place with the geometric normal `n`, from which the light is in direction
-        `d`."""
+        """Row of a place with the geometric normal `n` (zero in media), from which the light is in
+        direction `d`."""
         return self.grid.row(p, dr.mulsign(n, dr.dot(n, d))) if self.aware else mi.UInt32(0)
 
     @staticmethod
@@ -117,7 +120,7 @@ class ResampledWeights:
         ds.d = dr.select(active & infinite, si.to_world(si.wi), ds.d)
         start = self.lights.pdf_emission_origin(si, ds, active)
         across = self.lights.pdf_emission_area(si, ds, active)
-        made = across * dr.abs(dr.dot(si.n, ds.d))
+        made = across * facing(self.traits, si.n, ds.d)
         strength = dr.select(
             self.lights.has_unknown_pdf(ds.emitter, active),
             self.lights.total_power,
@@ -148,7 +151,7 @@ class ResampledWeights:
     def depart(state, si, mask):
         return state
 
-    def scatter(self, state, p_forward, p_back, delta, scattered):
+    def scatter(self, state, p_forward, p_back, delta, scattered, n):
         d_vcm, d_vc, strength, *others = state
         return [
             d_vcm,
@@ -175,19 +178,22 @@ class ResampledWeights:
         return theory.connection(connection.density * (1 / self.ratio), a_light, 0, 0, 1)
 
 
-def guessed_weight(z, joined):
+def guessed_weight(traits, z, joined):
     """Weight that joining the cache point `z` (a record of a camera vertex) to a light vertex that
     sends `joined` would have among itself, the techniques nearer to the light, if the surface at
-    `z` is diffuse, and the one next to the camera; all as if nothing was resampled.
+    `z` is diffuse or the medium isotropic, and the one next to the camera; all as if nothing was
+    resampled.
 
     What is drawn should be proportional to weight times contribution. By q* alone long light
     sub-paths matter as much as direct light, though each of them is one of many ways to make its
     path."""
-    cosine = dr.abs(dr.dot(z["n"], joined.d))
+    cosine, onwards = facing(traits, z["n"], joined.d), dr.inv_pi
+    if traits.has_media:
+        onwards = dr.select(in_medium(z["n"]), dr.inv_four_pi, dr.inv_pi)
     return dr.rcp(
         1
         + dr.minimum(
-            cosine * (dr.inv_pi * joined.mis_sum + joined.pdf_area * z["d_vcm"]),
+            cosine * (onwards * joined.mis_sum + joined.pdf_area * z["d_vcm"]),
             theory.LARGEST_RATIO,
         )
     )

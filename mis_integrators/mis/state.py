@@ -44,7 +44,7 @@ class ConnectionState(Protocol):
     ) -> State:
         """At the first vertex of a light sub-path. `source`: the point of the light, as of
         `Lights.sample_emission`; `reachable`: next-event estimation could bring the same light;
-        `flux`: what the sub-path carries."""
+        `flux`: what the sub-path started with."""
 
     def init_camera(self, density: Array, active: Array) -> State:
         """At the first vertex of a camera sub-path. `density` [1/m^2]: that of camera rays there
@@ -57,11 +57,18 @@ class ConnectionState(Protocol):
         function; `squared` [m^2]: squared distance from the vertex before; `depth`: segments."""
 
     def scatter(
-        self, state: State, p_forward: Array, p_back: Array, delta: Array, scattered: Array
+        self,
+        state: State,
+        p_forward: Array,
+        p_back: Array,
+        delta: Array,
+        scattered: Array,
+        n: Array,
     ) -> State:
         """After scattering. `p_forward`, `p_back`: densities per projected solid angle with which
         this side goes on, and with which the other side would go back; `delta`: a delta function
-        scattered; `scattered` [1/sr]: mean of the BSDF over the channels."""
+        scattered; `scattered` [1/sr]: mean of the BSDF over the channels; `n`: normal of the vertex
+        (zero in media)."""
 
     def depart(self, state: State, si: Any, mask: Array) -> State:
         """After `scatter`, of light sub-paths: the state may keep the vertex that they leave."""
@@ -79,9 +86,11 @@ class ConnectionState(Protocol):
         sampled: Array,
         p_back: Array,
         delta: Array,
+        n: Array,
     ) -> Array:
         """Weight of next-event estimation. Arguments as of `hit_emitter`, but `emission` [1/m^2]
-        is an area density at the vertex; `delta`: the light cannot be met."""
+        is an area density at the vertex; `delta`: the light cannot be met; `n`: as of
+        `scatter`."""
 
 
 class MergeState(Protocol):

@@ -20,7 +20,8 @@ class ConnectionWeights:
     """The state of sub-paths (`mis.state.ConnectionState`), and the weights of joined sub-paths.
 
     `beta`: Veach's exponent; `ratio`: light sub-paths over camera paths, of the whole crop window;
-    `eta` [m^2]: pi R^2 N of merging, or 0; `media`: vertices may lie in media (connections only).
+    `eta` [m^2]: pi R^2 N of merging, or 0; `media`: vertices may lie in media, where nothing is
+    merged.
 
     In media densities per volume hold the extinction at the vertex. That stands in both densities
     of each ratio p>(x_s) / p<(x_s) and cancels, so the equations are those of surfaces, with
@@ -63,11 +64,11 @@ class ConnectionWeights:
             mi.Float(0),
         ]
 
-    def scatter(self, state, p_forward, p_back, delta, scattered=None):
+    def scatter(self, state, p_forward, p_back, delta, scattered, n):
         d_vcm, d_vc = state
         return [
             d_vcm,
-            dr.select(delta, d_vc, theory.d_vc_of(self._nearer(state, p_back), p_forward)),
+            dr.select(delta, d_vc, theory.d_vc_of(self._nearer(state, p_back, n), p_forward)),
         ]
 
     @staticmethod
@@ -81,19 +82,30 @@ class ConnectionWeights:
         ratio = dr.select(sampled > 0, direct * theory.reciprocal(sampled), 0)
         return theory.hit_emitter(ratio, direct * emission, state[1], self.beta)
 
-    def next_event(self, state, direct, emission, sampled, p_back, delta):
+    def next_event(self, state, direct, emission, sampled, p_back, delta, n):
         ratio = dr.select(delta, 0, sampled * theory.reciprocal(direct))
-        return theory.connection(ratio, 1, emission, self._nearer(state, p_back), self.beta)
+        return theory.connection(ratio, 1, emission, self._nearer(state, p_back, n), self.beta)
 
     # ------------------------------------------------------------------ joined sub-paths
 
-    def _nearer(self, state, p_back):
-        return theory.nearer(*state, p_back, self.beta, self.eta)
+    def eta_at(self, n):
+        """`eta` at vertices with the normals `n`: surfaces merge, vertices in media do not."""
+        if not self.media or (isinstance(self.eta, float) and self.eta == 0):
+            return self.eta
+        return dr.select(in_medium(n), 0, self.eta)
+
+    def _nearer(self, state, p_back, n):
+        return theory.nearer(*state, p_back, self.beta, self.eta_at(n))
 
     def connected(self, connection, camera, light):
         """Weight of a `Connection` of two kept vertices."""
-        a_light = self._nearer([light[name] for name in self.states], connection.back_at_light)
-        a_camera = self._nearer([camera[name] for name in self.states], connection.back_at_camera)
+        a_light, a_camera = (
+            self._nearer([vertex[name] for name in self.states], back, vertex["n"])
+            for vertex, back in (
+                (light, connection.back_at_light),
+                (camera, connection.back_at_camera),
+            )
+        )
         return theory.connection(
             connection.density_at_light, a_light, connection.density_at_camera, a_camera, self.beta
         )
@@ -108,5 +120,6 @@ class ConnectionWeights:
 
     def seen_by_sensor(self, connection, light):
         """Weight of a `LensConnection` of a light vertex."""
-        a_light = self._nearer([light[name] for name in self.states], connection.back)
+        state = [light[name] for name in self.states]
+        a_light = self._nearer(state, connection.back, light["n"])
         return theory.connection(connection.density * (1 / self.ratio), a_light, 0, 0, self.beta)

@@ -16,10 +16,11 @@ from ..core.packing import Store
 from ..core.records import Layout
 from ..core.spectra import channel_mean
 from .camera import trace_camera, whole_or_nothing, within_crop
+from .media import next_hit
 from .sensor import Lens
 from .setting import CameraPass, Limits, World
-from .subpaths import NO_PARENT, keep_vertex, new_vertices, vertex_layout
-from .vertex import VertexBSDF, scattered_mean
+from .subpaths import NO_PARENT, keep_vertex, new_vertices, selected, smooth_at, vertex_layout
+from .vertex import VertexBSDF, facing
 
 STEP = ("d_vcm", "geometry", "forward", "back", "scattered", "row")
 """What vertices and hits remember of the step from their parent: one over the area density with
@@ -62,7 +63,8 @@ def leave(soften, left, si, vertex_bsdf, value, p_forward, p_back, wo, mask):
     """After the lanes `mask` have scattered smoothly towards `wo`: what the next vertex must know
     of this one."""
     row = mi.Float(soften.row(si.p, si.n, wo))
-    new = [p_forward, p_back, scattered_mean(value, si.n, wo), row, dr.abs(dr.dot(si.n, wo))]
+    mean = vertex_bsdf.scattered_mean(value, wo, mask)
+    new = [p_forward, p_back, mean, row, facing(vertex_bsdf.traits, si.n, wo)]
     new += soften.kernels_of_vertex(left[3], si.p, vertex_bsdf, wo, mask)
     return [dr.select(mask, a, b) for a, b in zip(new, left)]
 
@@ -134,6 +136,10 @@ class StepVisitor:
         left = not_left(self.soften, n_paths)
         return [mi.UInt32(0), mi.UInt32(NO_PARENT), mi.Float(0), origin, left]
 
+    def travel(self, state, ray, flight, numbers, throughput, path, depth, active):
+        hit = next_hit(self.scene, self.traits, ray, flight, numbers, throughput, active)
+        return state, *hit
+
     def emission(self, state, at, active):
         _, parent, density, origin, left = state
         store, si = self.store, at.si
@@ -161,9 +167,9 @@ class StepVisitor:
     def arrive(self, state, at, rng, active):
         number, parent, density, origin, left = state
         si = at.si
-        smooth = active & mi.has_flag(at.bsdf.flags(), mi.BSDFFlags.Smooth)
+        smooth = smooth_at(at, active)
         squared = dr.maximum(dr.squared_norm(si.p - origin.p), 1e-20)
-        cosine = dr.abs(dr.dot(si.n, at.towards))
+        cosine = facing(self.traits, si.n, at.towards)
         step = step_to_vertex(self.soften, left, density, cosine, squared)
         if self.lens.connects:
             first = active & (at.depth == 1)
@@ -171,7 +177,7 @@ class StepVisitor:
             of_rays = cosine * self.lens.density(si.p, si.time, self.aperture, seen)
             of_rays = dr.select(of_rays > 0, self.ratio * dr.rcp(dr.maximum(of_rays, 1e-20)), 0)
             step[0] = dr.select(first, of_rays, step[0])
-        at.vertex_bsdf = VertexBSDF.at(self.traits, si, at.bsdf, smooth)
+        at.vertex_bsdf = VertexBSDF.at(self.traits, si, at.bsdf, smooth, at.medium)
         wanted = smooth & (dr.max(at.throughput) > 0)
         at.slot = keep_vertex(
             self.store, at, at.throughput, number, parent, dict(zip(self.steps, step)), wanted
@@ -185,8 +191,11 @@ class StepVisitor:
         value, p_forward, p_back = at.vertex_bsdf.f_and_pdfs(at.towards, wo, smoothly)
         parent = dr.select(smoothly, at.slot, parent)
         left = leave(self.soften, left, si, at.vertex_bsdf, value, p_forward, p_back, wo, smoothly)
-        density = dr.select(delta, 0, p_forward * dr.abs(dr.dot(si.n, wo)))
+        density = dr.select(delta, 0, p_forward * facing(self.traits, si.n, wo))
         return [number, parent, density, mi.Interaction3f(si), left], weight, active
+
+    def cross(self, before, after, crosses):
+        return [after[0], *selected(crosses, before[1:], after[1:])]
 
     def alpha(self, state, visible):
         return whole_or_nothing(visible)

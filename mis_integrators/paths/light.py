@@ -71,8 +71,9 @@ class LightArrival:
     unit vector to where the sub-path came from; `flux` [W] that one sub-path carries; `path`: its
     number; `depth`: segments so far; `first`: no surface was met before; `source`: the point of
     the light, valid where `first`; `had_delta`: met a delta surface, or started out of reach of
-    next-event estimation; `scattered`: met a smooth surface. In scenes with media, `medium`: the
-    one that it comes through, and `scatters`: it scatters there, at no surface (`interaction_at`).
+    next-event estimation; `scattered`: met a smooth surface; `sent`: the flux with which it
+    started, valid where `first`. In scenes with media, `medium`: the one that it comes through, and
+    `scatters`: it scatters there, at no surface (`interaction_at`).
     """
 
     si: mi.SurfaceInteraction3f
@@ -86,6 +87,7 @@ class LightArrival:
     source: mi.DirectionSample3f
     had_delta: mi.Bool
     scattered: mi.Bool
+    sent: mi.Spectrum
     medium: Any = None
     scatters: Any = None
 
@@ -142,7 +144,9 @@ def trace_light(world: World, limits: Limits, light_pass: LightPass, visitor: Li
     active = dr.full(mi.Bool, False, lanes)
     flight = begin_flights(traits, None)
     # Where it comes from, until it scatters first: it may pass surfaces before.
-    start = [dr.zeros(mi.DirectionSample3f), mi.Bool(False)] if traits.has_media else []
+    start = []
+    if traits.has_media:
+        start = [dr.zeros(mi.DirectionSample3f), dr.zeros(mi.Spectrum), mi.Bool(False)]
 
     while dr.hint(active | (next_path < count), label="light sub-paths"):
         # ---- Start the lane's next path where one has ended
@@ -164,18 +168,19 @@ def trace_light(world: World, limits: Limits, light_pass: LightPass, visitor: Li
             next_path += stride
             if dr.hint(traits.has_media, mode="scalar"):
                 flight = begin_flights(traits, lights.medium_at(source.emitter))
-                start = [source, mi.Bool(True)]
+                start = [source, mi.Spectrum(flux), mi.Bool(True)]
 
         # ---- Arrive
         depth += 1
         numbers = sequence.of_paths(first + path)
+        sent = flux
         if dr.hint(traits.has_media, mode="scalar"):
             hit, ray, flight, flux = next_hit(scene, traits, ray, flight, numbers, flux, active)
             medium, event, scatters = flight
             active &= hit.is_valid() | scatters
             si = interaction_at(hit, ray, scatters, active)
             rng = numbers.at(event)
-            source, fresh = start
+            source, sent, fresh = start
         else:
             medium = scatters = None
             hit = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
@@ -196,6 +201,7 @@ def trace_light(world: World, limits: Limits, light_pass: LightPass, visitor: Li
             source,
             had_delta,
             scattered,
+            sent,
             medium,
             scatters,
         )
@@ -218,7 +224,7 @@ def trace_light(world: World, limits: Limits, light_pass: LightPass, visitor: Li
             depth -= dr.select(crosses, mi.UInt32(1), mi.UInt32(0))
             active |= crosses
             begun &= ~crosses
-            start = [source, fresh & crosses]
+            start = [source, sent, fresh & crosses]
             flight = [medium_behind(si, medium, wo, active), event, scatters]
         else:
             bs, delta, weight, wo, active = scatter_light(traits, si, at.bsdf, rng, active)

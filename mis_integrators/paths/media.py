@@ -354,6 +354,17 @@ def phase_f_and_pdfs(sides, to_camera, to_light, active):
     return value, pdf, pdf
 
 
+def albedo_mean(sides, active):
+    """Albedo at vertices in media (`vertex.Sides`): mean scattering over mean extinction, which is
+    the channels' mean of what `collision` multiplies throughput with where it scatters."""
+    medium = dr.select(active, sides.above, dr.zeros(mi.MediumPtr))
+    sigma_s, _, sigma_t = medium.get_scattering_coefficients(
+        point_in(medium, sides.p, mi.Float(0), sides.wavelengths), active
+    )
+    total = channel_mean(sigma_t)
+    return dr.select(total > 0, channel_mean(sigma_s) * dr.rcp(dr.maximum(total, 1e-30)), 0)
+
+
 def direct_light(scene, traits, lights, ref, sides, draws, active):
     """`Lights.sample_direct` through media and boundaries."""
     ds, light, pdf = lights.propose_direct(ref, draws, active)

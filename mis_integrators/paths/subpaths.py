@@ -24,7 +24,7 @@ from .light_classes import class_of, scattered_history, start_of_camera_path
 from .media import direct_light, next_hit
 from .sensor import Lens
 from .setting import CameraPass, LightPass, Limits, World
-from .vertex import Sides, VertexBSDF, facing, scattered_mean
+from .vertex import Sides, VertexBSDF, facing, in_medium
 
 Array = Any
 
@@ -147,6 +147,24 @@ def read_vertices(vertices, index, active, only=None, states=STATES):
     return record
 
 
+def on_surfaces(vertices, count, capacity):
+    """Those of `count` kept vertices (places without parents) that lie on surfaces, in a buffer of
+    their own: `(vertices, count)`. For scenes with media."""
+    index = dr.arange(mi.UInt32, capacity)
+    active = index < dr.gather(mi.UInt32, count, 0)
+    record = read_vertices(vertices, index, active)
+    keep = active & ~in_medium(record["n"])
+    found = dr.zeros(mi.UInt32, 1)
+    slot = dr.scatter_inc(found, mi.UInt32(0), keep)
+    dr.eval(slot, found)
+    chosen = {"words": vertex_layout().room(capacity)}
+    vertex_layout().write(chosen["words"], record, slot, keep)
+    if "mark" in vertices:
+        chosen["mark"] = dr.zeros(mi.Bool, capacity)
+        dr.scatter(chosen["mark"], record["mark"], slot, keep)
+    return chosen, found
+
+
 def seen_normal(vertex):
     """Geometric normal of vertices, as read by `read_vertices`, on the side that their sub-path
     came from."""
@@ -237,7 +255,7 @@ class VertexVisitor:
         arrival = density * facing(self.traits, si.n, at.towards) * dr.rcp(squared)
         sums = _either(
             first,
-            weights.init_light(si, at.source, ~at.had_delta, first, at.flux),
+            weights.init_light(si, at.source, ~at.had_delta, first, at.sent),
             weights.propagate(sums, arrival, si, squared, at.depth),
         )
         smooth = smooth_at(at, active)
@@ -253,9 +271,9 @@ class VertexVisitor:
         number, parent, _, _, sums, mark = state
         si, away = at.si, at.si.to_world(wo)
         value, p_back, p_forward = at.vertex_bsdf.f_and_pdfs(away, at.towards, active & ~delta)
-        mean = scattered_mean(value, si.n, at.towards)
-        sums = _either(active, self.weights.scatter(sums, p_forward, p_back, delta, mean), sums)
-        sums = self.weights.depart(sums, si, active)
+        mean = at.vertex_bsdf.scattered_mean(value, at.towards, active)
+        left = self.weights.scatter(sums, p_forward, p_back, delta, mean, si.n)
+        sums = self.weights.depart(_either(active, left, sums), si, active)
         density = dr.select(delta, 0, p_forward * facing(self.traits, si.n, away))
         mark = [dr.select(at.first, delta, before) for before in mark]
         return [number, parent, density, mi.Point3f(si.p), sums, mark]
@@ -394,6 +412,7 @@ class CameraVertexVisitor:
             p_camera * cosine,
             p_light,
             ds.delta,
+            si.n,
         )
         light = at.throughput * response * light
         if self.ledger is not None:
@@ -404,8 +423,9 @@ class CameraVertexVisitor:
         number, parent, _, _, sums, history = state
         si, wo = at.si, at.si.to_world(bs.wo)
         value, p_forward, p_back = at.vertex_bsdf.f_and_pdfs(at.towards, wo, active & ~delta)
-        mean = scattered_mean(value, si.n, wo)
-        sums = _either(active, self.weights.scatter(sums, p_forward, p_back, delta, mean), sums)
+        mean = at.vertex_bsdf.scattered_mean(value, wo, active)
+        left = self.weights.scatter(sums, p_forward, p_back, delta, mean, si.n)
+        sums = _either(active, left, sums)
         density = dr.select(delta, 0, p_forward * facing(self.traits, si.n, wo))
         history = scattered_history(history, delta, active) if history else []
         return [number, parent, density, mi.Interaction3f(si), sums, history], weight, active

@@ -13,18 +13,12 @@ import mitsuba as mi
 
 from ..core.spectra import channel_mean
 from ..core.traits import lookup
-from .media import phase_f_and_pdfs
+from .media import albedo_mean, phase_f_and_pdfs
 from .perturbed import smooth_density
 
 SMALLEST_COSINE = 1e-6
 ROUGH = -1.0
 """What `VertexBSDF.density` holds where the surface is not Lambertian."""
-
-
-def scattered_mean(value, n, to_light):
-    """Mean over the channels of the BSDF [1/sr], where `value` is that of `VertexBSDF.f_and_pdfs`:
-    what geometric cosines turn into the light that goes on."""
-    return channel_mean(value) * dr.rcp(dr.maximum(dr.abs(dr.dot(n, to_light)), SMALLEST_COSINE))
 
 
 def in_medium(n):
@@ -149,3 +143,14 @@ class VertexBSDF:
             p_camera = dr.select(inside, phase_camera, p_camera)
             p_light = dr.select(inside, phase_light, p_light)
         return value, p_camera, p_light
+
+    def scattered_mean(self, value, to_light, active=True):
+        """Mean over the channels of the BSDF [1/sr], where `value` is that of `f_and_pdfs`: what
+        geometric cosines turn into the light that goes on. In media that is the phase function
+        times the albedo."""
+        cosine = dr.maximum(facing(self.traits, self.n, to_light), SMALLEST_COSINE)
+        mean = channel_mean(value) * dr.rcp(cosine)
+        if not self.traits.has_media:
+            return mean
+        inside = active & in_medium(self.n)
+        return dr.select(inside, mean * albedo_mean(self.sides, inside), mean)

@@ -1,8 +1,9 @@
 """Which cache points a place in the scene listens to: a table over the cells of a grid and the six
-directions that a surface can face.
+directions that a surface can face; in scenes with media also over places in these.
 
-A cache point knows something about light that surfaces near it with a similar normal share. The
-nearest ones are found once for each cell and facing; after that a look-up is one gather, cheap
+A cache point knows something about light that surfaces near it with a similar normal share, or
+places in media near one that lies there itself. The nearest ones are found once for each cell and
+facing; after that a look-up is one gather, cheap
 enough for path loops. What it returns is a function of place and normal alone, constant within a
 cell: weights made of it are the same for every technique that makes a path.
 """
@@ -14,6 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.packing import from_numpy, to_numpy
+from ..paths.vertex import in_medium
 
 CELLS = 1 << 14
 """Cells of the grid at most; times six facings and the number of neighbours, four bytes each."""
@@ -22,29 +24,33 @@ FINENESS = 0.75
 BLOCK = 4
 """Edge of a block of cells that are searched together, in cells."""
 FACINGS = 6
+"""Directions of surfaces. With media there is one facing more."""
 NORMAL_COST = 8.0
 """Tuned: squared distance, in units of the cache points' spacing, that a cache point facing the
-other way seems farther; a right angle: half of it."""
+other way seems farther; a right angle, or a surface seen from a medium and the other way round:
+half of it."""
 
 
 class CacheGrid:
     """The `neighbors` nearest cache points of every cell and facing.
 
     Parameters: `points`, `normals` (`Point3f`, `Normal3f` of width C >= 1, evaluated; unit normals
-    on the side that the camera path came from), `neighbors` (N_c; if C is smaller, neighbours
-    repeat).
+    on the side that the camera path came from, zero in media), `neighbors` (N_c; if C is smaller,
+    neighbours repeat), `media`: whether places may lie in media.
 
     Attributes: `table` (uint32, indices of cache points: entry `rows` times N_c and on, nearest
     first), `rows` (number of rows), `spacing` (of the cache points [length]) and `squared_spacing`
     (opaque, [length^2]).
     """
 
-    def __init__(self, points, normals, neighbors):
-        self.neighbors = neighbors
+    def __init__(self, points, normals, neighbors, media=False):
+        self.neighbors, self.media = neighbors, media
+        self.facings = FACINGS + media
         p = to_numpy(points).astype(np.float64).T
         low, high = p.min(axis=0), p.max(axis=0)
         size = np.maximum(high - low, 1e-4 * max(np.max(high - low), 1e-12))
-        # Surfaces: C points cover about the box's faces, each an equal share.
+        # Surfaces: C points cover about the box's faces, each an equal share. (A few hundred that
+        # fill a box have about the same spacing.)
         area = 2 * (size[0] * size[1] + size[1] * size[2] + size[2] * size[0])
         self.spacing = float(np.sqrt(area / len(p)))
         edge = FINENESS * self.spacing
@@ -57,7 +63,7 @@ class CacheGrid:
         self._cells = dr.opaque(
             mi.Point3u, self.resolution
         )  # as literals they would have path kernels compiled anew for each seed
-        self.rows = FACINGS * int(np.prod(self.resolution))
+        self.rows = self.facings * int(np.prod(self.resolution))
         nx, ny, nz = self.resolution
         x, y, z = (
             np.tile(np.arange(nx), ny * nz),
@@ -72,7 +78,7 @@ class CacheGrid:
                 centres,
                 blocks,
                 p,
-                to_numpy(normals).astype(np.float64).T,
+                turned_away(to_numpy(normals).astype(np.float64), self.facings),
                 neighbors,
                 0.5 * NORMAL_COST * self.spacing**2,
             ).ravel(),
@@ -83,11 +89,14 @@ class CacheGrid:
         return [self.table, self.squared_spacing, self._low, self._scale, self._cells]
 
     def row(self, p, n):
-        """Row of a point on a surface with normal `n`, on the side at hand; places outside the grid
-        belong to its border."""
+        """Row of a point on a surface with normal `n`, on the side at hand (zero in media); places
+        outside the grid belong to its border."""
         nx, ny, _ = self._cells
         x, y, z = mi.Point3u(dr.clip((p - self._low) * self._scale, 0, mi.Point3f(self._cells - 1)))
-        return ((z * ny + y) * nx + x) * FACINGS + facing(n)
+        towards = facing(n)
+        if self.media:
+            towards = dr.select(in_medium(n), mi.UInt32(FACINGS), towards)
+        return ((z * ny + y) * nx + x) * self.facings + towards
 
     def neighbor(self, row, number, active=True):
         """Index of the cache point `number` (0: nearest) of a row."""
@@ -104,15 +113,23 @@ def facing(n):
     return 2 * axis + dr.select(component < 0, mi.UInt32(1), mi.UInt32(0))
 
 
-def _nearest(centres, blocks, p, n, neighbors, normal_cost):
+def turned_away(n, facings):
+    """For each facing, how far the normals `n` (3, C) are turned away from it: 0, 1 at a right
+    angle, 2 (facings, C). Zero normals, in media, are at a right angle to all facings but their
+    own, and surfaces to that."""
+    axes = [n[direction // 2] * (-1 if direction % 2 else 1) for direction in range(FACINGS)]
+    return 1 - np.array([*axes, 1 - np.sum(n * n, axis=0)][:facings])
+
+
+def _nearest(centres, blocks, p, turned, neighbors, normal_cost):
     """The table, a NumPy array (rows, neighbors).
 
     `centres` (cells, 3) of the cells, `blocks` (cells,) numbers of the blocks that they belong to,
-    `p`, `n` (C, 3) of the cache points, `normal_cost` of a right angle between normals [length^2].
-    Only points that can be among the nearest somewhere in a
-    block are tried for its cells."""
+    `p` (C, 3) of the cache points, `turned` as of `turned_away`, `normal_cost` of a right angle
+    between normals [length^2]. Only points that can be among the nearest somewhere in a block are
+    tried for its cells."""
     wanted = min(neighbors, len(p))
-    table = np.empty((len(centres), FACINGS, wanted), dtype=np.uint32)
+    table = np.empty((len(centres), len(turned), wanted), dtype=np.uint32)
     order = np.argsort(blocks, kind="stable")
     members = np.split(order, np.flatnonzero(np.diff(blocks[order])) + 1)
     middles = np.array(
@@ -125,14 +142,13 @@ def _nearest(centres, blocks, p, n, neighbors, normal_cost):
         ]
     )[:, None]
     distance = np.sqrt(_squared(middles, p))
-    for direction in range(FACINGS):
-        turned = normal_cost * (1 - n[:, direction // 2] * (-1 if direction % 2 else 1))
-        at_most = np.partition((distance + reach) ** 2 + turned, wanted - 1, axis=1)[
+    for direction, away in enumerate(normal_cost * turned):
+        at_most = np.partition((distance + reach) ** 2 + away, wanted - 1, axis=1)[
             :, wanted - 1 : wanted
         ]
-        possible = np.maximum(distance - reach, 0) ** 2 + turned <= at_most * (1 + 1e-6)
+        possible = np.maximum(distance - reach, 0) ** 2 + away <= at_most * (1 + 1e-6)
         for cells, candidates in zip(members, map(np.flatnonzero, possible)):
-            cost = _squared(centres[cells], p[candidates]) + turned[candidates]
+            cost = _squared(centres[cells], p[candidates]) + away[candidates]
             table[cells, direction] = candidates[least_columns(cost, wanted)]
     return table[:, :, np.arange(neighbors) % wanted].reshape(
         -1, neighbors

@@ -13,11 +13,19 @@ import mitsuba as mi
 from ..core.spectra import channel_mean
 from ..paths.sensor import unblocked
 from ..paths.subpaths import seen_normal, vertex_bsdf_of
-from ..paths.vertex import scattered_mean
+from ..paths.vertex import in_medium
 from .light_vertices import sent_by_starts
 
 TARGETS = "f_y_rho_g_v", "f_y_f_yz"
 """Names of the targets: without and with the BSDF at the camera's end."""
+
+
+def receiving_cosine(traits, z, d):
+    """Cosine with which cache points `z` (records, `through` among them) receive light from the
+    directions `d`: on surfaces zero from behind, unless they transmit; one in media."""
+    cosine = dr.dot(seen_normal(z), d)
+    cosine = dr.select(z["through"], dr.abs(cosine), dr.maximum(cosine, 0))
+    return dr.select(in_medium(z["n"]), 1, cosine) if traits.has_media else cosine
 
 
 class CacheTargets:
@@ -41,8 +49,7 @@ class CacheTargets:
         """What a cache point `z` makes of light from direction `d`: the cosine, or its BSDF with
         the cosine, channel mean."""
         if self.target == TARGETS[0]:
-            cosine = dr.dot(seen_normal(z), d)
-            return dr.select(z["through"], dr.abs(cosine), dr.maximum(cosine, 0))
+            return receiving_cosine(self.traits, z, d)
         vertex_bsdf = vertex_bsdf_of(self.traits, z, self.wavelengths, active)
         return channel_mean(vertex_bsdf.f_and_pdfs(z["towards"], d, active)[0])
 
@@ -58,7 +65,7 @@ class CacheTargets:
             distance = dr.sqrt(squared)
             d = offset * dr.rcp(distance)
             value, *_ = vertex_bsdf.f_and_pdfs(-d, to_light, active)
-            sent = scattered_mean(value, vertex_bsdf.n, to_light)
+            sent = vertex_bsdf.scattered_mean(value, to_light, active)
             sent *= dr.abs(dr.dot(vertex_bsdf.n, d)) * dr.rcp(squared)
             result.append(self._seen(z, d, distance, sent, active))
         return result

@@ -10,9 +10,10 @@ import mitsuba as mi
 
 from ..core.spectra import channel_mean
 from ..paths.light_starts import read_starts
+from ..paths.media import transmitted
 from ..paths.sensor import unblocked
-from ..paths.subpaths import read_vertices, vertex_bsdf_of
-from ..paths.vertex import SMALLEST_COSINE, scattered_mean
+from ..paths.subpaths import read_vertices, sides_of, vertex_bsdf_of
+from ..paths.vertex import SMALLEST_COSINE, facing
 
 END = ("d_vcm", "d_vc", "strength")
 """Fields that the ends' states have."""
@@ -62,16 +63,15 @@ class LightVertices:
         squared = dr.maximum(dr.squared_norm(offset), 1e-20)
         distance = dr.sqrt(squared)
         d = offset * dr.rcp(distance)
-        value, back, forward = vertex_bsdf_of(self.traits, y, wavelengths, surface).f_and_pdfs(
-            -d, y["towards"], surface
-        )
-        leaving = dr.abs(dr.dot(y["n"], d)) * dr.rcp(squared)
-        landing = dr.maximum(dr.abs(dr.dot(y["n"], y["towards"])), SMALLEST_COSINE)
+        vertex_bsdf = vertex_bsdf_of(self.traits, y, wavelengths, surface)
+        value, back, forward = vertex_bsdf.f_and_pdfs(-d, y["towards"], surface)
+        leaving = facing(self.traits, y["n"], d) * dr.rcp(squared)
+        landing = dr.maximum(facing(self.traits, y["n"], y["towards"]), SMALLEST_COSINE)
         joined = LightConnection(
             d,
             distance,
             value * y["throughput"] * (leaving * dr.rcp(landing)),
-            y["strength"] * scattered_mean(value, y["n"], y["towards"]) * leaving,
+            y["strength"] * vertex_bsdf.scattered_mean(value, y["towards"], surface) * leaving,
             forward * leaving,
             leaving * (y["d_vcm"] + back * y["d_vc"]),
             y["depth"] + 1,
@@ -96,6 +96,13 @@ class LightVertices:
         """Whether nothing stands between points `p` (geometric normals `n`) and the ends that sent
         `joined`."""
         return unblocked(scene, p, n, joined.d, dr.minimum(joined.distance, self.reach), active)
+
+    def transmitted(self, scene, z, joined, wavelengths, rng, active):
+        """Share of light (spectrum) that media and boundaries leave between camera vertices `z`
+        (records) and the ends that sent `joined`."""
+        p, n, d, distance = z["p"], z["n"], joined.d, dr.minimum(joined.distance, self.reach)
+        sides = sides_of(z, wavelengths)
+        return transmitted(scene, self.traits, p, n, sides, d, distance, wavelengths, rng, active)
 
 
 def sent_by_starts(lights, starts, p, time, wavelengths, active):

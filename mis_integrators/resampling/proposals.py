@@ -19,20 +19,27 @@ def uniform_share(visible):
     return UNIFORM_SHARE[1] + (UNIFORM_SHARE[0] - UNIFORM_SHARE[1]) * visible
 
 
+def arriving(r, seen):
+    """What arrives of `r`: where nothing stands between (`seen` bool), or the share that media
+    leave of it (`seen` float)."""
+    return dr.select(seen, r, 0) if dr.is_mask_v(seen) else r * seen
+
+
 def cumulative_sums(r, seen, count, width):
     """Cumulative sums, up to one in each row, of the pmfs of C cache points over up to `width`
     light vertices; and `uniform_share` of each row.
 
     `r` (float, C x width, one row a cache point): q*/p of each light vertex if nothing stood
-    between, zero in unused places; `seen` (bool, alike): whether nothing does; `count` (uint32 of
-    width one): light vertices in use, the first ones. The pmf is that of what is seen, with
+    between, zero in unused places; `seen` (bool, alike): whether nothing does, or in scenes with
+    media (float) the share that arrives; `count` (uint32 of width one): light vertices in use, the
+    first ones. The pmf is that of what is seen, with
     `BLIND_SHARE` of what is not told apart; one of the two alone if the other is nothing, uniform
     if both are.
     """
     place = dr.arange(mi.UInt32, dr.width(r))
     last = (place // width) * width + (width - 1)
     all_sums, seen_sums = (
-        dr.block_prefix_sum(x, width, exclusive=False) for x in (r, dr.select(seen, r, 0))
+        dr.block_prefix_sum(x, width, exclusive=False) for x in (r, arriving(r, seen))
     )
     every, some = (dr.gather(mi.Float, x, last) for x in (all_sums, seen_sums))
     uniform = mi.Float(dr.minimum(place % width + 1, count)) / mi.Float(dr.maximum(count, 1))

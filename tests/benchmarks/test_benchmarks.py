@@ -504,6 +504,19 @@ def test_what_is_asked_for_is_checked_before_it_is_measured(module, capsys, argu
     assert exit.value.code == 2 and message in capsys.readouterr().err.splitlines()[-1]
 
 
+def test_comparisons_without_path_are_shown(module, capsys):
+    """Artefacts are counted beside `path`: without it the table has no such column."""
+    compare = module("experiments.compare")
+    row = dict.fromkeys(set(compare.COLUMNS) - {"artefacts"}, 1.5) | {"method": "bdpt"}
+    row |= {f"{name} ratio {end}": 1.0 for name in ("relMSE", "cost") for end in ("low", "high")}
+    base = SimpleNamespace(method=SimpleNamespace(label="bdpt"))
+    measurement = SimpleNamespace(base=base, opened=SimpleNamespace(name="s"), failures={})
+    options = SimpleNamespace(spp=None, time=1.0, seeds=2, denoise=False)
+    compare.show_comparison([row], measurement, options)
+    shown = capsys.readouterr().out
+    assert "ratios to bdpt" in shown and "artefacts" not in shown and "1.5" in shown
+
+
 @pytest.mark.extended
 def test_comparisons_of_denoised_images(tmp_path, module, rgb):
     """Denoised images have errors of their own, over those of the better `path`; integrators are

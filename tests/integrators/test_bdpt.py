@@ -31,7 +31,7 @@ from mis_integrators.paths.subpaths import (
     trace_light_subpaths,
     vertex_layout,
 )
-from mis_integrators.paths.vertex import VertexBSDF, facing
+from mis_integrators.paths.vertex import VertexBSDF, facing, in_medium
 from mis_integrators.photons.gather import KeptVertices, gather_photons
 from mis_integrators.photons.vertex_map import state_of, vertex_map
 
@@ -209,7 +209,8 @@ class JointPaths:
             states.append(state)
             p_camera, p_light = self.densities(number)
             delta = self.vertices[number][-1]
-            left = weights.scatter(state, p_camera, p_light, delta)
+            n = self.vertices[number][1].n
+            left = weights.scatter(state, p_camera, p_light, delta, None, n)
             if number < self.length - 1:
                 near, far, squared = self.segment(number, number + 1)
                 state = weights.propagate(
@@ -230,7 +231,8 @@ class JointPaths:
         for number in range(self.length - 1, 0, -1):
             p_camera, p_light = self.densities(number)
             delta = self.vertices[number][-1]
-            left = weights.scatter(states[number], p_light, p_camera, delta)
+            n = self.vertices[number][1].n
+            left = weights.scatter(states[number], p_light, p_camera, delta, None, n)
             near, far, squared = self.segment(number, number - 1)
             states[number - 1] = weights.propagate(
                 left, dr.select(delta, 0, p_light * near * far / squared)
@@ -289,6 +291,7 @@ class JointPaths:
                 p_camera * cosine,
                 p_light,
                 self.light.delta,
+                last.n,
             )
         )
         for z in range(self.length - 2, -1, -1):
@@ -324,11 +327,13 @@ class JointPaths:
 
     def merged(self, weights, camera, light, number):
         """Weight of a merge at a vertex: what a gather of just this light vertex brings, over what
-        it would bring without weights."""
+        it would bring without weights; zero in media."""
         y, z = (
             self.record(number, "light", light[number]),
             self.record(number, "camera", camera[number]),
         )
+        inside = in_medium(y["n"])
+        y["n"] = dr.select(inside, mi.Vector3f(0, 0, 1), y["n"])
         index = dr.arange(mi.UInt32, self.COUNT)
         zero = dr.zeros(mi.UInt32, self.COUNT)
         words = vertex_layout().room(self.COUNT)
@@ -348,14 +353,14 @@ class JointPaths:
         for weigh in (merged, None):
             (radiance,) = gather_photons(
                 photons,
-                KeptVertices(self.traits, z, [], self.valid),
+                KeptVertices(self.traits, z, [], self.valid & ~inside),
                 [dr.opaque(mi.Float, 1e-4)],
                 1,
                 -1,
                 weigh,
             )
             brought.append(np.array(dr.mean(radiance)))
-        self.valid &= mi.Bool(brought[1] > 0)
+        self.valid &= mi.Bool(brought[1] > 0) | inside
         return brought[0] / np.maximum(brought[1], 1e-30)
 
     def joined(self, camera, light, z):
@@ -426,7 +431,8 @@ def test_states_of_traced_subpaths(rgb, kind):
     sides = (before["towards"], d) if kind == "camera" else (d, before["towards"])
     _, p_camera, p_light = VertexBSDF.at(traits, si, si.bsdf(), later).f_and_pdfs(*sides, later)
     forward, back = (p_camera, p_light) if kind == "camera" else (p_light, p_camera)
-    left = weights.scatter([before["d_vcm"], before["d_vc"]], forward, back, mi.Bool(False))
+    state = [before["d_vcm"], before["d_vc"]]
+    left = weights.scatter(state, forward, back, mi.Bool(False), None, before["n"])
     geometry = dr.abs(dr.dot(before["n"], d) * dr.dot(here["n"], d)) / dr.squared_norm(
         here["p"] - before["p"]
     )

@@ -34,6 +34,7 @@ from comparing import (
     differences,
 )
 from foggy import container, even, floor, grid, lamp, pockets, view, volpath
+from selection import extended
 from test_bdpm import last_words
 from test_bdpt import JointPaths, pyramid, technique_estimates
 from worlds import T, diffuse, grey, look
@@ -187,27 +188,33 @@ def test_depth_is_that_of_volpath(rgb, max_depth):
     agree_with_volpath(scene, max_depth, whole=0.02, block=0.05)
 
 
-@pytest.mark.parametrize(
-    "max_depth, opacity, radius, fov", [(2, 0.3, 0.9, 20.0), (4, 0.03, 0.5, 40.0)]
-)
-def test_half_transparent_surfaces(rgb, max_depth, opacity, radius, fov):
-    """All that is seen, and most light, comes through a mask: paths that pass it go on as if it
-    were not there, and their weights with them."""
+def curtain(opacity, radius, fov):
+    """Fog behind a half transparent ball, which fills most of the view."""
     mask = {"type": "mask", "opacity": opacity, "nested": {"type": "twosided", "nested": diffuse()}}
-    scene = fog_scene(
+    return fog_scene(
         homogeneous(1.5, 0.95),
         view((0, 0.3, 4.2), fov=fov),
         floor=None,
         curtain=ball(mask, radius, exterior=FOG, interior=FOG),
         sky={"type": "constant", "radiance": grey(0.4)},
     )
-    agree_with_volpath(scene, max_depth, whole=0.01, block=0.02)
+
+
+@pytest.mark.parametrize(
+    "max_depth, opacity, radius, fov", [(2, 0.3, 0.9, 20.0), (4, 0.03, 0.5, 40.0)]
+)
+def test_half_transparent_surfaces(rgb, max_depth, opacity, radius, fov):
+    """All that is seen, and most light, comes through a mask: paths that pass it go on as if it
+    were not there, and their weights with them."""
+    agree_with_volpath(curtain(opacity, radius, fov), max_depth, whole=0.01, block=0.02)
 
 
 # --- Closed forms -------------------------------------------------------------
 
 
 NEAR_CLIP = 0.5
+SIGMA_T, POINT = 0.7, (1.5, 0.3, 0.4)
+"""Of `point_in_fog`: extinction, and the place of the light."""
 
 
 def single_scattering(sigma_t, albedo, g, light, pixels, half_width, distance):
@@ -233,17 +240,16 @@ def single_scattering(sigma_t, albedo, g, light, pixels, half_width, distance):
     return radiance.reshape(pixels, fine, pixels, fine).mean(axis=(1, 3))
 
 
-@pytest.mark.parametrize("albedo, g", [(0.5, 0.0), (1.0, 0.5), (1.0, -0.5)])
-def test_single_scattering_in_closed_form(rgb, albedo, g):
-    """An infinite medium without any shape: next-event estimation and joining to the sensor, each
-    alone, and both."""
-    sigma_t, distance, half_width, at = 0.7, 2.0, 0.5, (1.5, 0.3, 0.4)
-    medium = homogeneous(sigma_t, albedo, hg(g))
+def point_in_fog(albedo, g):
+    """A point light in an infinite medium without any shape, and the means of the image and of its
+    quarters, of light that has scattered once."""
+    distance, half_width = 2.0, 0.5
+    medium = homogeneous(SIGMA_T, albedo, hg(g))
     scene = mi.load_dict(
         {
             "type": "scene",
             "fog": {**medium, "id": "fog"},
-            "light": {"type": "point", "position": list(at), "intensity": 1.0},
+            "light": {"type": "point", "position": list(POINT), "intensity": 1.0},
             "sensor": {
                 **view((0, 0, distance), fov=np.degrees(2 * np.arctan(half_width / distance))),
                 "to_world": look((0, 0, distance), (0, 0, 0), (0, 1, 0)),
@@ -252,8 +258,14 @@ def test_single_scattering_in_closed_form(rgb, albedo, g):
             },
         }
     )
-    picture = single_scattering(sigma_t, albedo, g, at, 16, half_width, distance)
-    exact = Estimate.exact(np.repeat(block_means(picture[:, :, None], 2), 3, axis=1))
+    picture = single_scattering(SIGMA_T, albedo, g, POINT, 16, half_width, distance)
+    return scene, Estimate.exact(np.repeat(block_means(picture[:, :, None], 2), 3, axis=1))
+
+
+@pytest.mark.parametrize("albedo, g", [(0.5, 0.0), (1.0, 0.5), (1.0, -0.5)])
+def test_single_scattering_in_closed_form(rgb, albedo, g):
+    """Next-event estimation and joining to the sensor, each alone, and both."""
+    scene, exact = point_in_fog(albedo, g)
     batches = SessionBatches(bdpt(max_depth=2), scene, 2)
     batches.add(2)
     assert_same(*collect_until(batches, exact, 0.01, 0.02), 0.01, 0.02, slack=1e-3)
@@ -327,13 +339,19 @@ def foggy_room(light, sensor="perspective"):
 
 
 @pytest.mark.parametrize(
-    "light, sensor, length, beta",
-    [("area", "perspective", 3, 1), ("point", "thinlens", 3, 2), ("area", "perspective", 4, 1)],
+    "light, sensor, length, beta, eta",
+    [
+        ("area", "perspective", 3, 1, 0.0),
+        ("point", "thinlens", 3, 2, 0.0),
+        ("area", "perspective", 4, 1, 2.0),
+        *extended(("point", "perspective", 3, 2, 1.0)),
+    ],
 )
-def test_weights_sum_to_one(rgb, light, sensor, length, beta):
-    """Each technique's weight for the same joint path through the fog, from its own code."""
+def test_weights_sum_to_one(rgb, light, sensor, length, beta, eta):
+    """Each technique's weight for the same joint path through the fog, from its own code, merges on
+    surfaces (eta = pi R^2 N) among them."""
     paths = JointPaths(foggy_room(light, sensor), length)
-    by_technique = paths.weights(ConnectionWeights(paths.lights, beta, 0.7, media=True))
+    by_technique = paths.weights(ConnectionWeights(paths.lights, beta, 0.7, eta, media=True))
     total = sum(by_technique.values())
     assert len(total) > 100
     assert np.mean(np.abs(total - 1) < 2e-3) > 0.995, np.sort(np.abs(total - 1))[-20:]
@@ -371,7 +389,8 @@ def test_states_behind_half_transparent_surfaces(rgb, kind):
     sides = (before["towards"], d) if kind == "camera" else (d, before["towards"])
     _, p_camera, p_light = vertex_bsdf_of(traits, before, [], later).f_and_pdfs(*sides, later)
     forward, back = (p_camera, p_light) if kind == "camera" else (p_light, p_camera)
-    left = weights.scatter([before["d_vcm"], before["d_vc"]], forward, back, mi.Bool(False))
+    state = [before["d_vcm"], before["d_vc"]]
+    left = weights.scatter(state, forward, back, mi.Bool(False), None, before["n"])
     squared = dr.squared_norm(here["p"] - before["p"])
     near, far = weights.propagate(left, forward * facing(traits, here["n"], d) / squared)
     mask = np.array(later) & (np.array(here["depth"]) == np.array(before["depth"]) + 1)
@@ -383,7 +402,8 @@ def test_states_behind_half_transparent_surfaces(rgb, kind):
 
 # --- What is refused ----------------------------------------------------------
 
-REFUSING = sorted(set(_plugins.PLUGINS) - {"bdpm", "bdpt", "bdpm_auto", "volpath_multiview"})
+WITH_MEDIA = "bdpm", "bdpm_auto", "bdpt", "bdpt_ris", "pcbpt", "vcm", "volpath_multiview"
+REFUSING = sorted(set(_plugins.PLUGINS) - set(WITH_MEDIA))
 
 
 @pytest.mark.parametrize("plugin", REFUSING)

@@ -5,8 +5,10 @@ Comparisons of renders as in `test_against_path`: false-alarm rate 1e-6 each, an
 are seen with a probability of 0.95.
 """
 
+from functools import partial
 from pathlib import Path
 
+from mis_integrators.core.random import streams
 from mis_integrators.paths.camera_vertices import (
     STEP,
     LightEnd,
@@ -21,13 +23,14 @@ from mis_integrators.paths.setting import Limits, World
 from mis_integrators.paths.subpaths import (
     NO_PARENT,
     hit_record,
+    media_record,
     new_vertices,
     read_vertices,
     seen_normal,
     vertex_bsdf_of,
     vertex_layout,
 )
-from mis_integrators.paths.vertex import VertexBSDF, scattered_mean
+from mis_integrators.paths.vertex import VertexBSDF, facing
 from mis_integrators.resampling.light_vertices import END, LightVertices
 
 import drjit as dr
@@ -81,7 +84,7 @@ class ResampledPaths(JointPaths):
         seen.wi = si.to_local(towards)
         depth = number + 1 if side == "camera" else self.length - number
         slot = dr.arange(mi.UInt32, self.COUNT) + number * self.COUNT
-        vertex_bsdf = VertexBSDF.at(self.traits, seen, si.bsdf(), self.valid)
+        vertex_bsdf = VertexBSDF.at(self.traits, seen, si.bsdf(), self.valid, self.media[number])
         values = {
             "p": si.p,
             "n": vertex_bsdf.n,
@@ -99,6 +102,10 @@ class ResampledPaths(JointPaths):
         dr.scatter(buffer["parent"], parent, slot, self.valid)
         if "hit" in buffer:
             hit_record().write(buffer["hit"], {"hit": hit}, slot, self.valid)
+        if "media" in buffer:
+            sides = vertex_bsdf.sides
+            values = {"above": sides.above, "below": sides.below}
+            media_record().write(buffer["media"], values, slot, self.valid)
         dr.eval(buffer)
         return slot
 
@@ -116,9 +123,8 @@ class ResampledPaths(JointPaths):
                 _, cosine, squared = self.segment(number - 1, number)
                 state = step_to_vertex(weights, left, density, cosine, squared)
             else:
-                of_rays = self.lens.density(si.p, si.time, self.aperture, self.valid) * dr.abs(
-                    dr.dot(si.n, to_camera)
-                )
+                of_rays = self.lens.density(si.p, si.time, self.aperture, self.valid)
+                of_rays *= facing(self.traits, si.n, to_camera)
                 state = [
                     weights.ratio / of_rays if self.lens.connects else mi.Float(0),
                     *[mi.Float(0)] * (5 + len(weights.kernels)),
@@ -127,7 +133,7 @@ class ResampledPaths(JointPaths):
             vertex_bsdf = self.vertex_bsdf(number)
             value, *_ = vertex_bsdf.f_and_pdfs(to_camera, to_light, self.valid)
             left = leave(weights, left, si, vertex_bsdf, value, p_camera, p_light, to_light, ~delta)
-            density = dr.select(delta, 0, p_camera * dr.abs(dr.dot(si.n, to_light)))
+            density = dr.select(delta, 0, p_camera * facing(self.traits, si.n, to_light))
             parent = dr.select(delta, parent, slot)
             slots.append(slot)
             dr.eval(left, density, parent)
@@ -155,10 +161,10 @@ class ResampledPaths(JointPaths):
             )
             if number:
                 p_camera, p_light = self.densities(number)
-                value, *_ = self.vertex_bsdf(number).f_and_pdfs(to_camera, to_light, self.valid)
-                left = weights.scatter(
-                    state, p_light, p_camera, delta, scattered_mean(value, si.n, to_light)
-                )
+                vertex_bsdf = self.vertex_bsdf(number)
+                value, *_ = vertex_bsdf.f_and_pdfs(to_camera, to_light, self.valid)
+                mean = vertex_bsdf.scattered_mean(value, to_light, self.valid)
+                left = weights.scatter(state, p_light, p_camera, delta, mean, si.n)
                 left_from = mi.SurfaceInteraction3f(si)
                 left_from.wi = si.to_local(to_light)
                 left = weights.depart(left, left_from, self.valid)
@@ -261,6 +267,7 @@ class ResampledPaths(JointPaths):
             self.aperture,
             [],
             self.valid,
+            streams(index, mi.UInt32(7)),
         )
         self.valid &= seen.active | mi.Bool(delta[0])
         result[self.length + 1] = (
@@ -344,21 +351,20 @@ def test_guessed_weight_is_the_weight_where_nothing_is_guessed(rgb):
 
     paths = ResampledPaths(room("diffuse", "area", "perspective"), 3, name="pcbpt")
     share, seen = paths.session._share, []
+    guess = partial(guessed_weight, paths.traits)
 
     def spy(weights, own, camera, z, sent, *rest):
         result = share(weights, own, camera, z, sent, *rest)
-        seen.append(
-            [np.array(x) for x in (z["depth"], sent.vertices, guessed_weight(z, sent), result)]
-        )
+        seen.append([np.array(x) for x in (z["depth"], sent.vertices, guess(z, sent), result)])
         return result
 
     paths.session._share = spy
     paths.weights()
     valid = np.array(paths.valid)
-    depth, vertices, guess, exact = (x[:, valid] for x in np.stack(seen, axis=1))
+    depth, vertices, guessed, exact = (x[:, valid] for x in np.stack(seen, axis=1))
     first = depth == 1
-    assert first.any() and np.all((guess > 0) & (guess <= 1))
-    np.testing.assert_allclose(guess[first], exact[first], rtol=1e-3, atol=1e-5)
+    assert first.any() and np.all((guessed > 0) & (guessed <= 1))
+    np.testing.assert_allclose(guessed[first], exact[first], rtol=1e-3, atol=1e-5)
     assert 0.01 < np.mean(exact[first]) < 0.99 and set(vertices[first]) == {3}
 
 

@@ -1,13 +1,15 @@
-"""The plugin `vcm`. That its weights sum to one is in `test_bdpt` and
+"""The plugin `vcm`. That its weights sum to one is in `test_bdpt`, `test_bdpt_media` and
 `test_bidirectional_weights`."""
 
 import mitsuba as mi
 import numpy as np
 import pytest
 from comparing import Estimate, SessionBatches, agree, assert_same, collect_until
+from foggy import volpath
 from selection import extended
 from test_analytic import inside_sphere, series
 from test_bdpm import box_scene, glossy_box
+from test_bdpt_media import SCENES
 from worlds import T, diffuse, film, look, path, tray
 
 
@@ -102,6 +104,51 @@ def test_light_that_only_merging_makes(rgb):
         mi.render(scene, integrator=mi.load_dict({"type": "bdpt", "max_depth": 4}), spp=16)
     )
     assert dark.max() == 0
+
+
+def test_light_that_only_merging_makes_in_media(rgb):
+    """The floor of a tank without refraction, full of what only absorbs: L = rho E / pi, less what
+    is lost on the way down and up."""
+    sigma_t, height = 0.8, 0.25
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "sun": {"type": "directional", "direction": [0, 0, -1], "irradiance": 1.0},
+            "floor": {"type": "rectangle", "to_world": T().scale(9), "bsdf": diffuse(0.6)},
+            "tank": {
+                "type": "cube",
+                "to_world": T().scale([10, 10, height]),
+                "bsdf": {"type": "dielectric", "int_ior": 1.0, "ext_ior": 1.0},
+                "interior": {"type": "homogeneous", "sigma_t": sigma_t, "albedo": 0.0},
+            },
+            "sensor": {
+                "type": "orthographic",
+                "to_world": look((0, 0, 1), (0, 0, 0)) @ T().scale([0.5, 0.5, 1]),
+                "film": film(16),
+            },
+        }
+    )
+    batches = SessionBatches(vcm(max_depth=4, initial_radius=0.05), scene, 2)
+    batches.add(8)
+    exact = Estimate.exact(np.full((5, 3), 0.6 / np.pi * np.exp(-2 * height * sigma_t)))
+    assert_same(*collect_until(batches, exact, 0.02, 0.05), 0.02, 0.05, 1e-3)
+
+
+@pytest.mark.parametrize(
+    "name", ["sensor within", *extended("grid", "coloured", "glass", "mask", "sky", "lamp within")]
+)
+def test_agrees_in_media(rgb, name):
+    """An error of 2 % of the whole image and of 6 % of a quarter is seen."""
+    agree(
+        vcm(max_depth=6, camera_paths=16),
+        volpath(max_depth=6),
+        SCENES[name](),
+        blocks=2,
+        spp=512,
+        whole=0.02,
+        block=0.06,
+        most=600,
+    )
 
 
 def test_small_radius_is_bdpt(rgb):

@@ -29,18 +29,28 @@ def box_points(count, seed=0, stretch=(1, 1, 1)):
 
 
 @pytest.mark.parametrize(
-    "count, neighbors, stretch",
-    [(300, 3, (1, 1, 1)), (77, 5, (10, 1, 0.01)), (2, 3, (1, 1, 1)), (1, 1, (0, 0, 0))],
+    "count, neighbors, stretch, media",
+    [
+        (300, 3, (1, 1, 1), False),
+        (300, 3, (1, 1, 1), True),
+        (77, 5, (10, 1, 0.01), False),
+        (2, 3, (1, 1, 1), False),
+        (1, 1, (0, 0, 0), True),
+    ],
 )
-def test_neighbours_are_the_nearest(rgb, count, neighbors, stretch):
-    """Against sorting the same costs in NumPy; places outside the grid get the border's."""
+def test_neighbours_are_the_nearest(rgb, count, neighbors, stretch, media):
+    """Against sorting the same costs in NumPy; places outside the grid get the border's. With media
+    a third of cache points and places lie in these."""
     p, n = box_points(count, 1, stretch)
-    grid = CacheGrid(mi.Point3f(p), mi.Normal3f(n), neighbors)
-    assert np.prod(grid.resolution) <= 1 << 14
     q, m = box_points(500, 2, 1.3 * np.array(stretch))
+    if media:
+        n[:, ::3], m[:, ::3] = 0, 0
+    grid = CacheGrid(mi.Point3f(p), mi.Normal3f(n), neighbors, media)
+    assert np.prod(grid.resolution) <= 1 << 14
     rows = np.array(grid.row(mi.Point3f(q), mi.Normal3f(m)))
     assert rows.max() < grid.rows
-    cell, face = rows // 6, rows % 6
+    facings = 7 if media else 6
+    cell, face = rows // facings, rows % facings
     nx, ny, _ = grid.resolution
     edge = 1 / float(grid._scale[0])
     centre = (np.stack([cell % nx, cell // nx % ny, cell // (nx * ny)]) + 0.5) * edge + p.min(
@@ -48,11 +58,13 @@ def test_neighbours_are_the_nearest(rgb, count, neighbors, stretch):
     )[:, None]
     inside = np.all((q >= p.min(axis=1)[:, None]) & (q < p.max(axis=1)[:, None]), axis=0)
     assert np.all(np.abs(centre - q)[:, inside] <= 0.5001 * edge + 1e-6)
-    axis = np.eye(3)[face // 2].T * np.where(face % 2, -1, 1)
-    assert np.all(np.sum(axis * m, axis=0) == 1)
-    cost = np.sum(
-        (centre[:, :, None] - p[:, None]) ** 2, axis=0
-    ) + 0.5 * NORMAL_COST * grid.spacing**2 * (1 - np.sum(axis[:, :, None] * n[:, None], axis=0))
+    axis = np.eye(4)[face // 2].T[:3] * np.where(face % 2, -1, 1)
+    assert np.all(np.sum(axis * m, axis=0) == (face < 6)) and np.any(face == 6) == media
+    other = np.where(
+        (face == 6)[:, None], np.sum(n * n, axis=0), 1 - np.sum(axis[:, :, None] * n[:, None], 0)
+    )
+    cost = np.sum((centre[:, :, None] - p[:, None]) ** 2, axis=0)
+    cost += 0.5 * NORMAL_COST * grid.spacing**2 * other
     found = np.array(grid.table).reshape(-1, neighbors)[rows]
     costs = np.take_along_axis(cost, found, axis=1)
     least = np.sort(cost, axis=1)[:, :neighbors]
@@ -65,10 +77,10 @@ def new_proposals(grid, r, seen, count, width):
     return Proposals(grid, cumulative, uniform, count, width)
 
 
-@pytest.mark.parametrize("width", [24, 37])
-def test_draws_have_their_probability(rgb, width):
+@pytest.mark.parametrize("width, media", [(24, False), (37, True)])
+def test_draws_have_their_probability(rgb, width, media):
     """Frequencies of drawn light vertices against the mixture of pmfs computed apart, and against
-    `probability`; rows without light are uniform."""
+    `probability`; rows without light are uniform. What is seen is, or in media arrives in part."""
     p, n = box_points(40)
     grid = CacheGrid(mi.Point3f(p), mi.Normal3f(n), 3)
     count, rng = 21, np.random.default_rng(3)
@@ -82,9 +94,10 @@ def test_draws_have_their_probability(rgb, width):
     r[table[dark]] = 0
     r[table[dominated, 0], :count] = 1e-12
     r[table[dominated, 0], 4] = 1e12
-    seen = rng.random(r.shape) < 0.3
-    seen[table[dominated, 1]] = False
-    proposals = new_proposals(grid, mi.Float(r.ravel()), mi.Bool(seen.ravel()), count, width)
+    seen = rng.random(r.shape) if media else rng.random(r.shape) < 0.3
+    seen[table[dominated, 1]] = 0
+    kept = (mi.Float if media else mi.Bool)(seen.ravel())
+    proposals = new_proposals(grid, mi.Float(r.ravel()), kept, count, width)
     every, some = r.sum(axis=1, keepdims=True), (r * seen).sum(axis=1, keepdims=True)
     blind, open_ = r / np.maximum(every, 1e-30), r * seen / np.maximum(some, 1e-30)
     pmf = np.where(some > 0, (1 - BLIND_SHARE) * open_ + BLIND_SHARE * blind, blind)[:, :count]
