@@ -2,9 +2,16 @@
 way through media at once (Jarosz, Zwicker and Jensen 2008, The beam radiance estimate for
 volumetric photon mapping).
 
-A camera path goes straight through media (`paths.media.pass_straight`). Its pieces there are stored
-as beams. Photons within the radius of a beam count by a constant kernel on the disk across the
-beam, times the phase function and the share of light that gets from the photon to the camera.
+The pieces of a camera path's way through media are stored as beams. Photons within the radius of a
+beam count by a constant kernel on the disk across the beam, times the phase function and the share
+of light that gets from the photon to the camera. There are two kinds of beams (Jarosz et al. 2011,
+A comprehensive theory of volumetric radiance estimation using photon points and beams):
+
+- long ones, where a path goes straight on to the next surface (`paths.media.pass_straight`): the
+  share of light is computed. All photons count.
+- short ones, where a path may scatter on the way (`paths.media.fly`): they end there, and that a
+  path gets as far as a photon has the share as its probability. Only caustic photons count: what
+  other light there is, the path finds from where it scatters.
 """
 
 from __future__ import annotations
@@ -24,14 +31,18 @@ from .grid import Query, longest_row, visit_hits
 from .photon import read_power
 from .volume import number_of_medium, read_place
 
+SHORT, LONG = 0, 1 << 31
+"""Bit of a beam's depth that tells its kind."""
+FIRST = 1 << 30
+"""Bit that says that the path has scattered smoothly nowhere before."""
 SLACK = 2e-3
 """Cells that queries reach beyond the radius, for rounding."""
 
 
 def beam_layout():
     """Fields of a beam: its ray, `length`, the path's throughput at its beginning, the number of
-    the path, its depth in segments with this one, the medium, and the surface that its ray meets:
-    packed geometric `normal`, and distance (infinite: none)."""
+    the path, its depth in segments with this one (with `LONG` and `FIRST`), the medium, and the
+    surface that its ray meets: packed geometric `normal`, and distance (infinite: none)."""
     return Layout(
         {
             "o": mi.Point3f,
@@ -60,7 +71,8 @@ def read_beams(words):
 @dataclass
 class Beams:
     """Beams of a buffer (`new_beams`), one a lane: the fields of `beam_layout`, which are `active`,
-    and the `extinction` by which light falls along them (zero in heterogeneous media)."""
+    `long` and `first`, and the `extinction` by which light falls along them (zero for short ones
+    and in heterogeneous media)."""
 
     o: mi.Point3f
     d: mi.Vector3f
@@ -72,6 +84,8 @@ class Beams:
     normal: mi.Vector3f
     surface: mi.Float
     active: mi.Bool
+    long: mi.Bool
+    first: mi.Bool
     extinction: mi.Spectrum
     wavelengths: mi.Float
 
@@ -82,13 +96,19 @@ class Beams:
         active = dr.max(record["throughput"]) > 0
         medium = dr.select(active, record["medium"], dr.zeros(mi.MediumPtr))
         at_start = point_in(medium, record["o"], mi.Float(0), wavelengths, -record["d"])
-        even = active & medium.is_homogeneous()
+        long, first = (record["depth"] & LONG) != 0, (record["depth"] & FIRST) != 0
+        even = active & long & medium.is_homogeneous()
         _, _, sigma_t = medium.get_scattering_coefficients(at_start, even)
         extinction = dr.select(even, sigma_t, 0)
         normal = dr.normalize(unpack_direction(record["normal"]))
         normal = dr.mulsign(normal, -dr.dot(normal, record["d"]))
-        record |= {"medium": medium, "normal": normal}
-        return cls(**record, active=active, extinction=extinction, wavelengths=wavelengths)
+        record |= {"medium": medium, "normal": normal, "depth": record["depth"] & (FIRST - 1)}
+        record |= {"long": long, "first": first, "extinction": extinction}
+        return cls(**record, active=active, wavelengths=wavelengths)
+
+    def takes(self, landing):
+        """Whether photons (`VolumeLanding`) are of a kind that counts, in the beams' own medium."""
+        return (landing.medium == number_of_medium(self.medium)) & (self.long | landing.caustic)
 
     def before_surface(self, p):
         """Whether points lie on the camera's side of the surface that ends the way: on that of its
@@ -226,14 +246,13 @@ def gather_along(photon_map, beams, radii, light_path_count, max_depth, grey=Fal
     (pi radius^2 x light sub-paths) (Jarosz et al. 2008, with a constant kernel).
 
     Parameters and result are those of `gather.gather_photons`. Photons count for beams in their own
-    medium only, and not behind the surface that ends the beam.
+    medium only, not behind the surface that ends the beam, and for short beams only caustic ones.
     """
     query = BeamQuery(photon_map, beams, radii[-1])
-    own_medium = number_of_medium(beams.medium)
     split = marked and not grey
 
     def visit(index, landing, offset, distance_squared, hit, totals):
-        hit &= (landing.medium == own_medium) & beams.before_surface(landing.p)
+        hit &= beams.takes(landing) & beams.before_surface(landing.p)
         if max_depth > 0:
             hit &= landing.depth + beams.depth <= max_depth
         flux, towards = read_power(photon_map.power, index, hit)
@@ -246,7 +265,8 @@ def gather_along(photon_map, beams, radii, light_path_count, max_depth, grey=Fal
             value = channel_mean(value * beams.throughput)
         values = [value]
         if split:
-            smooth = dr.select(landing.depth == 1, mi.UInt32(1), mi.UInt32(2))
+            alone = (landing.depth == 1) & beams.first
+            smooth = dr.select(alone, mi.UInt32(1), mi.UInt32(2))
             values = by_class(class_of(smooth, delta_at_light), value)
         inside = [hit & (distance_squared < dr.square(radius)) for radius in radii]
         found = [dr.select(i, value, 0) for i in inside for value in values]
@@ -262,14 +282,13 @@ def gather_along(photon_map, beams, radii, light_path_count, max_depth, grey=Fal
 
 
 def mean_count_along(photon_map, beams, radius, paths):
-    """Photons within `radius` of the beams of a camera path, on average over `paths` of them (a
-    number)."""
+    """Photons within `radius` of the beams of a camera path that count there, on average over
+    `paths` of them (a number)."""
     query = BeamQuery(photon_map, beams, radius)
-    own_medium = number_of_medium(beams.medium)
     (count,) = visit_hits(
         query,
         lambda index, landing, offset, distance_squared, hit, counts: (
-            counts[0] + dr.select(hit & (landing.medium == own_medium), mi.UInt32(1), 0),
+            counts[0] + dr.select(hit & beams.takes(landing), mi.UInt32(1), 0),
         ),
         (mi.UInt32(0),),
     )

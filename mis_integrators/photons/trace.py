@@ -85,6 +85,7 @@ class PhotonVisitor:
             "towards": at.towards,
             "flux": at.flux,
             "depth": at.depth,
+            "caustic": at.had_delta & ~at.scattered,
             "medium": at.medium,
         }
         if self.marked:

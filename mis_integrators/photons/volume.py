@@ -24,13 +24,19 @@ CELL = 2.0
 
 
 def place_layout():
-    """Position `p`; `word`: depth and medium, as of `pack_place`."""
+    """Position `p`; `word`: depth, kind and medium, as of `pack_place`."""
     return Layout({"p": mi.Point3f, "word": mi.UInt32})
 
 
-def pack_place(depth, medium):
-    """A path depth (saturated at `MAX_DEPTH`), and the number of a medium in 23 bits."""
-    return dr.minimum(depth, MAX_DEPTH) | (number_of_medium(medium) << DEPTH_BITS)
+CAUSTIC = 1 << DEPTH_BITS
+"""Bit of a photon's word that says of which kind it is."""
+
+
+def pack_place(depth, caustic, medium):
+    """A path depth (saturated at `MAX_DEPTH`), the photon's kind (caustic or not), and the number
+    of a medium in 22 bits."""
+    word = dr.minimum(depth, MAX_DEPTH) | (number_of_medium(medium) << (DEPTH_BITS + 1))
+    return word | dr.select(caustic, mi.UInt32(CAUSTIC), 0)
 
 
 def number_of_medium(medium):
@@ -40,18 +46,20 @@ def number_of_medium(medium):
 
 @dataclass
 class VolumeLanding:
-    """Where a volume photon was left: position, depth in segments, number of the medium."""
+    """Where a volume photon was left: position, depth in segments, number of the medium, kind."""
 
     p: mi.Point3f
     depth: mi.UInt32
     medium: mi.UInt32
+    caustic: mi.Bool
 
 
 def read_place(place, index, active=True):
     """The `VolumeLanding` of photons `index`."""
     record = place_layout().read(place, index, active)
     word = record["word"]
-    return VolumeLanding(record["p"], word & MAX_DEPTH, word >> DEPTH_BITS)
+    medium = word >> (DEPTH_BITS + 1)
+    return VolumeLanding(record["p"], word & MAX_DEPTH, medium, (word & CAUSTIC) != 0)
 
 
 def new_volume_photons(capacity):
@@ -62,9 +70,9 @@ def new_volume_photons(capacity):
 
 def write_volume_photon(place, power, slot, photon, active):
     """Writes photons to the places `slot`. `photon`: by name, `p`, `towards`, `flux`, `depth`,
-    `medium`, and where light is split into classes, `delta_at_light` (see
-    `photon.write_photon`)."""
-    word = pack_place(photon["depth"], photon["medium"])
+    `medium`, whether it is a `caustic` one, and where light is split into classes,
+    `delta_at_light` (see `photon.write_photon`)."""
+    word = pack_place(photon["depth"], photon["caustic"], photon["medium"])
     place_layout().write(place, {"p": photon["p"], "word": word}, slot, active)
     flux = photon["flux"]
     if "delta_at_light" in photon:
