@@ -430,7 +430,10 @@ class BDPMSession(PilotedSession):
         if self.traits.has_media:
             *photons, in_media = photons
             if kind == "volume":
-                return build_volume_map(*in_media, radius, self.volume_capacity)
+                place, power, count, *mis_words = in_media
+                return build_volume_map(
+                    place, power, count, radius, self.volume_capacity, *mis_words
+                )
         mis_words = photons[3] if kind == "indirect" and len(photons) > 3 else None
         return build_photon_map(
             *photons[:3],

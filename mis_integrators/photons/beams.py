@@ -35,6 +35,8 @@ SHORT, LONG = 0, 1 << 31
 """Bit of a beam's depth that tells its kind."""
 FIRST = 1 << 30
 """Bit that says that the path has scattered smoothly nowhere before."""
+LEVEL_SHIFT = 27
+"""Where under weights the three bits of the number of smooth vertices before begin."""
 SLACK = 2e-3
 """Cells that queries reach beyond the radius, for rounding."""
 
@@ -71,8 +73,8 @@ def read_beams(words):
 @dataclass
 class Beams:
     """Beams of a buffer (`new_beams`), one a lane: the fields of `beam_layout`, which are `active`,
-    `long` and `first`, and the `extinction` by which light falls along them (zero for short ones
-    and in heterogeneous media)."""
+    `long` and `first`, under weights their `level`, and the `extinction` by which light falls along
+    them (zero for short ones and in heterogeneous media)."""
 
     o: mi.Point3f
     d: mi.Vector3f
@@ -86,6 +88,7 @@ class Beams:
     active: mi.Bool
     long: mi.Bool
     first: mi.Bool
+    level: mi.UInt32
     extinction: mi.Spectrum
     wavelengths: mi.Float
 
@@ -102,13 +105,16 @@ class Beams:
         extinction = dr.select(even, sigma_t, 0)
         normal = dr.normalize(unpack_direction(record["normal"]))
         normal = dr.mulsign(normal, -dr.dot(normal, record["d"]))
-        record |= {"medium": medium, "normal": normal, "depth": record["depth"] & (FIRST - 1)}
-        record |= {"long": long, "first": first, "extinction": extinction}
+        level = (record["depth"] >> LEVEL_SHIFT) & 7
+        record["depth"] &= (1 << LEVEL_SHIFT) - 1
+        record |= {"medium": medium, "normal": normal, "long": long, "first": first}
+        record |= {"level": level, "extinction": extinction}
         return cls(**record, active=active, wavelengths=wavelengths)
 
-    def takes(self, landing):
+    def takes(self, landing, all_kinds=False):
         """Whether photons (`VolumeLanding`) are of a kind that counts, in the beams' own medium."""
-        return (landing.medium == number_of_medium(self.medium)) & (self.long | landing.caustic)
+        own = landing.medium == number_of_medium(self.medium)
+        return own if all_kinds else own & (self.long | landing.caustic)
 
     def before_surface(self, p):
         """Whether points lie on the camera's side of the surface that ends the way: on that of its
@@ -118,13 +124,10 @@ class Beams:
 
     def phase(self, p, towards, active):
         """The phase function [1/sr] at points `p`, for light from `towards` that goes on to the
-        camera."""
+        camera, and its density."""
         medium = dr.select(active, self.medium, dr.zeros(mi.MediumPtr))
         mei = point_in(medium, p, mi.Float(0), self.wavelengths, -self.d)
-        value, _ = medium.phase_function().eval_pdf(
-            mi.PhaseFunctionContext(None), mei, towards, active
-        )
-        return value
+        return medium.phase_function().eval_pdf(mi.PhaseFunctionContext(None), mei, towards, active)
 
 
 class BeamQuery(Query):
@@ -240,26 +243,33 @@ def _within(low, high, beams):
     return begin, end
 
 
-def gather_along(photon_map, beams, radii, light_path_count, max_depth, grey=False, marked=False):
+def gather_along(
+    photon_map, beams, radii, light_path_count, max_depth, grey=False, marked=False, weigh=None
+):
     """Radiance that volume photons bring to camera paths along beams, for each radius of a list:
     the sum over photons of phase function x flux x transmittance to the beam's beginning, over
     (pi radius^2 x light sub-paths) (Jarosz et al. 2008, with a constant kernel).
 
-    Parameters and result are those of `gather.gather_photons`. Photons count for beams in their own
-    medium only, not behind the surface that ends the beam, and for short beams only caustic ones.
+    Parameters and result are those of `gather.gather_photons`, but for ``weigh(index, pdf,
+    active)``: the weight (a number) of a photon to which camera paths would go on with density
+    `pdf`. Photons count for beams in their own medium only, not behind the surface that ends the
+    beam, and for short beams, unless they are weighed, only caustic ones.
     """
     query = BeamQuery(photon_map, beams, radii[-1])
     split = marked and not grey
 
     def visit(index, landing, offset, distance_squared, hit, totals):
-        hit &= beams.takes(landing) & beams.before_surface(landing.p)
+        hit &= beams.takes(landing, weigh is not None) & beams.before_surface(landing.p)
         if max_depth > 0:
             hit &= landing.depth + beams.depth <= max_depth
         flux, towards = read_power(photon_map.power, index, hit)
         if marked:
             flux, delta_at_light = read_mark(flux)
         along = query.skipped + dr.dot(offset, query.d)
-        value = flux * beams.phase(landing.p, dr.normalize(towards), hit)
+        phase, pdf = beams.phase(landing.p, dr.normalize(towards), hit)
+        value = flux * phase
+        if weigh is not None:
+            value *= dr.select(hit, weigh(index, pdf, hit), 0)
         value *= dr.exp(-beams.extinction * along)
         if grey:
             value = channel_mean(value * beams.throughput)

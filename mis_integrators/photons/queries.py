@@ -22,12 +22,11 @@ from ..paths.media import (
     direct_light,
     next_hit_either,
     next_hit_straight_on,
-    phase_f_and_pdfs,
 )
 from ..paths.setting import CameraPass, Limits, ListedPass, World
 from ..paths.subpaths import selected, smooth_at
-from ..paths.vertex import Sides
-from .beams import FIRST, LONG, SHORT, beam_layout, new_beams
+from ..paths.vertex import PhaseOrBSDF, Sides
+from .beams import FIRST, LEVEL_SHIFT, LONG, SHORT, beam_layout, new_beams
 
 LAST_VERTEX = 1 << 31
 """Bit of a vertex' depth that says that all photons are wanted there, else only caustic ones."""
@@ -152,10 +151,13 @@ class QueryVisitor:
         self.passes_masks = self.traits.has_media and self.traits.has_null_vertices
         self.deepest = limits.max_depth - 1 if limits.max_depth > 0 else None
         self.kinds = [LONG]
-        if self.flies and queries.has_caustics:
+        if self.flies and (queries.has_caustics or weights is not None):
             self.kinds.append(SHORT)
         if queries.beams:
-            self.store.beams = new_beams(len(self.kinds) * queries.beams)
+            room = len(self.kinds) * queries.beams
+            self.store.beams = new_beams(room)
+            if weights is not None:
+                self.store.beam_weights = weight_layout().room(room)
             self.store.beam_room = dr.opaque(mi.UInt32, queries.beams)
             # One each: what a loop has counted up, no other one can within the same iteration.
             self.store.beam_count = {kind: dr.zeros(mi.UInt32, 1) for kind in self.kinds}
@@ -197,6 +199,10 @@ class QueryVisitor:
         if self.deepest is not None:
             wanted &= mi.Int32(depth) <= self.deepest
         depth = depth | mi.UInt32(kind)
+        stored = {}
+        if self.weights is not None:
+            depth |= state[0] << LEVEL_SHIFT
+            stored = dict(zip(STATE, self.weights.stored(state[7])), share=mi.Spectrum(1))
         if self.classes is not None:
             depth |= dr.select(state[8][0] == 0, mi.UInt32(FIRST), 0)
 
@@ -218,6 +224,8 @@ class QueryVisitor:
                 "surface": surface,
             }
             beam_layout().write(store.beams, beam, slot, mask)
+            if stored:
+                weight_layout().write(store.beam_weights, stored, slot, mask)
 
         return keep
 
@@ -254,7 +262,7 @@ class QueryVisitor:
             unseen = met | at.scatters if self.flies else met
             times = dr.select(smooth & unseen, self.beyond, times)
         if weights is not None:
-            sums, share = weights.propagate(sums, at.si, bsdf, vertex, smooth)
+            sums, share = weights.propagate(sums, at.si, self._scattering(at), vertex, smooth)
             share_here = dr.select(smooth, share, share_here)
             at.ends |= weights.ends(bsdf, vertex, smooth)
         state = [vertex, met, behind_delta, scatter_pdf, origin, share_here, times, sums, *more]
@@ -266,6 +274,10 @@ class QueryVisitor:
                 self.classes.add("next_event", at.path, number, direct, smooth)
         self._ask_for_photons(state, at, smooth)
         return state, direct
+
+    def _scattering(self, at):
+        """What scatters there: a BSDF, or where paths scatter in media a `PhaseOrBSDF`."""
+        return PhaseOrBSDF.at(at) if self.flies else at.bsdf
 
     def _direct(self, state, at, rng, smooth):
         """Radiance of direct light at smooth vertices, by next-event estimation."""
@@ -279,16 +291,11 @@ class QueryVisitor:
         else:
             ds, light, light_pdf = self.lights.sample_direct(si, rng, smooth)
         wo = si.to_local(ds.d)
-        on_surface = smooth & ~at.scatters if self.flies else smooth
-        response, response_pdf = at.bsdf.eval_pdf(mi.BSDFContext(), si, wo, on_surface)
-        if self.flies:
-            inside = smooth & at.scatters & (dr.max(light) > 0)
-            phase, phase_pdf, _ = phase_f_and_pdfs(sides, at.towards, ds.d, inside)
-            response = dr.select(inside, phase, response)
-            response_pdf = dr.select(inside, phase_pdf, response_pdf)
+        reached = smooth & (dr.max(light) > 0)  # elsewhere `ds` may not even be a number
+        scattering, lit = self._scattering(at), reached if self.flies else smooth
+        response, response_pdf = scattering.eval_pdf(mi.BSDFContext(), si, wo, lit)
         if self.by_light:
-            reached = smooth & (dr.max(light) > 0)  # elsewhere `ds` may not even be a number
-            left = weights.scatter(sums, si, at.bsdf, mi.BSDFSample3f(wo), vertex, reached)
+            left = weights.scatter(sums, si, scattering, mi.BSDFSample3f(wo), vertex, reached)
             share_here = weights.next_event_weight(left, si, ds, reached)
         share = dr.select(ds.delta, 1, mis_power(light_pdf, response_pdf)) * share_here
         return dr.select(smooth, at.throughput * share * response * light, 0)
@@ -328,7 +335,7 @@ class QueryVisitor:
             active &= vertex <= self.bdd
         scattered = active & ~delta
         if self.weights is not None:
-            sums = self.weights.scatter(sums, at.si, at.bsdf, bs, vertex, scattered)
+            sums = self.weights.scatter(sums, at.si, self._scattering(at), bs, vertex, scattered)
         beyond = dr.select(at.ends, mi.UInt32(self.bdd), vertex) + 1
         if self.queries.narrow is not None:
             narrow = ~at.ends & lookup(self.queries.narrow, at.bsdf, mi.Bool, scattered)
@@ -380,6 +387,8 @@ def trace_camera_paths(
     In media, paths scatter until they have left `bdd` smooth vertices behind, those in media among
     them, with direct light at each. From there they go straight on to the next surface; what light
     they lack is that of volume photons along that way, and of caustic ones along the way before.
+    With `weights` all of these count along all of the way: the number of the segment's last vertex,
+    and the state of the weights before it, are kept with each beam (`beam_weights`).
     Where `queries` have room for beams, of each kind, `vertices` have two entries more, `beams`
     (see `beams.new_beams`) and `beam_count`, how many of one kind wanted a place.
 
@@ -399,4 +408,6 @@ def trace_camera_paths(
     if queries.beams:
         count = functools.reduce(dr.maximum, store.beam_count.values())
         store.vertices |= {"beams": store.beams, "beam_count": count}
+        if weights is not None:
+            store.vertices["beam_weights"] = store.beam_weights
     return radiance, alpha, splat, store.vertices, store.count

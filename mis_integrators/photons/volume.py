@@ -91,19 +91,27 @@ class Box:
 
 class VolumeMap:
     """Sorted volume photons: their `box`, a `grid` over it, `start` (first photon of each table
-    entry), `place` and `power`."""
+    entry), `place` and `power`. Under weights there are also `mis_words`, as light sub-paths have
+    left them, and for each sorted photon its `number` among them."""
 
-    def __init__(self, box, grid, start, place, power):
+    def __init__(self, box, grid, start, place, power, mis_words=None, number=None):
         self.box, self.grid, self.start, self.place, self.power = box, grid, start, place, power
+        self.mis_words, self.number = mis_words, number
 
     def arrays(self):
         """What a recorded function can take; `with_grid` makes the map of it again."""
-        names = "start", "place", "power"
+        names = ["start", "place", "power"]
+        if self.mis_words is not None:
+            names += ["mis_words", "number"]
         return {
             **{name: getattr(self, name) for name in names},
             "low": self.box.min,
             "high": self.box.max,
         }
+
+    def place_of_mis_words(self, index, active):
+        """Where among the `mis_words` those of photon `index` are."""
+        return dr.gather(mi.UInt32, self.number, index, active)
 
     @classmethod
     def with_grid(cls, arrays, radius, capacity: int):
@@ -120,8 +128,9 @@ def volume_grid(box, radius, capacity):
     return Grid(box, dr.maximum(CELL * radius, extent / (longest_row(size) - 8)), size)
 
 
-def build_volume_map(place, power, count, radius, capacity: int):
-    """Sorts volume photons into a grid over the box that holds them all."""
+def build_volume_map(place, power, count, radius, capacity: int, mis_words=None):
+    """Sorts volume photons into a grid over the box that holds them all. `mis_words` (None: there
+    are none) stay unsorted."""
     index = dr.arange(mi.UInt32, capacity)
     active = index < dr.gather(mi.UInt32, count, 0)
     record = place_layout().read(place, index, active)
@@ -135,8 +144,12 @@ def build_volume_map(place, power, count, radius, capacity: int):
     sorted_place = place_layout().room(capacity)
     place_layout().write(sorted_place, record, target, active)
     sorted_power = power_layout().move(power, index, target, active)
-    dr.eval(sorted_place, sorted_power)
-    return VolumeMap(box, grid, start, sorted_place, sorted_power)
+    number = None
+    if mis_words is not None:
+        number = dr.empty(mi.UInt32, capacity)
+        dr.scatter(number, index, target, active)
+    dr.eval(sorted_place, sorted_power, number)
+    return VolumeMap(box, grid, start, sorted_place, sorted_power, mis_words, number)
 
 
 def _extreme(reduce, values, active, neutral):

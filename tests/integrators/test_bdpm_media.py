@@ -304,6 +304,14 @@ def test_hiding_emitters_is_refused(rgb):
     assert last_words(error.value).startswith(words)
 
 
+@pytest.mark.parametrize("plugin", ["bdpm_opt", "bdpm_opt2", "bdpm_opt3"])
+def test_optimal_weights_refuse_media(rgb, plugin):
+    with pytest.raises(Exception) as error:
+        mi.render(fog_scene(homogeneous()), integrator=mi.load_dict({"type": plugin}), spp=16)
+    words = f"{plugin}: participating media are not supported by this surface integrator"
+    assert last_words(error.value).startswith(words)
+
+
 def test_flakes_are_refused(rgb):
     flakes = np.broadcast_to(np.float32([0.9, 0.1, 0.2, 0, 0, 0]), (2, 2, 2, 6))
     phase = {"type": "sggx", "S": {"type": "gridvolume", "grid": mi.VolumeGrid(flakes.copy())}}
