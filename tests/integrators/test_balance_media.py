@@ -256,9 +256,10 @@ def weights_found(paths, strategies, beta, straight):
         ("M", 2, 1, "area"),
         ("MM", 2, 1, "point"),
         ("SM", 3, 2, "area"),
-        ("MMS", 3, 1, "area"),
+        ("MMMM", 3, 1, "area"),
         ("MSMM", 3, 1, "point"),
         *extended(
+            ("MMS", 3, 1, "area"),
             ("MM", 3, 1, "area"),
             ("MS", 2, 2, "area"),
             ("SMM", 2, 1, "area"),
