@@ -217,7 +217,7 @@ class BDPMSession(PilotedSession):
             and (self.has_caustics or depth < 0 or depth >= integrator.bdd + 2)
         )
         self.narrow = None
-        if integrator.pass_narrow and self.has_indirect and not self.traits.has_media:
+        if integrator.pass_narrow and self.has_indirect:
             self.narrow = narrow_bsdfs(scene)
         self.one_vertex = not self.traits.has_mixed and (
             (integrator.bdd == 0 and self.narrow is None) or not self.has_caustics

@@ -313,7 +313,7 @@ class SmallRadius(SmallRadiusBatches):
         self.sessions = [mi.load_dict(p).session(scene, seed=1, spp=0) for p in plugins]
 
 
-USUAL = ("glass", 3), ("coloured", 2)
+USUAL = (("glass", 3),)
 ALL = [(name, strategies) for strategies in (2, 3) for name in sorted(SCENES)]
 
 
@@ -324,6 +324,9 @@ def test_agrees_with_volpath(rgb, name, strategies):
     scene, visible = SCENES[name](), (0.02, 0.06)
     if name in ("sky", "sun"):
         visible = (0.05, 0.15)
+    if name in ("sensor within", "lens within"):
+        # All pixels share the photons that are close to the sensor, which have most of the weight.
+        visible = (0.1, 0.3)
     mine = SmallRadius(scene, strategies)
     oracle = PathBatches(volpath(max_depth=6), scene, 2, 512)
     assert_same(*collect_until(mine, oracle, *visible, most=600), *visible, slack=SLACK)

@@ -80,7 +80,7 @@ def agree_with_volpath(scene, max_depth=6, whole=0.02, block=0.06, **parameters)
     assert_same(*collect_until(mine, oracle, whole, block, most=600), whole, block, slack=SLACK)
 
 
-USUAL = ("pockets", 0), ("coloured", 0), ("mask", 0), ("coloured", 1), ("glass", 2)
+USUAL = ("pockets", 0), ("mask", 0), ("coloured", 1), ("glass", 2)
 """Of `SCENES` and values of `bdd`, one of each kind."""
 ALL = [(name, bdd) for bdd in (0, 1, 2) for name in sorted(SCENES)]
 
@@ -129,6 +129,16 @@ def test_depth_is_that_of_volpath(rgb, max_depth, bdd):
     agree_with_volpath(scene, max_depth, whole=0.02, block=0.05, bdd=bdd)
 
 
+@pytest.mark.parametrize("bdd", extended(0, 1))
+def test_narrow_lobes_are_passed(rgb, bdd):
+    """Smooth metal in fog: paths go on, straight or not, and what is between it and the next vertex
+    counts once."""
+    metal = {"type": "roughconductor", "material": "Al", "alpha": 0.08}
+    scene = fog_scene(homogeneous(0.7), ball=ball(metal, 0.7, exterior=FOG))
+    assert bdpm(bdd=bdd).session(scene, spp=0).narrow is not None
+    agree_with_volpath(scene, bdd=bdd, direct_paths=3)
+
+
 def test_light_through_a_half_transparent_ceiling(rgb):
     """Half of what the floor gets comes through a mask, from a sky that camera paths meet as often
     as next-event estimation finds it."""
@@ -153,9 +163,11 @@ def test_coverage_is_that_of_volpath(rgb, bdd):
     ]
     right = np.array(mi.render(scene, integrator=volpath(max_depth=6), spp=4096))[:, :, 3:]
     assert np.count_nonzero((right > 0.2) & (right < 0.9)) > 50
-    # 4096 samples of zero or one: 0.008 at most; five times that, over 256 pixels.
-    assert np.abs(mine - right).max() < 0.04
-    assert abs(mine.mean() - right.mean()) < 2e-3
+    # 4096 samples of zero or one: 0.008 at most, and twice that with the channels' weights; five
+    # times that, over 256 pixels.
+    noise = 0.016 if bdd else 0.008
+    assert np.abs(mine - right).max() < 5 * noise
+    assert abs(mine.mean() - right.mean()) < noise / 4
 
 
 # --- Closed forms -------------------------------------------------------------
