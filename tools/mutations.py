@@ -41,6 +41,9 @@ FOG = "tests/integrators/test_bdpt_media.py"
 RIS_FOG = "tests/integrators/test_bdpt_ris_media.py"
 RIS = "tests/integrators/test_bdpt_ris.py"
 BALANCE = "tests/integrators/test_balance.py"
+BALANCE_MEDIA = "tests/integrators/test_balance_media.py"
+MEDIA = "tests/integrators/test_bdpm_media.py"
+BEAMS = "tests/photons/test_beams.py"
 OPTIMAL = "tests/integrators/test_weights_in_renders.py"
 ANALYTIC = "tests/integrators/test_analytic.py"
 LONG = "tests/app/test_long_renders.py"
@@ -377,6 +380,42 @@ MUTATIONS = [
         "density = dr.select(on_surface, density, density)",
         "views share surfaces without the cosine at which they see them",
         f"{VIEWS}::test_views_on_both_sides_of_a_surface {VIEWS}::test_surfaces",
+    ),
+    # ------------------------------------------------------------------ photons in media
+    Mutation(
+        "photons/queries.py",
+        "unseen = met | at.scatters if self.flies else met",
+        "unseen = met",
+        "direct light in media counts as if the paths for direct light saw it",
+        f"{MEDIA}::test_agrees_with_volpath",
+    ),
+    Mutation(
+        "photons/beams.py",
+        "even = active & long & medium.is_homogeneous()",
+        "even = active & medium.is_homogeneous()",
+        "short beams lose light that their length has lost before",
+        f"{BEAMS}::test_short_beams_take_caustic_photons_only",
+    ),
+    Mutation(
+        "photons/trace.py",
+        '"caustic": at.had_delta & ~at.scattered,',
+        '"caustic": at.had_delta,',
+        "light that has scattered before counts as caustic, too",
+        f"{MEDIA}::test_classes_of_light_are_those_of_bdpt",
+    ),
+    Mutation(
+        "mis/heuristic.py",
+        "return dr.select(in_medium(n), density * dr.rcp(self.volume_share), value)",
+        "return dr.select(in_medium(n), density, value)",
+        "merge disks in media have the area of those on surfaces",
+        f"{BALANCE_MEDIA}::test_weights_are_veachs",
+    ),
+    Mutation(
+        "mis/heuristic.py",
+        "before = dr.select(in_medium(ref.n), 1 + before, before)",
+        "pass",
+        "next-event estimation in media forgets the photons of the same light",
+        f"{BALANCE_MEDIA}::test_weights_of_a_path_sum_to_one",
     ),
     # ------------------------------------------------------------------ core
     Mutation(

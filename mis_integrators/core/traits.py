@@ -261,7 +261,7 @@ def check_scene(scene, sensor, plugin, media=False):
     if not media and has_media(scene, sensor):
         raise UnsupportedScene(
             f"{plugin}: participating media are not supported by this surface integrator; use "
-            '"bdpt", "bdpm" or "volpath"'
+            '"bdpt", "bdpm", "bdpm_balance" or "volpath"'
         )
     check_emitters(scene, plugin)
     if mi.has_flag(sensor.film().flags(), mi.FilmFlags.Special):

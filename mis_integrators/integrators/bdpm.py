@@ -119,10 +119,11 @@ class BDPM(IterativeIntegrator):
     light of two or more segments, and caustics, which next-event estimation cannot make. The number
     of iterations is the number of samples per pixel over ``camera_paths``.
 
-    In scenes with participating media, which need ``bdd`` 0, light sub-paths scatter in these, too,
-    and leave volume photons there; a camera path goes straight on to the first smooth surface, and
-    gathers the volume photons along its way (Jarosz et al. 2008, the beam radiance estimate). They
-    carry all light that media scatter, their single scattering included.
+    In participating media light sub-paths scatter, too, and leave volume photons there. Vertices in
+    media count for ``bdd``. From its last vertex before the ``bdd``-th on, a camera path goes
+    straight on to the next smooth surface, and gathers the volume photons along its way (Jarosz et
+    al. 2008, the beam radiance estimate). They carry all light that media scatter there, their
+    single scattering included.
 
     The estimate is consistent: its bias vanishes with the radius. Polarised variants, gradients and
     the film ``specfilm`` are refused by name; in media also phase functions of flakes and
@@ -156,11 +157,6 @@ class BDPM(IterativeIntegrator):
             raise UnsupportedScene(
                 f'{self.plugin}: parameter "hide_emitters" is not supported in scenes with '
                 'participating media; use "volpath"'
-            )
-        if self.bdd:
-            raise UnsupportedScene(
-                f'{self.plugin}: parameter "bdd" = {self.bdd} is not supported in scenes with '
-                "participating media, where only 0 is"
             )
 
     def read_parameters(self, parameters):
@@ -216,10 +212,12 @@ class BDPMSession(PilotedSession):
         )
         self.has_indirect = not self.lights.dark and (depth < 0 or depth >= integrator.bdd + 3)
         self.has_volume = (
-            self.traits.has_media and not self.lights.dark and (depth < 0 or depth >= 2)
+            self.traits.has_media
+            and not self.lights.dark
+            and (self.has_caustics or depth < 0 or depth >= integrator.bdd + 2)
         )
         self.narrow = None
-        if integrator.pass_narrow and self.has_indirect and not self.traits.has_media:
+        if integrator.pass_narrow and self.has_indirect:
             self.narrow = narrow_bsdfs(scene)
         self.one_vertex = not self.traits.has_mixed and (
             (integrator.bdd == 0 and self.narrow is None) or not self.has_caustics
@@ -464,7 +462,10 @@ class BDPMSession(PilotedSession):
         if self.traits.has_media:
             *photons, in_media = photons
             if kind == "volume":
-                return build_volume_map(*in_media, radius, self.volume_capacity)
+                place, power, count, *mis_words = in_media
+                return build_volume_map(
+                    place, power, count, radius, self.volume_capacity, *mis_words
+                )
         mis_words = photons[3] if kind == "indirect" and len(photons) > 3 else None
         return build_photon_map(
             *photons[:3],

@@ -36,7 +36,8 @@ class BDPMBalance(WeightedBDPM):
     compare it with: each light path is shared among the strategies that can make it in proportion
     to the densities with which they do (Veach 1997, equations 9.8 and 9.13; densities of merges as
     Georgiev et al. 2012 have them). That camera paths share their photons, whose noise they do not
-    average out, is outside that theory.
+    average out, is outside that theory. In participating media volume photons are merged along each
+    segment of a camera path, as :monosp:`bdpm` does along one.
 
     .. tabs::
         .. code-tab:: xml
@@ -52,6 +53,7 @@ class BDPMBalance(WeightedBDPM):
     """
 
     bdd = 0
+    MEDIA = True
 
     def read_parameters(self, parameters):
         self.read_photon_parameters(parameters)
@@ -82,15 +84,23 @@ class BDPMBalanceSession(WeightedSession):
             merge_settings["caustic_share"],
             integrator.strategies,
             beta,
+            merge_settings.get("volume_share"),
         )
 
     def merge_settings(self, radii):
-        radius = radii.get("indirect", radii.get("caustic"))
+        radius = radii.get("indirect", radii.get("caustic", radii.get("volume")))
         both = {"caustic", "indirect"} <= radii.keys()
+        of_volume = {}
+        if self.traits.has_media:
+            of_volume["volume_share"] = dr.square(radii.get("volume", radius) / radius)
         return {
             "disk_paths": dr.pi * dr.square(radius) * self.light_path_count,
             "caustic_share": dr.square(radius / radii["caustic"]) if both else mi.Float(1),
+            **of_volume,
         }
+
+    def beam_weigher(self, weights, beams, state, photon_map):
+        return weights.beam_weigher(beams, state, photon_map)
 
     def weigher(self, weights, kind, level, vertices, photon_map):
         return weights.weigher(kind, level, vertices, photon_map)

@@ -5,7 +5,9 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from ..photons.queries import STATE, query_layout, read_queries
+from ..core.recording import lanes
+from ..photons.beams import Beams, beam_layout, gather_along
+from ..photons.queries import STATE, query_layout, read_queries, weight_layout
 from .bdpm import BDPM, BDPMSession
 
 
@@ -86,6 +88,11 @@ class WeightedSession(BDPMSession):
 
         return weigh
 
+    def beam_weigher(self, weights, beams, state, photon_map):
+        """What weighs volume photons along beams (`weigh` of `gather_along`), whose paths arrive
+        with that `state` of the weights."""
+        raise TypeError(f"{type(self).__name__} does not define beam_weigher")
+
     def _run_pilot(self):
         """The weights are made before the pilot or after it, see `weighted_pilot`."""
         if self.weighted_pilot:
@@ -119,7 +126,7 @@ class WeightedSession(BDPMSession):
         return spectral
 
     def _light_state(self, spectral):
-        if not (self._weighted and self.has_indirect):
+        if not (self._weighted and (self.has_indirect or self.has_volume)):
             return None
         return self.weights(spectral["merge_settings"]).light_state()
 
@@ -129,6 +136,8 @@ class WeightedSession(BDPMSession):
     def _gather(self, photon_map, vertices, kind, radii, spectral, grey=False):
         if not self._weighted:
             return super()._gather(photon_map, vertices, kind, radii, spectral, grey)
+        if kind == "volume":
+            return self._gather_weighted_along(photon_map, vertices, radii, spectral, grey)
         if kind == "caustic":
             record = read_queries(vertices)
             return self._merge_weighted(photon_map, record, kind, None, radii, spectral, grey)
@@ -145,6 +154,25 @@ class WeightedSession(BDPMSession):
                 dr.scatter(total, values, dr.arange(mi.UInt32, section) + first)
         dr.eval(totals)
         return totals
+
+    def _gather_weighted_along(self, photon_map, vertices, radii, spectral, grey):
+        """`gather_along` of all beams, weighted."""
+        beams = Beams.read(vertices["beams"], spectral["wavelengths"])
+        record = weight_layout().read(
+            vertices["beam_weights"], lanes(beam_layout().capacity(vertices["beams"]))
+        )
+        weights = self.weights(spectral["merge_settings"])
+        state = [record[name] for name in STATE]
+        return gather_along(
+            photon_map,
+            beams,
+            radii,
+            self.light_path_count,
+            self.integrator.max_depth,
+            grey,
+            self.integrator.splits_light,
+            self.beam_weigher(weights, beams, state, photon_map),
+        )
 
     def _merge_weighted(self, photon_map, record, kind, level, radii, spectral, grey):
         """`_merge` at the vertices of one strategy, weighted."""

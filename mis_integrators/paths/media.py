@@ -124,7 +124,7 @@ def transmittance(scene, traits, ray, medium, rng, active):
 
 
 @dr.syntax
-def fly(scene, traits, ray, medium, draws, active):
+def fly(scene, traits, ray, medium, draws, active, keep=None):
     """Moves rays through media and boundaries with the plain BSDF `null` to where they scatter or
     meet another surface.
 
@@ -132,6 +132,11 @@ def fly(scene, traits, ray, medium, draws, active):
     surface (of those that scatter: none, at the distance of the collision), the ray that leads
     there, the medium at its end, whether it scatters there, and what throughput is multiplied with:
     albedo and null collisions.
+
+    `keep`, if given, is called as that of `pass_straight` for each piece of the way from one
+    tentative collision to the next, with the weight so far in place of the share of light, which is
+    constant along the piece: flights that get as far as a point have that share as their mean
+    weight there.
     """
     ray = mi.Ray3f(ray)
     medium = mi.MediumPtr(medium)
@@ -142,11 +147,15 @@ def fly(scene, traits, ray, medium, draws, active):
     weight = mi.Spectrum(1)
     scatters = mi.Bool(False)
     passed = mi.Float(0)
+    normal = None if keep is None else mi.Normal3f(0, 0, 1)
     fresh = mi.Bool(True)  # the next surface is not known yet
     scattering = int(mi.BSDFFlags.Delta) | int(mi.BSDFFlags.Smooth)  # Null among them
     while dr.hint(flying, label="free flight"):
         look = flying & fresh
         hit[look] = scene.ray_intersect_preliminary(ray, coherent=False, active=look)
+        if dr.hint(keep is not None, mode="scalar"):
+            look &= hit.is_valid()
+            normal[look] = hit.compute_surface_interaction(ray, mi.RayFlags.Minimal, look).n
         fresh = mi.Bool(False)
 
         # ---- Media
@@ -156,6 +165,13 @@ def fly(scene, traits, ray, medium, draws, active):
         near, far, majorant = section(medium, stretch, inside)
         t = dr.maximum(near, passed) - dr.log(1 - flight) * dr.rcp(dr.maximum(majorant, 1e-30))
         collided = inside & (majorant > 0) & (t < far)
+        if dr.hint(keep is not None, mode="scalar"):
+            start = dr.maximum(near, passed)
+            length = dr.minimum(dr.minimum(t, far), LONGEST) - start
+            begin = mi.Ray3f(ray)
+            begin.o = ray(start)
+            piece = inside & (majorant > 0) & (length > 0)
+            keep(begin, medium, length, weight, normal, hit.t - start, piece)
         null, real, probability = collision(
             medium, ray(t), majorant, ray.time, ray.wavelengths, collided, -ray.d
         )
@@ -303,6 +319,18 @@ def next_hit_straight_on(scene, traits, ray, flight, numbers, keep, active):
         scene, traits, ray, medium, numbers.at(FLIGHT + number), keep, active
     )
     return hit, ray, [medium, number + 1, scatters], kept
+
+
+def next_hit_either(scene, traits, ray, flight, numbers, keep_flown, keep_straight, flies, active):
+    """As `next_hit` on the lanes `flies`, as `next_hit_straight_on` on the others, each with a
+    `keep` of its own; in place of the throughput, its factor."""
+    medium, number, _ = flight
+    draws = numbers.at(FLIGHT + number)
+    flown = fly(scene, traits, ray, medium, draws, active & flies, keep_flown)
+    straight = pass_straight(scene, traits, ray, medium, draws, keep_straight, active & ~flies)
+    hit, ray, medium = (dr.select(flies, a, b) for a, b in zip(flown[:3], straight[:3]))
+    _, _, _, scatters, weight = flown
+    return hit, ray, [medium, number + 1, scatters], dr.select(flies, weight, straight[3])
 
 
 def interaction_at(hit, ray, scatters, active):

@@ -53,6 +53,38 @@ class Sides:
         return dr.select(dr.dot(n, d) > 0, self.above, self.below)
 
 
+class PhaseOrBSDF:
+    """What scatters at vertices, with the methods of a BSDF that weights call: the `bsdf` of the
+    surface, or on the lanes `scatters` the phase function of the `medium`."""
+
+    def __init__(self, bsdf, medium, scatters):
+        self.bsdf, self.medium, self.scatters = bsdf, medium, scatters
+
+    @classmethod
+    def at(cls, at):
+        """Where sub-paths have arrived (`CameraArrival`, `LightArrival`); in scenes without media
+        the BSDF itself."""
+        return at.bsdf if at.scatters is None else cls(at.bsdf, at.medium, at.scatters)
+
+    def _phase(self, si, wo, inside):
+        sides = Sides(self.medium, self.medium, si.p, si.wavelengths)
+        value, pdf, _ = phase_f_and_pdfs(sides, si.to_world(si.wi), si.to_world(wo), inside)
+        return value, pdf
+
+    def eval_pdf(self, context, si, wo, active=True):
+        """Value (on surfaces times the cosine) and density per solid angle."""
+        inside = active & self.scatters
+        value, pdf = self.bsdf.eval_pdf(context, si, wo, active & ~self.scatters)
+        phase, phase_pdf = self._phase(si, wo, inside)
+        return dr.select(inside, phase, value), dr.select(inside, phase_pdf, pdf)
+
+    def pdf(self, context, si, wo, active=True):
+        """Density per solid angle."""
+        inside = active & self.scatters
+        pdf = self.bsdf.pdf(context, si, wo, active & ~self.scatters)
+        return dr.select(inside, self._phase(si, wo, inside)[1], pdf)
+
+
 class VertexBSDF:
     """A vertex, seen from one side of it. In a medium (without a normal, see `in_medium`) the phase
     function is the BSDF, and there is no cosine.

@@ -2,9 +2,16 @@
 way through media at once (Jarosz, Zwicker and Jensen 2008, The beam radiance estimate for
 volumetric photon mapping).
 
-A camera path goes straight through media (`paths.media.pass_straight`). Its pieces there are stored
-as beams. Photons within the radius of a beam count by a constant kernel on the disk across the
-beam, times the phase function and the share of light that gets from the photon to the camera.
+The pieces of a camera path's way through media are stored as beams. Photons within the radius of a
+beam count by a constant kernel on the disk across the beam, times the phase function and the share
+of light that gets from the photon to the camera. There are two kinds of beams (Jarosz et al. 2011,
+A comprehensive theory of volumetric radiance estimation using photon points and beams):
+
+- long ones, where a path goes straight on to the next surface (`paths.media.pass_straight`): the
+  share of light is computed. All photons count.
+- short ones, where a path may scatter on the way (`paths.media.fly`): they end there, and that a
+  path gets as far as a photon has the share as its probability. Only caustic photons count: what
+  other light there is, the path finds from where it scatters.
 """
 
 from __future__ import annotations
@@ -24,14 +31,20 @@ from .grid import Query, longest_row, visit_hits
 from .photon import read_power
 from .volume import number_of_medium, read_place
 
+SHORT, LONG = 0, 1 << 31
+"""Bit of a beam's depth that tells its kind."""
+FIRST = 1 << 30
+"""Bit that says that the path has scattered smoothly nowhere before."""
+LEVEL_SHIFT = 27
+"""Where under weights the three bits of the number of smooth vertices before begin."""
 SLACK = 2e-3
 """Cells that queries reach beyond the radius, for rounding."""
 
 
 def beam_layout():
     """Fields of a beam: its ray, `length`, the path's throughput at its beginning, the number of
-    the path, its depth in segments with this one, the medium, and the surface that its ray meets:
-    packed geometric `normal`, and distance (infinite: none)."""
+    the path, its depth in segments with this one (with `LONG` and `FIRST`), the medium, and the
+    surface that its ray meets: packed geometric `normal`, and distance (infinite: none)."""
     return Layout(
         {
             "o": mi.Point3f,
@@ -60,7 +73,8 @@ def read_beams(words):
 @dataclass
 class Beams:
     """Beams of a buffer (`new_beams`), one a lane: the fields of `beam_layout`, which are `active`,
-    and the `extinction` by which light falls along them (zero in heterogeneous media)."""
+    `long` and `first`, under weights their `level`, and the `extinction` by which light falls along
+    them (zero for short ones and in heterogeneous media)."""
 
     o: mi.Point3f
     d: mi.Vector3f
@@ -72,6 +86,9 @@ class Beams:
     normal: mi.Vector3f
     surface: mi.Float
     active: mi.Bool
+    long: mi.Bool
+    first: mi.Bool
+    level: mi.UInt32
     extinction: mi.Spectrum
     wavelengths: mi.Float
 
@@ -82,13 +99,22 @@ class Beams:
         active = dr.max(record["throughput"]) > 0
         medium = dr.select(active, record["medium"], dr.zeros(mi.MediumPtr))
         at_start = point_in(medium, record["o"], mi.Float(0), wavelengths, -record["d"])
-        even = active & medium.is_homogeneous()
+        long, first = (record["depth"] & LONG) != 0, (record["depth"] & FIRST) != 0
+        even = active & long & medium.is_homogeneous()
         _, _, sigma_t = medium.get_scattering_coefficients(at_start, even)
         extinction = dr.select(even, sigma_t, 0)
         normal = dr.normalize(unpack_direction(record["normal"]))
         normal = dr.mulsign(normal, -dr.dot(normal, record["d"]))
-        record |= {"medium": medium, "normal": normal}
-        return cls(**record, active=active, extinction=extinction, wavelengths=wavelengths)
+        level = (record["depth"] >> LEVEL_SHIFT) & 7
+        record["depth"] &= (1 << LEVEL_SHIFT) - 1
+        record |= {"medium": medium, "normal": normal, "long": long, "first": first}
+        record |= {"level": level, "extinction": extinction}
+        return cls(**record, active=active, wavelengths=wavelengths)
+
+    def takes(self, landing, all_kinds=False):
+        """Whether photons (`VolumeLanding`) are of a kind that counts, in the beams' own medium."""
+        own = landing.medium == number_of_medium(self.medium)
+        return own if all_kinds else own & (self.long | landing.caustic)
 
     def before_surface(self, p):
         """Whether points lie on the camera's side of the surface that ends the way: on that of its
@@ -98,13 +124,10 @@ class Beams:
 
     def phase(self, p, towards, active):
         """The phase function [1/sr] at points `p`, for light from `towards` that goes on to the
-        camera."""
+        camera, and its density."""
         medium = dr.select(active, self.medium, dr.zeros(mi.MediumPtr))
         mei = point_in(medium, p, mi.Float(0), self.wavelengths, -self.d)
-        value, _ = medium.phase_function().eval_pdf(
-            mi.PhaseFunctionContext(None), mei, towards, active
-        )
-        return value
+        return medium.phase_function().eval_pdf(mi.PhaseFunctionContext(None), mei, towards, active)
 
 
 class BeamQuery(Query):
@@ -220,33 +243,40 @@ def _within(low, high, beams):
     return begin, end
 
 
-def gather_along(photon_map, beams, radii, light_path_count, max_depth, grey=False, marked=False):
+def gather_along(
+    photon_map, beams, radii, light_path_count, max_depth, grey=False, marked=False, weigh=None
+):
     """Radiance that volume photons bring to camera paths along beams, for each radius of a list:
     the sum over photons of phase function x flux x transmittance to the beam's beginning, over
     (pi radius^2 x light sub-paths) (Jarosz et al. 2008, with a constant kernel).
 
-    Parameters and result are those of `gather.gather_photons`. Photons count for beams in their own
-    medium only, and not behind the surface that ends the beam.
+    Parameters and result are those of `gather.gather_photons`, but for ``weigh(index, pdf,
+    active)``: the weight (a number) of a photon to which camera paths would go on with density
+    `pdf`. Photons count for beams in their own medium only, not behind the surface that ends the
+    beam, and for short beams, unless they are weighed, only caustic ones.
     """
     query = BeamQuery(photon_map, beams, radii[-1])
-    own_medium = number_of_medium(beams.medium)
     split = marked and not grey
 
     def visit(index, landing, offset, distance_squared, hit, totals):
-        hit &= (landing.medium == own_medium) & beams.before_surface(landing.p)
+        hit &= beams.takes(landing, weigh is not None) & beams.before_surface(landing.p)
         if max_depth > 0:
             hit &= landing.depth + beams.depth <= max_depth
         flux, towards = read_power(photon_map.power, index, hit)
         if marked:
             flux, delta_at_light = read_mark(flux)
         along = query.skipped + dr.dot(offset, query.d)
-        value = flux * beams.phase(landing.p, dr.normalize(towards), hit)
+        phase, pdf = beams.phase(landing.p, dr.normalize(towards), hit)
+        value = flux * phase
+        if weigh is not None:
+            value *= dr.select(hit, weigh(index, pdf, hit), 0)
         value *= dr.exp(-beams.extinction * along)
         if grey:
             value = channel_mean(value * beams.throughput)
         values = [value]
         if split:
-            smooth = dr.select(landing.depth == 1, mi.UInt32(1), mi.UInt32(2))
+            alone = (landing.depth == 1) & beams.first
+            smooth = dr.select(alone, mi.UInt32(1), mi.UInt32(2))
             values = by_class(class_of(smooth, delta_at_light), value)
         inside = [hit & (distance_squared < dr.square(radius)) for radius in radii]
         found = [dr.select(i, value, 0) for i in inside for value in values]
@@ -262,14 +292,13 @@ def gather_along(photon_map, beams, radii, light_path_count, max_depth, grey=Fal
 
 
 def mean_count_along(photon_map, beams, radius, paths):
-    """Photons within `radius` of the beams of a camera path, on average over `paths` of them (a
-    number)."""
+    """Photons within `radius` of the beams of a camera path that count there, on average over
+    `paths` of them (a number)."""
     query = BeamQuery(photon_map, beams, radius)
-    own_medium = number_of_medium(beams.medium)
     (count,) = visit_hits(
         query,
         lambda index, landing, offset, distance_squared, hit, counts: (
-            counts[0] + dr.select(hit & (landing.medium == own_medium), mi.UInt32(1), 0),
+            counts[0] + dr.select(hit & beams.takes(landing), mi.UInt32(1), 0),
         ),
         (mi.UInt32(0),),
     )

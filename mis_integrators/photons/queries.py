@@ -3,6 +3,7 @@ are to be gathered."""
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,11 +18,15 @@ from ..core.traits import lookup
 from ..lights.lights import mis_power
 from ..paths.camera import trace_camera, whole_or_nothing
 from ..paths.light_classes import class_of, scattered_history, start_of_camera_path
-from ..paths.media import direct_light, next_hit_straight_on
+from ..paths.media import (
+    direct_light,
+    next_hit_either,
+    next_hit_straight_on,
+)
 from ..paths.setting import CameraPass, Limits, ListedPass, World
-from ..paths.subpaths import selected
-from ..paths.vertex import Sides
-from .beams import beam_layout, new_beams
+from ..paths.subpaths import selected, smooth_at
+from ..paths.vertex import PhaseOrBSDF, Sides
+from .beams import FIRST, LEVEL_SHIFT, LONG, SHORT, beam_layout, new_beams
 
 LAST_VERTEX = 1 << 31
 """Bit of a vertex' depth that says that all photons are wanted there, else only caustic ones."""
@@ -97,7 +102,7 @@ class Queries:
     `bdd`: the last smooth camera vertex, counted from 0; `capacity`: vertices that there is room
     for (under weights, in each section); `has_caustics`, `has_indirect`: kinds of photons that
     there are; `one_vertex`: no path asks twice, and each owns the place of its number; `beams`: how
-    many beams through media there is room for (0: none are kept); `narrow`: a registry table of
+    many beams of each kind there is room for (0: none are kept); `narrow`: a registry table of
     BSDFs at which none but caustic photons are gathered, and which the `bdd` does not count (None:
     there are none).
     """
@@ -122,7 +127,10 @@ class QueryVisitor:
     function; the density of the last smooth scattering; the last smooth vertex; the weight of
     direct light there; how many times light counts that is found there; the state of `weights`;
     with `classes` what these carry along; and in scenes with media the share of light that has got
-    through these, straight on.
+    through these without being scattered.
+
+    In media, paths scatter until they have left `bdd` smooth vertices behind, and go straight on
+    from there.
     """
 
     def __init__(self, world, limits, queries, weights, first, beyond, classes):
@@ -138,13 +146,21 @@ class QueryVisitor:
             ),
             count=dr.zeros(mi.UInt32, self.sections),
         )
+        self.flies = self.traits.has_media and self.bdd > 0
         # Half transparent boundaries are none for the light that is met beyond the last vertex.
         self.passes_masks = self.traits.has_media and self.traits.has_null_vertices
         self.deepest = limits.max_depth - 1 if limits.max_depth > 0 else None
+        self.kinds = [LONG]
+        if self.flies and (queries.has_caustics or weights is not None):
+            self.kinds.append(SHORT)
         if queries.beams:
-            self.store.beams = new_beams(queries.beams)
+            room = len(self.kinds) * queries.beams
+            self.store.beams = new_beams(room)
+            if weights is not None:
+                self.store.beam_weights = weight_layout().room(room)
             self.store.beam_room = dr.opaque(mi.UInt32, queries.beams)
-            self.store.beam_count = dr.zeros(mi.UInt32, 1)
+            # One each: what a loop has counted up, no other one can within the same iteration.
+            self.store.beam_count = {kind: dr.zeros(mi.UInt32, 1) for kind in self.kinds}
 
     def begin(self, n_paths, splat, aperture):
         sums = [] if self.weights is None else self.weights.init(n_paths)
@@ -157,25 +173,45 @@ class QueryVisitor:
 
     def travel(self, state, ray, flight, numbers, throughput, path, depth, active):
         *others, clear = state
-        keep = self._keep_beams(state[0], throughput, path, depth + 1)
-        hit, ray, flight, kept = next_hit_straight_on(
-            self.scene, self.traits, ray, flight, numbers, keep, active
-        )
+        keep = self._keep_beams(state, throughput, path, depth + 1, LONG)
+        if self.flies:
+            keep_short = None
+            if SHORT in self.kinds:
+                keep_short = self._keep_beams(state, throughput, path, depth + 1, SHORT)
+            flies = state[0] < self.bdd
+            hit, ray, flight, kept = next_hit_either(
+                self.scene, self.traits, ray, flight, numbers, keep_short, keep, flies, active
+            )
+        else:
+            hit, ray, flight, kept = next_hit_straight_on(
+                self.scene, self.traits, ray, flight, numbers, keep, active
+            )
         return [*others, [clear[0] * kept]], hit, ray, flight, throughput * kept
 
-    def _keep_beams(self, vertex, throughput, path, depth):
-        """What keeps the beams of paths before their first smooth vertex (see `pass_straight`)."""
+    def _keep_beams(self, state, throughput, path, depth, kind):
+        """What keeps the beams of paths (see `pass_straight`, `fly`): long ones after `bdd` smooth
+        vertices, short ones before."""
         if not self.queries.beams:
             return lambda *piece: None
-        store, wanted = self.store, vertex == 0
+        store, wanted = self.store, mi.Bool(True)
+        if kind == LONG:
+            wanted &= state[0] == self.bdd
         if self.deepest is not None:
             wanted &= mi.Int32(depth) <= self.deepest
+        depth = depth | mi.UInt32(kind)
+        stored = {}
+        if self.weights is not None:
+            depth |= state[0] << LEVEL_SHIFT
+            stored = dict(zip(STATE, self.weights.stored(state[7])), share=mi.Spectrum(1))
+        if self.classes is not None:
+            depth |= dr.select(state[8][0] == 0, mi.UInt32(FIRST), 0)
 
         def keep(start, medium, length, kept, normal, surface, mask):
             light = throughput * kept
             mask = mask & wanted & (dr.max(light) > 0)
-            slot = dr.scatter_inc(store.beam_count, mi.UInt32(0), mask)
+            slot = dr.scatter_inc(store.beam_count[kind], mi.UInt32(0), mask)
             mask &= slot < store.beam_room
+            slot += self.kinds.index(kind) * self.queries.beams
             beam = {
                 "o": start.o,
                 "d": start.d,
@@ -188,6 +224,8 @@ class QueryVisitor:
                 "surface": surface,
             }
             beam_layout().write(store.beams, beam, slot, mask)
+            if stored:
+                weight_layout().write(store.beam_weights, stored, slot, mask)
 
         return keep
 
@@ -213,16 +251,18 @@ class QueryVisitor:
     def arrive(self, state, at, rng, active):
         vertex, met, behind_delta, scatter_pdf, origin, share_here, times, sums, *more = state
         weights, bsdf = self.weights, at.bsdf
-        smooth = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+        smooth = smooth_at(at, active)
         if self.passes_masks:
             smooth &= vertex <= self.bdd
         at.ends = vertex >= self.bdd  # the path's last smooth vertex
         if self.queries.narrow is not None:
             at.ends &= ~lookup(self.queries.narrow, bsdf, mi.Bool, smooth)
         if self.beyond is not None:
-            times = dr.select(smooth & met, self.beyond, times)
+            # Other paths go straight through media.
+            unseen = met | at.scatters if self.flies else met
+            times = dr.select(smooth & unseen, self.beyond, times)
         if weights is not None:
-            sums, share = weights.propagate(sums, at.si, bsdf, vertex, smooth)
+            sums, share = weights.propagate(sums, at.si, self._scattering(at), vertex, smooth)
             share_here = dr.select(smooth, share, share_here)
             at.ends |= weights.ends(bsdf, vertex, smooth)
         state = [vertex, met, behind_delta, scatter_pdf, origin, share_here, times, sums, *more]
@@ -234,6 +274,10 @@ class QueryVisitor:
                 self.classes.add("next_event", at.path, number, direct, smooth)
         self._ask_for_photons(state, at, smooth)
         return state, direct
+
+    def _scattering(self, at):
+        """What scatters there: a BSDF, or where paths scatter in media a `PhaseOrBSDF`."""
+        return PhaseOrBSDF.at(at) if self.flies else at.bsdf
 
     def _direct(self, state, at, rng, smooth):
         """Radiance of direct light at smooth vertices, by next-event estimation."""
@@ -247,10 +291,11 @@ class QueryVisitor:
         else:
             ds, light, light_pdf = self.lights.sample_direct(si, rng, smooth)
         wo = si.to_local(ds.d)
-        response, response_pdf = at.bsdf.eval_pdf(mi.BSDFContext(), si, wo, smooth)
+        reached = smooth & (dr.max(light) > 0)  # elsewhere `ds` may not even be a number
+        scattering, lit = self._scattering(at), reached if self.flies else smooth
+        response, response_pdf = scattering.eval_pdf(mi.BSDFContext(), si, wo, lit)
         if self.by_light:
-            reached = smooth & (dr.max(light) > 0)  # elsewhere `ds` may not even be a number
-            left = weights.scatter(sums, si, at.bsdf, mi.BSDFSample3f(wo), vertex, reached)
+            left = weights.scatter(sums, si, scattering, mi.BSDFSample3f(wo), vertex, reached)
             share_here = weights.next_event_weight(left, si, ds, reached)
         share = dr.select(ds.delta, 1, mis_power(light_pdf, response_pdf)) * share_here
         return dr.select(smooth, at.throughput * share * response * light, 0)
@@ -261,6 +306,8 @@ class QueryVisitor:
         weights, store, queries = self.weights, self.store, self.queries
         last = at.ends | (weights is not None)
         wants = smooth & (dr.max(at.throughput) > 0)
+        if self.flies:
+            wants &= ~at.scatters
         if not queries.has_caustics:
             wants &= last & queries.has_indirect
         slot = mi.UInt32(at.path)
@@ -288,7 +335,7 @@ class QueryVisitor:
             active &= vertex <= self.bdd
         scattered = active & ~delta
         if self.weights is not None:
-            sums = self.weights.scatter(sums, at.si, at.bsdf, bs, vertex, scattered)
+            sums = self.weights.scatter(sums, at.si, self._scattering(at), bs, vertex, scattered)
         beyond = dr.select(at.ends, mi.UInt32(self.bdd), vertex) + 1
         if self.queries.narrow is not None:
             narrow = ~at.ends & lookup(self.queries.narrow, at.bsdf, mi.Bool, scattered)
@@ -337,10 +384,13 @@ def trace_camera_paths(
     Returns `(radiance, alpha, splat position, vertices, count)`: the vertices at which photons are
     to be gathered, as made by `new_vertex_buffer`, and how many wanted a place in it (width one).
 
-    In scenes with media nothing scatters in these: the paths go straight through, and what light
-    they lack is that of volume photons along their way as far as the first smooth vertex. Where
-    `queries` have room for beams, `vertices` have two entries more, `beams` (see `beams.new_beams`)
-    and `beam_count`, how many wanted a place.
+    In media, paths scatter until they have left `bdd` smooth vertices behind, those in media among
+    them, with direct light at each. From there they go straight on to the next surface; what light
+    they lack is that of volume photons along that way, and of caustic ones along the way before.
+    With `weights` all of these count along all of the way: the number of the segment's last vertex,
+    and the state of the weights before it, are kept with each beam (`beam_weights`).
+    Where `queries` have room for beams, of each kind, `vertices` have two entries more, `beams`
+    (see `beams.new_beams`) and `beam_count`, how many of one kind wanted a place.
 
     With `weights` (a `mis.state.MergeState`) all photons are wanted at every smooth vertex, and
     direct light at each is weighted. The vertex buffer is then one section for each smooth vertex
@@ -356,5 +406,8 @@ def trace_camera_paths(
     radiance, alpha, splat = trace_camera(world, limits, camera_pass, visitor)
     store = visitor.store
     if queries.beams:
-        store.vertices |= {"beams": store.beams, "beam_count": store.beam_count}
+        count = functools.reduce(dr.maximum, store.beam_count.values())
+        store.vertices |= {"beams": store.beams, "beam_count": count}
+        if weights is not None:
+            store.vertices["beam_weights"] = store.beam_weights
     return radiance, alpha, splat, store.vertices, store.count

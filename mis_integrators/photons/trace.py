@@ -10,6 +10,7 @@ from ..core.records import write_packets
 from ..paths.light import trace_light
 from ..paths.setting import LightPass, Limits, World
 from ..paths.subpaths import selected
+from ..paths.vertex import PhaseOrBSDF
 from .photon import new_photons, write_photon
 from .volume import new_volume_photons, write_volume_photon
 
@@ -34,6 +35,8 @@ class PhotonVisitor:
             self.store.place, self.store.volume_power = new_volume_photons(volume_capacity)
             self.store.volume_room = dr.opaque(mi.UInt32, volume_capacity)
             self.store.volume_count = dr.zeros(mi.UInt32, 1)
+            if light_state is not None:
+                self.store.volume_mis_words = light_state.layout.room(volume_capacity)
 
     def blank(self, lanes):
         return self.begin([])
@@ -52,7 +55,7 @@ class PhotonVisitor:
             words = self.light_state.words(sums)
             write_packets(self.store.mis_words, words, slot, keep)
         if at.scatters is not None:
-            self._leave_in_medium(mark, at, active & at.scatters)
+            self._leave_in_medium(sums, mark, at, active & at.scatters)
         return [sums, mark]
 
     def keep(self, at, mark, active):
@@ -75,7 +78,7 @@ class PhotonVisitor:
         write_photon(store.surface, store.power, slot, photon, keep)
         return slot, keep
 
-    def _leave_in_medium(self, mark, at, keep):
+    def _leave_in_medium(self, sums, mark, at, keep):
         """Stores volume photons."""
         store = self.store
         slot = dr.scatter_inc(store.volume_count, mi.UInt32(0), keep)
@@ -85,16 +88,20 @@ class PhotonVisitor:
             "towards": at.towards,
             "flux": at.flux,
             "depth": at.depth,
+            "caustic": at.had_delta & ~at.scattered,
             "medium": at.medium,
         }
         if self.marked:
             photon["delta_at_light"] = mark[0]
         write_volume_photon(store.place, store.volume_power, slot, photon, keep)
+        if self.light_state is not None:
+            words = self.light_state.volume_words(sums)
+            write_packets(store.volume_mis_words, words, slot, keep)
 
     def leave(self, state, at, wo, delta, active):
         sums, mark = state
         if self.light_state is not None:
-            sums = self.light_state.scatter(sums, at.si, at.bsdf, wo, active & ~delta)
+            sums = self.light_state.scatter(sums, at.si, PhaseOrBSDF.at(at), wo, active & ~delta)
         return [sums, [dr.select(at.first, delta, before) for before in mark]]
 
     def cross(self, before, after, crosses):
@@ -130,7 +137,8 @@ def trace_light_paths(
 
     In scenes with media, which need a `volume_capacity`, the last element of the result is a tuple
     of its own, of the photons in media: all places where sub-paths scatter there, the first one
-    included. It is `(place, power, count)`, see `volume.new_volume_photons`.
+    included. It is `(place, power, count)`, see `volume.new_volume_photons`, and with a
+    `light_state` what `volume_words` of that returns for each, as records of its `layout`.
     """
     visitor = PhotonVisitor(capacity, keep_direct, light_state, marked, volume_capacity)
     trace_light(world, limits, light_pass, visitor)
@@ -139,5 +147,8 @@ def trace_light_paths(
     if light_state is not None:
         photons = *photons, store.mis_words
     if volume_capacity:
-        photons = *photons, (store.place, store.volume_power, store.volume_count)
+        in_media = store.place, store.volume_power, store.volume_count
+        if light_state is not None:
+            in_media = *in_media, store.volume_mis_words
+        photons = *photons, in_media
     return photons

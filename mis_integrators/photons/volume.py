@@ -24,13 +24,19 @@ CELL = 2.0
 
 
 def place_layout():
-    """Position `p`; `word`: depth and medium, as of `pack_place`."""
+    """Position `p`; `word`: depth, kind and medium, as of `pack_place`."""
     return Layout({"p": mi.Point3f, "word": mi.UInt32})
 
 
-def pack_place(depth, medium):
-    """A path depth (saturated at `MAX_DEPTH`), and the number of a medium in 23 bits."""
-    return dr.minimum(depth, MAX_DEPTH) | (number_of_medium(medium) << DEPTH_BITS)
+CAUSTIC = 1 << DEPTH_BITS
+"""Bit of a photon's word that says of which kind it is."""
+
+
+def pack_place(depth, caustic, medium):
+    """A path depth (saturated at `MAX_DEPTH`), the photon's kind (caustic or not), and the number
+    of a medium in 22 bits."""
+    word = dr.minimum(depth, MAX_DEPTH) | (number_of_medium(medium) << (DEPTH_BITS + 1))
+    return word | dr.select(caustic, mi.UInt32(CAUSTIC), 0)
 
 
 def number_of_medium(medium):
@@ -40,18 +46,20 @@ def number_of_medium(medium):
 
 @dataclass
 class VolumeLanding:
-    """Where a volume photon was left: position, depth in segments, number of the medium."""
+    """Where a volume photon was left: position, depth in segments, number of the medium, kind."""
 
     p: mi.Point3f
     depth: mi.UInt32
     medium: mi.UInt32
+    caustic: mi.Bool
 
 
 def read_place(place, index, active=True):
     """The `VolumeLanding` of photons `index`."""
     record = place_layout().read(place, index, active)
     word = record["word"]
-    return VolumeLanding(record["p"], word & MAX_DEPTH, word >> DEPTH_BITS)
+    medium = word >> (DEPTH_BITS + 1)
+    return VolumeLanding(record["p"], word & MAX_DEPTH, medium, (word & CAUSTIC) != 0)
 
 
 def new_volume_photons(capacity):
@@ -62,9 +70,9 @@ def new_volume_photons(capacity):
 
 def write_volume_photon(place, power, slot, photon, active):
     """Writes photons to the places `slot`. `photon`: by name, `p`, `towards`, `flux`, `depth`,
-    `medium`, and where light is split into classes, `delta_at_light` (see
-    `photon.write_photon`)."""
-    word = pack_place(photon["depth"], photon["medium"])
+    `medium`, whether it is a `caustic` one, and where light is split into classes,
+    `delta_at_light` (see `photon.write_photon`)."""
+    word = pack_place(photon["depth"], photon["caustic"], photon["medium"])
     place_layout().write(place, {"p": photon["p"], "word": word}, slot, active)
     flux = photon["flux"]
     if "delta_at_light" in photon:
@@ -83,19 +91,27 @@ class Box:
 
 class VolumeMap:
     """Sorted volume photons: their `box`, a `grid` over it, `start` (first photon of each table
-    entry), `place` and `power`."""
+    entry), `place` and `power`. Under weights there are also `mis_words`, as light sub-paths have
+    left them, and for each sorted photon its `number` among them."""
 
-    def __init__(self, box, grid, start, place, power):
+    def __init__(self, box, grid, start, place, power, mis_words=None, number=None):
         self.box, self.grid, self.start, self.place, self.power = box, grid, start, place, power
+        self.mis_words, self.number = mis_words, number
 
     def arrays(self):
         """What a recorded function can take; `with_grid` makes the map of it again."""
-        names = "start", "place", "power"
+        names = ["start", "place", "power"]
+        if self.mis_words is not None:
+            names += ["mis_words", "number"]
         return {
             **{name: getattr(self, name) for name in names},
             "low": self.box.min,
             "high": self.box.max,
         }
+
+    def place_of_mis_words(self, index, active):
+        """Where among the `mis_words` those of photon `index` are."""
+        return dr.gather(mi.UInt32, self.number, index, active)
 
     @classmethod
     def with_grid(cls, arrays, radius, capacity: int):
@@ -112,8 +128,9 @@ def volume_grid(box, radius, capacity):
     return Grid(box, dr.maximum(CELL * radius, extent / (longest_row(size) - 8)), size)
 
 
-def build_volume_map(place, power, count, radius, capacity: int):
-    """Sorts volume photons into a grid over the box that holds them all."""
+def build_volume_map(place, power, count, radius, capacity: int, mis_words=None):
+    """Sorts volume photons into a grid over the box that holds them all. `mis_words` (None: there
+    are none) stay unsorted."""
     index = dr.arange(mi.UInt32, capacity)
     active = index < dr.gather(mi.UInt32, count, 0)
     record = place_layout().read(place, index, active)
@@ -127,8 +144,12 @@ def build_volume_map(place, power, count, radius, capacity: int):
     sorted_place = place_layout().room(capacity)
     place_layout().write(sorted_place, record, target, active)
     sorted_power = power_layout().move(power, index, target, active)
-    dr.eval(sorted_place, sorted_power)
-    return VolumeMap(box, grid, start, sorted_place, sorted_power)
+    number = None
+    if mis_words is not None:
+        number = dr.empty(mi.UInt32, capacity)
+        dr.scatter(number, index, target, active)
+    dr.eval(sorted_place, sorted_power, number)
+    return VolumeMap(box, grid, start, sorted_place, sorted_power, mis_words, number)
 
 
 def _extreme(reduce, values, active, neutral):

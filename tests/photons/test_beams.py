@@ -4,8 +4,15 @@ the pieces of a way through media."""
 from mis_integrators.core.packing import pack_direction
 from mis_integrators.core.sequences import SampleSequence
 from mis_integrators.core.traits import SceneTraits
-from mis_integrators.paths.media import pass_straight
-from mis_integrators.photons.beams import Beams, beam_layout, gather_along, mean_count_along
+from mis_integrators.paths.media import fly, pass_straight
+from mis_integrators.photons.beams import (
+    FIRST,
+    LONG,
+    Beams,
+    beam_layout,
+    gather_along,
+    mean_count_along,
+)
 from mis_integrators.photons.grid import longest_row, table_size
 from mis_integrators.photons.volume import (
     VolumeMap,
@@ -23,7 +30,7 @@ import numpy as np
 import pytest
 from comparing import Estimate, differences
 from foggy import container, even, grid, pockets
-from test_bdpt_media import FOG, ball, homogeneous
+from test_bdpt_media import FOG, ball, coloured, homogeneous
 
 SIGMA = 0.7
 
@@ -41,7 +48,7 @@ def media():
     return scene, by_id["a"], by_id["b"]
 
 
-def photon_map(points, flux, medium, radius, depth=1):
+def photon_map(points, flux, medium, radius, depth=1, caustic=False):
     """The map of volume photons, NumPy (n, 3) and (n,)."""
     count, capacity = len(points), len(points) + 3
     place, power = new_volume_photons(capacity)
@@ -50,20 +57,21 @@ def photon_map(points, flux, medium, radius, depth=1):
         "towards": mi.Vector3f(0, 0, 1),
         "flux": mi.Spectrum(mi.Float(np.float32(flux))),
         "depth": mi.UInt32(depth),
+        "caustic": mi.Bool(caustic),
         "medium": mi.MediumPtr(medium),
     }
     write_volume_photon(place, power, dr.arange(mi.UInt32, count), photon, True)
     return build_volume_map(place, power, mi.UInt32([count]), mi.Float([radius]), capacity)
 
 
-def beams(o, d, length, medium, depth=1, normal=(0, 0, 1), surface=dr.inf):
+def beams(o, d, length, medium, depth=1, normal=(0, 0, 1), surface=dr.inf, bits=LONG | FIRST):
     """Beams (NumPy (m, 3), (m, 3), (m,)) in a medium, on rays that meet a surface."""
     words = beam_layout().room(len(o))
     values = {
         "o": mi.Point3f(np.float32(o).T.copy()),
         "path": dr.arange(mi.UInt32, len(o)),
         "d": mi.Vector3f(np.float32(d).T.copy()),
-        "depth": mi.UInt32(depth),
+        "depth": mi.UInt32(depth | bits),
         "throughput": mi.Spectrum(1),
         "length": mi.Float(np.float32(length)),
         "medium": mi.MediumPtr(medium),
@@ -173,6 +181,23 @@ def test_depths_add_up(rgb, max_depth, found):
     assert (np.array(light).max() > 0) == found
 
 
+def test_short_beams_take_caustic_photons_only(rgb):
+    """Along them nothing is lost: that paths get so far has the share of light as its
+    probability."""
+    _scene, medium, _ = media()
+    o, d, length = np.array([[0, 0, -1.0]]), np.array([[0, 0, 1.0]]), np.array([3.0])
+    for caustic in (False, True):
+        built = photon_map(np.zeros((1, 3)), np.ones(1), medium, 0.1, caustic=caustic)
+        short, long = (
+            gather_along(built, beams(o, d, length, medium, bits=bits), [mi.Float(0.1)], 1, -1)[0][
+                0
+            ]
+            for bits in (0, LONG)
+        )
+        assert long[0] > 0
+        assert short[0] == pytest.approx(long[0] * np.exp(SIGMA) * caustic)
+
+
 def test_no_photons(rgb):
     _scene, medium, _ = media()
     place, power = new_volume_photons(8)
@@ -183,7 +208,7 @@ def test_no_photons(rgb):
 
 
 def test_records_hold_what_was_written(rgb):
-    """Depths saturate; media are told apart."""
+    """Depths saturate; media and kinds are told apart."""
     _scene, first, second = media()
     place, power = new_volume_photons(2)
     media_of = dr.select(mi.Bool([True, False]), mi.MediumPtr(first), mi.MediumPtr(second))
@@ -192,6 +217,7 @@ def test_records_hold_what_was_written(rgb):
         "towards": mi.Vector3f(0, 0, 1),
         "flux": mi.Spectrum(1),
         "depth": mi.UInt32([7, 100000]),
+        "caustic": mi.Bool([False, True]),
         "medium": media_of,
     }
     write_volume_photon(place, power, dr.arange(mi.UInt32, 2), photon, True)
@@ -199,6 +225,7 @@ def test_records_hold_what_was_written(rgb):
     assert np.array(landing.p).tolist() == [[1, 2], [3, 4], [5, 6]]
     assert np.array(landing.depth).tolist() == [7, 511]
     assert np.array(landing.medium == number_of_medium(media_of)).all()
+    assert np.array(landing.caustic).tolist() == [False, True]
 
 
 def test_ten_million_photons_fit_into_two_gibibytes(rgb):
@@ -223,9 +250,10 @@ def test_ten_million_photons_fit_into_two_gibibytes(rgb):
 COUNT = 1 << 14
 
 
-def straight(scene, o, d):
-    """What `pass_straight` finds along a ray: the hits' distances, the share that gets there, and
-    the pieces `(first, last, share at first, path)`."""
+def pieces_along(scene, o, d, scattered=False):
+    """What `pass_straight`, or `fly` if paths may be `scattered`, finds along a ray: the hits'
+    distances, the share that gets there (weight), and the pieces `(first, last, share at first,
+    path)`, those of the first channel."""
     traits = SceneTraits(scene)
     sequence = SampleSequence(mi.UInt32(5), mi.UInt32(0), 1, False)
     draws = sequence.of_paths(dr.arange(mi.UInt32, COUNT)).at(0)
@@ -243,7 +271,10 @@ def straight(scene, o, d):
             dr.scatter(store.values, value, 4 * slot + place, mask)
 
     none = dr.zeros(mi.MediumPtr, COUNT)
-    hit, ray, _, kept = pass_straight(scene, traits, ray, none, draws, keep, True)
+    if scattered:
+        hit, ray, _, _, kept = fly(scene, traits, ray, none, draws, True, keep)
+    else:
+        hit, ray, _, kept = pass_straight(scene, traits, ray, none, draws, keep, True)
     dr.eval(hit, ray, kept, store.values, store.count)
     number = int(store.count[0])
     assert number < room
@@ -270,7 +301,7 @@ def test_pieces_of_a_homogeneous_medium(rgb, sigma):
         {"type": "scene", "cube": container(homogeneous(sigma)), "wall": ball({"type": "diffuse"},
          0.5, center=[0, 0, -3])}
     )  # fmt: skip
-    end, kept, pieces = straight(scene, (0.1, 0, 4), (0, 0, -1))
+    end, kept, pieces = pieces_along(scene, (0.1, 0, 4), (0, 0, -1))
     depths = np.array([3.1, 3.5, 4.0, 4.9])
     exact = Estimate.exact(np.exp(-sigma * (depths - 3))[:, None])
     found = share_along(pieces, depths, sigma)
@@ -283,13 +314,14 @@ def test_pieces_of_a_homogeneous_medium(rgb, sigma):
     assert going.all() == (sigma < 1), "no roulette where light is strong"
 
 
+@pytest.mark.parametrize("scattered", [False, True])
 @pytest.mark.parametrize("density, scale", [(pockets, 2.0), (even, 4.0)])
-def test_pieces_of_a_heterogeneous_medium(rgb, density, scale):
+def test_pieces_of_a_heterogeneous_medium(rgb, density, scale, scattered):
     """Their mean share is the transmittance, which is integrated in small steps; where it is faint,
-    too."""
+    too, and where paths scatter on the way."""
     medium = grid(density, scale=scale)
     scene = mi.load_dict({"type": "scene", "cube": container(medium)})
-    _, kept, pieces = straight(scene, (0.1, -0.2, 3), (0, 0, -1))
+    _, kept, pieces = pieces_along(scene, (0.1, -0.2, 3), (0, 0, -1), scattered)
     depths = np.linspace(2.05, 3.95, 9)
     fine = np.linspace(2, 4, 4001)
     middle = 0.5 * (fine[1:] + fine[:-1])
@@ -302,8 +334,21 @@ def test_pieces_of_a_heterogeneous_medium(rgb, density, scale):
     found = share_along(pieces, depths)
     assert not differences(found, Estimate.exact(exact[:, None]), slack=2e-3)
     assert np.sqrt(found.error2.max()) < 0.01
+    if scattered:
+        return
     law = np.exp(-thickness[-1])
     assert abs(kept[0].mean() - law) < 6 * kept[0].std() / COUNT**0.5 + 2e-3 * law
+
+
+def test_pieces_of_flights_in_a_coloured_medium(rgb):
+    """One density serves all channels: their weights make up for it."""
+    scene = mi.load_dict({"type": "scene", "cube": container(coloured())})
+    _, _, pieces = pieces_along(scene, (0.1, 0, 4), (0, 0, -1), scattered=True)
+    depths = np.array([3.1, 3.5, 4.0, 4.9])
+    exact = Estimate.exact(np.exp(-2.5 * 0.2 * (depths - 3))[:, None])  # of the first channel
+    found = share_along(pieces, depths)
+    assert not differences(found, exact, slack=1e-3)
+    assert np.sqrt(found.error2.max()) < 0.02
 
 
 def test_boundaries_within_one_another(rgb):
@@ -316,7 +361,7 @@ def test_boundaries_within_one_another(rgb):
             "inner": {**container(homogeneous(1.0), 0.5), "exterior": FOG},
         }
     )
-    _, kept, pieces = straight(scene, (0.1, 0.2, 3), (0, 0, -1))
+    _, kept, pieces = pieces_along(scene, (0.1, 0.2, 3), (0, 0, -1))
     ends = np.unique(np.round(pieces[:, :2], 2), axis=0)
     np.testing.assert_allclose(ends, [[2, 2.5], [2.5, 3.5], [3.5, 4]], atol=0.011)
     np.testing.assert_allclose(kept, np.exp(-(0.2 + 1.0)), rtol=1e-3)
