@@ -70,7 +70,7 @@ PARTS = {
     ),
     "denoised10": Part(
         "compare --denoise --time 10 --seeds 1 --integrators path path:sampler=multijitter"
-        " bdpm:bdd=1 bdpm_opt2 bdpm_auto",
+        " bdpm:bdd=1 bdpm:bdd=2 bdpm_auto",
         "compare",
         (
             *_EFFORT,

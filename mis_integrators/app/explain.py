@@ -1,5 +1,5 @@
-"""What ``mis-render --explain`` tells: which integrator rendered an image and why, and what it found
-out about the scene."""
+"""What ``mis-render --explain`` tells: which integrator rendered an image and why, and what it
+found out about the scene."""
 
 from __future__ import annotations
 
