@@ -5,7 +5,6 @@ Comparisons of renders: false-alarm rate 1e-6 each; an error of 2 % of the whole
 a quarter is seen with a probability of 0.95, where a test says nothing else (`comparing`).
 """
 
-from mis_integrators import _plugins
 from mis_integrators.core.sequences import SampleSequence
 from mis_integrators.core.traits import SceneTraits
 from mis_integrators.lights.lights import Lights
@@ -402,8 +401,7 @@ def test_states_behind_half_transparent_surfaces(rgb, kind):
 
 # --- What is refused ----------------------------------------------------------
 
-WITH_MEDIA = "bdpm", "bdpm_auto", "bdpt", "bdpt_ris", "pcbpt", "vcm", "volpath_multiview"
-REFUSING = sorted(set(_plugins.PLUGINS) - set(WITH_MEDIA))
+REFUSING = "bdpm_opt", "bdpm_opt2", "bdpm_opt3"
 
 
 @pytest.mark.parametrize("plugin", REFUSING)
