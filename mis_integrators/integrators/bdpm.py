@@ -13,7 +13,7 @@ from ..core.film import splat_samples
 from ..core.packing import rounded_up
 from ..core.recording import lanes, recorder
 from ..core.spectra import channel_mean
-from ..core.traits import SceneTraits, UnsupportedScene, check_media, check_scene, has_media, lookup
+from ..core.traits import SceneTraits, lookup
 from ..lights.lights import Lights
 from ..paths.camera import film_sample_count, film_size
 from ..paths.layers import CHANNELS, SPLIT
@@ -146,18 +146,6 @@ class BDPM(IterativeIntegrator):
 
     LAYERS = *CHANNELS, *SPLIT
     MEDIA = True
-    """Whether participating media are supported."""
-
-    def check(self, scene, sensor):
-        check_scene(scene, sensor, self.plugin, self.MEDIA)
-        check_media(scene, sensor, self.plugin)
-        if not has_media(scene, sensor):
-            return
-        if self.hide_emitters:
-            raise UnsupportedScene(
-                f'{self.plugin}: parameter "hide_emitters" is not supported in scenes with '
-                'participating media; use "volpath"'
-            )
 
     def read_parameters(self, parameters):
         self.read_photon_parameters(parameters)
@@ -294,7 +282,7 @@ class BDPMSession(PilotedSession):
 
     def _run_pilot(self):
         """With a pilot's light sub-paths."""
-        if self.radii is not None:
+        if not self.needs_pilot:
             return super()._run_pilot()
         self._use_light_paths(pilot_light_paths(self.iteration_light_paths))
         pilot = super()._run_pilot()

@@ -28,12 +28,7 @@ from ..paths.light_classes import LightClasses, by_class, class_of
 from ..paths.sensor import Lens
 from ..paths.setting import World
 from ..paths.subpaths import Kept, read_vertices, trace_camera_subpaths, trace_light_subpaths
-from .common import (
-    MOST_LIGHT_PATHS,
-    IterativeIntegrator,
-    IterativeSession,
-    check_scene_and_media,
-)
+from .common import MOST_LIGHT_PATHS, IterativeIntegrator, IterativeSession
 from .pyramid import Ledger, camera_images, sensor_images, technique_channels, with_rest
 
 CHUNK = 1 << 19
@@ -149,8 +144,7 @@ class BDPT(IterativeIntegrator):
             "technique_weights": self.technique_weights,
         }
 
-    def check(self, scene, sensor):
-        check_scene_and_media(self, scene, sensor)
+    MEDIA = True
 
     def new_session(self, scene, sensor, seed, iterations):
         return BDPTSession(self, scene, sensor, seed, iterations)

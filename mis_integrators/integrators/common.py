@@ -44,22 +44,6 @@ MOST_LIGHT_PATHS = 2**28
 """Light sub-paths of an iteration at most: the words of their photons are numbered with 32 bits."""
 
 
-def check_scene_and_media(integrator, scene, sensor, refused=()):
-    """Raises `UnsupportedScene` for what integrators that join vertices in media cannot render;
-    `refused`: parameters that are not supported in media, as a message has them, each with what to
-    use instead."""
-    check_scene(scene, sensor, integrator.plugin, True)
-    check_media(scene, sensor, integrator.plugin)
-    if integrator.hide_emitters:
-        refused = (*refused, ('"hide_emitters"', '"volpath"'))
-    if refused and has_media(scene, sensor):
-        parameter, instead = refused[0]
-        raise UnsupportedScene(
-            f"{integrator.plugin}: parameter {parameter} is not supported in scenes with "
-            f"participating media; use {instead}"
-        )
-
-
 class IterativeIntegrator(mi.AdjointIntegrator):
     """Base of integrators that render by iterations and average them.
 
@@ -114,9 +98,24 @@ class IterativeIntegrator(mi.AdjointIntegrator):
         subclass has its own."""
         raise TypeError(f"{type(self).__name__} does not define new_session")
 
+    MEDIA = False
+    """Whether participating media are supported."""
+
     def check(self, scene, sensor):
         """Raises `UnsupportedScene` for a scene that this integrator cannot render."""
-        check_scene(scene, sensor, self.plugin)
+        check_scene(scene, sensor, self.plugin, self.MEDIA)
+        if has_media(scene, sensor):
+            check_media(scene, sensor, self.plugin)
+            for parameter, instead in self.refused_in_media():
+                raise UnsupportedScene(
+                    f"{self.plugin}: parameter {parameter} is not supported in scenes with "
+                    f"participating media; use {instead}"
+                )
+
+    def refused_in_media(self):
+        """Parameters whose values are not supported there, as a message has them, each with what to
+        use instead."""
+        return [('"hide_emitters"', '"volpath"')] if self.hide_emitters else []
 
     def estimated_channels(self):
         """Names of the channels beside the image's that iterations are summed for."""
@@ -368,13 +367,14 @@ class IterativeSession:
     def settings(self):
         """Names and values that reproduce the image, together with the scene; and what was
         `left_out`, if anything was."""
-        settings = {
+        left_out = ", ".join(self.left_out)
+        return {
             "integrator": self.integrator.plugin,
             **self.integrator.settings(),
             "camera_paths": self.camera_paths,
             "seed": self.seed,
+            **({"left_out": left_out} if left_out else {}),
         }
-        return {**settings, "left_out": ", ".join(self.left_out)} if self.left_out else settings
 
     @under_render_lock
     def iterate(self, iteration=None):

@@ -113,9 +113,14 @@ class PilotedSession(IterativeSession):
         else:
             self._choose_by_clock(pilot, begun)
 
+    @property
+    def needs_pilot(self):
+        """Radii are not known, and there are photons to gather."""
+        return self.radii is None and bool(self.kinds())
+
     def _run_pilot(self):
-        """The `PilotResult`; None where radii are known, or there are no photons to gather."""
-        if self.radii is not None or not self.kinds():
+        """The `PilotResult`; None where no pilot is needed."""
+        if not self.needs_pilot:
             return None
         setting = self.pilot_setting()
         pixels = pilot_pixels(setting)

@@ -52,7 +52,7 @@ from ..resampling.cache_targets import TARGETS, CacheTargets, integrals, receivi
 from ..resampling.light_vertices import END, LightVertices, list_light_vertices
 from ..resampling.proposals import Proposals, arriving, cumulative_sums
 from ..weights import resampling
-from .common import IterativeIntegrator, IterativeSession, check_scene_and_media
+from .common import IterativeIntegrator, IterativeSession
 
 CHUNK = 1 << 18
 """Camera paths, and as many light sub-paths, traced at once at most; larger films are traced in
@@ -118,9 +118,11 @@ class ResampledIntegrator(IterativeIntegrator):
             "light_tracing": self.light_tracing,
         }
 
-    def check(self, scene, sensor):
-        published = ('"weights" = published', '"bounded"')
-        check_scene_and_media(self, scene, sensor, [published] if self.published else [])
+    MEDIA = True
+
+    def refused_in_media(self):
+        published = [('"weights" = published', '"bounded"')] if self.published else []
+        return published + super().refused_in_media()
 
     def new_session(self, scene, sensor, seed, iterations):
         return ResampledSession(self, scene, sensor, seed, iterations)

@@ -18,11 +18,7 @@ from ..core.traits import lookup
 from ..lights.lights import mis_power
 from ..paths.camera import trace_camera, whole_or_nothing
 from ..paths.light_classes import class_of, scattered_history, start_of_camera_path
-from ..paths.media import (
-    direct_light,
-    next_hit_either,
-    next_hit_straight_on,
-)
+from ..paths.media import direct_light, next_hit_either, next_hit_straight_on
 from ..paths.setting import CameraPass, Limits, ListedPass, World
 from ..paths.subpaths import selected, smooth_at
 from ..paths.vertex import PhaseOrBSDF, Sides
@@ -193,18 +189,19 @@ class QueryVisitor:
         vertices, short ones before."""
         if not self.queries.beams:
             return lambda *piece: None
+        vertex, *_, sums, history, _ = state
         store, wanted = self.store, mi.Bool(True)
         if kind == LONG:
-            wanted &= state[0] == self.bdd
+            wanted &= vertex == self.bdd
         if self.deepest is not None:
             wanted &= mi.Int32(depth) <= self.deepest
         depth = depth | mi.UInt32(kind)
         stored = {}
         if self.weights is not None:
-            depth |= state[0] << LEVEL_SHIFT
-            stored = dict(zip(STATE, self.weights.stored(state[7])), share=mi.Spectrum(1))
+            depth |= vertex << LEVEL_SHIFT
+            stored = dict(zip(STATE, self.weights.stored(sums)), share=mi.Spectrum(1))
         if self.classes is not None:
-            depth |= dr.select(state[8][0] == 0, mi.UInt32(FIRST), 0)
+            depth |= dr.select(history[0] == 0, mi.UInt32(FIRST), 0)
 
         def keep(start, medium, length, kept, normal, surface, mask):
             light = throughput * kept
