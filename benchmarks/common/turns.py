@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import functools
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -161,3 +161,17 @@ def take_turns(
                     contender.iterate()
             tell(f"{min(c.rendering for c in contenders):.1f} of {seconds:g} s each")
         dr.kernel_history_clear()
+
+
+def processor_seconds(
+    sessions: Mapping[str, Session], iterations: int, skipped: int
+) -> dict[str, float]:
+    """Median processor time of an iteration of each session, without the first ``skipped`` of so
+    many, for which kernels may be compiled. The sessions take turns."""
+    seconds: dict[str, list[float]] = {label: [] for label in sessions}
+    for _ in range(iterations):
+        for label, session in sessions.items():
+            start = time.process_time()
+            session.iterate()
+            seconds[label].append(time.process_time() - start)
+    return {label: float(np.median(times[skipped:])) for label, times in seconds.items()}

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import time
 from pathlib import Path
 
 from mis_integrators.integrators import costs
@@ -22,6 +21,7 @@ import numpy as np
 
 from common.rows import show, tell
 from common.scene_files import open_scene, scaled_size
+from common.turns import processor_seconds
 
 PLUGINS = tuple(CANDIDATES)
 RADII = (1.0, 2.0)
@@ -98,13 +98,8 @@ def measured(opened, plugins) -> list[dict]:
                 session, segments, session.last_vertex, pilot.prediction.gathered * factor**2
             )
             sessions.append((plugin, f"{plugin} x {factor:g}", session, counted))
-    seconds = {label: [] for _, label, _, _ in sessions}
-    for _ in range(ITERATIONS):
-        for _, label, session, _ in sessions:
-            start = time.process_time()
-            session.iterate()
-            seconds[label].append(time.process_time() - start)
-    took = {label: float(np.median(times[SKIPPED:])) for label, times in seconds.items()}
+    by_label = {label: session for _, label, session, _ in sessions}
+    took = processor_seconds(by_label, ITERATIONS, SKIPPED)
     unit = took["path"] / float(sum(segments))
     return [
         {

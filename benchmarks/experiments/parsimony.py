@@ -10,41 +10,25 @@ from __future__ import annotations
 
 import argparse
 import sys
-import time
-from collections.abc import Callable
 from pathlib import Path
-from statistics import median
 from unittest import mock
 
 from mis_integrators.core.traits import SceneTraits
 
-import drjit as dr
-
 from common.methods import Method
 from common.rows import Row, save, show, tell
 from common.scene_files import OpenScene, open_scene, scaled_size
+from common.turns import processor_seconds
 
 PLUGIN = "bdpm_opt3"
 ITERATIONS, SKIPPED = 12, 3
 """Of each session, and how many of them are not counted: kernels are compiled."""
 
 
-def with_specular_surfaces(traits, scene, sensor) -> None:
-    """There may be caustics: a second photon map, which stays empty."""
-    traits.has_delta = True
-
-
-def with_emission(traits, scene, sensor) -> None:
-    """Camera paths may meet lamps: what they sample is traced on beyond the last vertex."""
-    traits.has_light_surfaces = True
-
-
-PUT_BACK: dict[str, Callable | dict[str, object]] = {
-    "caustic photons": with_specular_surfaces,
-    "emission met by chance": with_emission,
-    "weights": {"mix_diffuse": True},
-}
-"""By the name of what was left out: what puts it back, into `SceneTraits` or as parameters."""
+TRAITS = {"caustic photons": "has_delta", "emission met by chance": "has_light_surfaces"}
+"""By the name of what was left out: what `SceneTraits` must say to put it back."""
+PARAMETERS = {"weights": {"mix_diffuse": True}}
+"""The same for parameters."""
 
 
 def run(options: argparse.Namespace) -> None:
@@ -68,17 +52,10 @@ def measure(path: Path, scale: float) -> list[Row]:
     plain.start()
     sessions = {"": plain}
     for part in plain.left_out:
-        if part in PUT_BACK:
-            sessions[part] = new_session(opened, PUT_BACK[part])
+        if part in TRAITS or part in PARAMETERS:
+            sessions[part] = new_session(opened, part)
             start_like(sessions[part], plain)
-    seconds: dict[str, list[float]] = {part: [] for part in sessions}
-    for number in range(ITERATIONS):
-        for part, session in sessions.items():
-            start = time.process_time()
-            dr.eval(session._iteration(number))
-            dr.sync_thread()
-            seconds[part].append(time.process_time() - start)
-    cost = {part: median(values[SKIPPED:]) for part, values in seconds.items()}
+    cost = processor_seconds(sessions, ITERATIONS, SKIPPED)
     others = [part for part in sessions if part] or [""]
     return [
         {
@@ -91,16 +68,15 @@ def measure(path: Path, scale: float) -> list[Row]:
     ]
 
 
-def new_session(opened: OpenScene, put_back: Callable | dict[str, object] | None = None):
+def new_session(opened: OpenScene, put_back: str = ""):
     """A session of the plugin, with a part put back."""
-    parameters = put_back if isinstance(put_back, dict) else {}
-    integrator = Method(PLUGIN, PLUGIN, parameters).integrator(opened)
+    integrator = Method(PLUGIN, PLUGIN, PARAMETERS.get(put_back, {})).integrator(opened)
     module = sys.modules["mis_integrators.integrators.bdpm"]
 
     def traits(scene, sensor=None):
         found = SceneTraits(scene, sensor)
-        if callable(put_back):
-            put_back(found, scene, sensor)
+        if put_back in TRAITS:
+            setattr(found, TRAITS[put_back], True)
         return found
 
     with mock.patch.object(module, "SceneTraits", traits):
