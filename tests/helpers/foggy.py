@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import mitsuba as mi
 import numpy as np
-from comparing import Estimate, assert_same, collect_until
+from comparing import Estimate, agree, assert_same, collect_until
 from worlds import T, bitmap, film, grey, look, waves
 
 SIZE = 16
@@ -182,6 +182,13 @@ def multiview(**parameters):
 
 def volpath(plugin="volpath", **parameters):
     return mi.load_dict({"type": plugin, "max_depth": 8, "rr_depth": 50, **parameters})
+
+
+def agree_with_volpath(integrator, scene, most=600, **visible):
+    """An integrator and `volpath` with its depth have the same mean in the image and in its
+    quarters; `visible`: the errors that are seen, as of `comparing.agree`."""
+    oracle = volpath(max_depth=integrator.max_depth)
+    agree(integrator, oracle, scene, blocks=2, spp=512, most=most, **visible)
 
 
 def regions(images, blocks=2):

@@ -307,6 +307,45 @@ POINT_LIKE = ("point", "spot", "directional", "projector", "directionalarea")
 """Emitters that no ray can meet: `path` does not see what mirrors and glass make of them."""
 
 
+def lamp_inside(kind, **area):
+    """A `point` or `area` lamp within the cube from -1 to 1; `area`: parameters of the latter's
+    emitter."""
+    if kind == "point":
+        return {"type": "point", "position": [0.3, 0.2, 0.7], "intensity": 1.0}
+    return {
+        "type": "rectangle",
+        "to_world": look((0.2, -0.1, 0.8), (0, 0, 0)) @ T().scale(0.3),
+        "emitter": {"type": "area", **area},
+    }
+
+
+def floor_in_a_beam(seen_from, floor=10, **cover):
+    """A diffuse floor of albedo 0.6 and half the edge `floor` in a beam of irradiance one from
+    above, seen from the height `seen_from`; `cover`: what is between."""
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "sun": {"type": "directional", "direction": [0, 0, -1], "irradiance": 1.0},
+            "floor": {"type": "rectangle", "to_world": T().scale(floor), "bsdf": diffuse(0.6)},
+            **cover,
+            "sensor": {
+                "type": "orthographic",
+                "to_world": look((0, 0, seen_from), (0, 0, 0)) @ T().scale([0.5, 0.5, 1]),
+                "film": film(16),
+            },
+        }
+    )
+
+
+def index_matched_pane(height):
+    """A pane without refraction above a floor."""
+    return {
+        "type": "rectangle",
+        "to_world": T().translate([0, 0, height]).rotate([1, 0, 0], 180).scale(10),
+        "bsdf": {"type": "thindielectric", "int_ior": 1.0, "ext_ior": 1.0},
+    }
+
+
 def film(size=SIZE, rfilter="box", **extra):
     return {
         "type": "hdrfilm",

@@ -11,14 +11,10 @@ import numpy as np
 import pytest
 from comparing import Estimate, SessionBatches, assert_same, collect_until
 from selection import extended
-from worlds import diffuse, film, grey, look
+from worlds import T, diffuse, film, floor_in_a_beam, grey, index_matched_pane, look
 
 EACH = pytest.mark.parametrize("bdd", [0, 1, 2, 3])
 BDD = pytest.mark.parametrize("bdd", [0, 2, *extended(1, 3)])
-
-
-def T():
-    return mi.ScalarTransform4f()
 
 
 def bdpm(**parameters):
@@ -385,23 +381,7 @@ def test_light_through_mask(rgb, bdd):
 def test_index_matched_pane(rgb, bdd):
     """A pane without refraction is no obstacle: all direct light comes by way of caustic
     photons."""
-    scene = mi.load_dict(
-        {
-            "type": "scene",
-            "sun": {"type": "directional", "direction": [0, 0, -1], "irradiance": 1.0},
-            "floor": {"type": "rectangle", "to_world": T().scale(10), "bsdf": diffuse(0.6)},
-            "pane": {
-                "type": "rectangle",
-                "to_world": T().translate([0, 0, 0.25]).rotate([1, 0, 0], 180).scale(10),
-                "bsdf": {"type": "thindielectric", "int_ior": 1.0, "ext_ior": 1.0},
-            },
-            "sensor": {
-                "type": "orthographic",
-                "to_world": look((0, 0, 0.2), (0, 0, 0)) @ T().scale([0.5, 0.5, 1]),
-                "film": film(16),
-            },
-        }
-    )
+    scene = floor_in_a_beam(0.2, pane=index_matched_pane(0.25))
     assert_value(scene, bdpm(bdd=bdd, max_depth=4), 0.6 / np.pi)
 
 

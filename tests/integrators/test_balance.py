@@ -23,7 +23,19 @@ import pytest
 from comparing import PathBatches, SessionBatches, agree, assert_same, collect_until
 from selection import extended, one_of_each_kind
 from test_against_path import MONO, RGB, SPECTRAL
-from worlds import EMITTERS, RADIUS, T, diffuse, film, has_delta, look, path, ptracer, tray
+from worlds import (
+    EMITTERS,
+    RADIUS,
+    T,
+    diffuse,
+    film,
+    has_delta,
+    lamp_inside,
+    look,
+    path,
+    ptracer,
+    tray,
+)
 
 
 def balance(**parameters):
@@ -44,20 +56,12 @@ def balance(**parameters):
 
 def room(bsdf, light):
     """A closed room of one material, with a lamp."""
-    lamps = {
-        "point": {"type": "point", "position": [0.3, 0.2, 0.7], "intensity": 1.0},
-        "area": {
-            "type": "rectangle",
-            "to_world": look((0.2, -0.1, 0.8), (0, 0, 0)) @ T().scale(0.3),
-            "emitter": {"type": "area", "radiance": 5.0},
-        },
-    }
     bsdfs = {"diffuse": diffuse(0.7), "rough": {"type": "roughconductor", "alpha": 0.3}}
     return mi.load_dict(
         {
             "type": "scene",
             "walls": {"type": "cube", "bsdf": {"type": "twosided", "bsdf": bsdfs[bsdf]}},
-            "lamp": lamps[light],
+            "lamp": lamp_inside(light, radiance=5.0),
             "sensor": {
                 "type": "perspective",
                 "fov": 70,

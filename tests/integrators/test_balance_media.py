@@ -32,7 +32,7 @@ from foggy import view, volpath
 from selection import extended
 from test_bdpm_media import RADIUS, SCENES, SLACK, SmallRadiusBatches
 from test_bdpt_media import FOG, hg, homogeneous
-from worlds import T, diffuse, look
+from worlds import diffuse, lamp_inside
 
 COUNT = 400
 NEAR = 1e-4
@@ -42,20 +42,12 @@ DISK_PATHS, CAUSTIC_SHARE, VOLUME_SHARE = 20.0, 0.4, 1.7
 
 def room(light):
     """A closed room full of fog, with a lamp."""
-    lamps = {
-        "point": {"type": "point", "position": [0.3, 0.2, 0.7], "intensity": 1.0},
-        "area": {
-            "type": "rectangle",
-            "to_world": look((0.2, -0.1, 0.8), (0, 0, 0)) @ T().scale(0.3),
-            "emitter": {"type": "area", "radiance": 5.0},
-        },
-    }
     return mi.load_dict(
         {
             "type": "scene",
             "fog": {**homogeneous(1.0, 0.9, hg(0.5)), "id": "fog"},
             "walls": {"type": "cube", "bsdf": {"type": "twosided", "bsdf": diffuse(0.7)}},
-            "lamp": lamps[light],
+            "lamp": lamp_inside(light, radiance=5.0),
             "sensor": {**view((0, -0.9, -0.3), (0.1, 0, 0), size=8, fov=70.0), "medium": FOG},
         }
     )

@@ -62,6 +62,7 @@ from worlds import (
     diffuse,
     film,
     has_delta,
+    lamp_inside,
     look,
     path,
     ptracer,
@@ -79,17 +80,11 @@ def bdpt(**parameters):
 def room(bsdf, light, sensor="perspective"):
     """A closed room of one material (open at both ends under a sky), with a lamp."""
     lamps = {
-        "point": {"type": "point", "position": [0.3, 0.2, 0.7], "intensity": 1.0},
         "spot": {
             "type": "spot",
             "to_world": look((0.3, 0.2, 0.7), (0, 0, -0.5)),
             "cutoff_angle": 80,
             "beam_width": 79,
-        },
-        "area": {
-            "type": "rectangle",
-            "to_world": look((0.2, -0.1, 0.8), (0, 0, 0)) @ T().scale(0.3),
-            "emitter": {"type": "area"},
         },
         "sphere": {
             "type": "sphere",
@@ -121,7 +116,7 @@ def room(bsdf, light, sensor="perspective"):
         {
             "type": "scene",
             "walls": {**walls, "bsdf": {"type": "twosided", "bsdf": bsdfs[bsdf]}},
-            "lamp": lamps[light],
+            "lamp": lamps.get(light) or lamp_inside(light),
             "sensor": {"type": sensor, **view},
         }
     )

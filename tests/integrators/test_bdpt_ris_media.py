@@ -12,8 +12,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from comparing import SessionBatches, agree, assert_same, collect_until
-from foggy import volpath
+from comparing import SessionBatches, assert_same, collect_until
+from foggy import agree_with_volpath
 from selection import extended
 from test_bdpm import last_words
 from test_bdpt_media import (
@@ -58,15 +58,12 @@ there."""
     ],
 )
 def test_agrees_with_volpath(rgb, name, scene, parameters):
-    agree(
+    agree_with_volpath(
         plugin(name, max_depth=6, camera_paths=16, **parameters),
-        volpath(max_depth=6),
         SCENES[scene](),
-        blocks=2,
-        spp=512,
+        most=900,
         whole=0.02,
         block=0.06,
-        most=900,
     )
 
 
@@ -118,15 +115,11 @@ def test_strengths_in_an_infinite_medium(rgb):
 def test_half_transparent_surfaces(rgb):
     """Most light comes through a mask: steps of camera paths go on beyond it as if it were not
     there. An error of 2 % of the image and of 4 % of a quarter is seen."""
-    agree(
+    agree_with_volpath(
         plugin("bdpt_ris", max_depth=2, camera_paths=16),
-        volpath(max_depth=2),
         curtain(0.3, 0.9, 20.0),
-        blocks=2,
-        spp=512,
         whole=0.02,
         block=0.04,
-        most=600,
     )
 
 

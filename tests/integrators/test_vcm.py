@@ -5,12 +5,12 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from comparing import Estimate, SessionBatches, agree, assert_same, collect_until
-from foggy import volpath
+from foggy import agree_with_volpath
 from selection import extended
 from test_analytic import inside_sphere, series
 from test_bdpm import box_scene, glossy_box
 from test_bdpt_media import SCENES
-from worlds import T, diffuse, film, look, path, tray
+from worlds import T, diffuse, film, floor_in_a_beam, index_matched_pane, look, path, tray
 
 
 def vcm(**parameters):
@@ -79,59 +79,34 @@ def test_point_in_sphere(rgb, max_depth, parameters):
 def test_light_that_only_merging_makes(rgb):
     """A floor under a pane without refraction, seen through it, in a parallel beam: L = rho E / pi,
     all of it by merges."""
-    scene = mi.load_dict(
-        {
-            "type": "scene",
-            "sun": {"type": "directional", "direction": [0, 0, -1], "irradiance": 1.0},
-            "floor": {"type": "rectangle", "to_world": T().scale(10), "bsdf": diffuse(0.6)},
-            "pane": {
-                "type": "rectangle",
-                "to_world": T().translate([0, 0, 0.25]).rotate([1, 0, 0], 180).scale(10),
-                "bsdf": {"type": "thindielectric", "int_ior": 1.0, "ext_ior": 1.0},
-            },
-            "sensor": {
-                "type": "orthographic",
-                "to_world": look((0, 0, 1), (0, 0, 0)) @ T().scale([0.5, 0.5, 1]),
-                "film": film(16),
-            },
-        }
-    )
-    batches = SessionBatches(vcm(max_depth=4, initial_radius=0.05), scene, 2)
-    batches.add(8)
-    exact = Estimate.exact(np.full((5, 3), 0.6 / np.pi))
-    assert_same(*collect_until(batches, exact, 0.01, 0.03), 0.01, 0.03, 1e-3)
+    scene = floor_in_a_beam(1, pane=index_matched_pane(0.25))
+    assert_merged(scene, 0.6 / np.pi, 0.01, 0.03)
     dark = np.array(
         mi.render(scene, integrator=mi.load_dict({"type": "bdpt", "max_depth": 4}), spp=16)
     )
     assert dark.max() == 0
 
 
+def assert_merged(scene, expected, whole, block):
+    """All of the image has this value."""
+    batches = SessionBatches(vcm(max_depth=4, initial_radius=0.05), scene, 2)
+    batches.add(8)
+    exact = Estimate.exact(np.full((5, 3), expected))
+    assert_same(*collect_until(batches, exact, whole, block), whole, block, 1e-3)
+
+
 def test_light_that_only_merging_makes_in_media(rgb):
     """The floor of a tank without refraction, full of what only absorbs: L = rho E / pi, less what
     is lost on the way down and up."""
     sigma_t, height = 0.8, 0.25
-    scene = mi.load_dict(
-        {
-            "type": "scene",
-            "sun": {"type": "directional", "direction": [0, 0, -1], "irradiance": 1.0},
-            "floor": {"type": "rectangle", "to_world": T().scale(9), "bsdf": diffuse(0.6)},
-            "tank": {
-                "type": "cube",
-                "to_world": T().scale([10, 10, height]),
-                "bsdf": {"type": "dielectric", "int_ior": 1.0, "ext_ior": 1.0},
-                "interior": {"type": "homogeneous", "sigma_t": sigma_t, "albedo": 0.0},
-            },
-            "sensor": {
-                "type": "orthographic",
-                "to_world": look((0, 0, 1), (0, 0, 0)) @ T().scale([0.5, 0.5, 1]),
-                "film": film(16),
-            },
-        }
-    )
-    batches = SessionBatches(vcm(max_depth=4, initial_radius=0.05), scene, 2)
-    batches.add(8)
-    exact = Estimate.exact(np.full((5, 3), 0.6 / np.pi * np.exp(-2 * height * sigma_t)))
-    assert_same(*collect_until(batches, exact, 0.02, 0.05), 0.02, 0.05, 1e-3)
+    tank = {
+        "type": "cube",
+        "to_world": T().scale([10, 10, height]),
+        "bsdf": {"type": "dielectric", "int_ior": 1.0, "ext_ior": 1.0},
+        "interior": {"type": "homogeneous", "sigma_t": sigma_t, "albedo": 0.0},
+    }
+    scene = floor_in_a_beam(1, floor=9, tank=tank)
+    assert_merged(scene, 0.6 / np.pi * np.exp(-2 * height * sigma_t), 0.02, 0.05)
 
 
 @pytest.mark.parametrize(
@@ -139,16 +114,7 @@ def test_light_that_only_merging_makes_in_media(rgb):
 )
 def test_agrees_in_media(rgb, name):
     """An error of 2 % of the whole image and of 6 % of a quarter is seen."""
-    agree(
-        vcm(max_depth=6, camera_paths=16),
-        volpath(max_depth=6),
-        SCENES[name](),
-        blocks=2,
-        spp=512,
-        whole=0.02,
-        block=0.06,
-        most=600,
-    )
+    agree_with_volpath(vcm(max_depth=6, camera_paths=16), SCENES[name](), whole=0.02, block=0.06)
 
 
 def test_small_radius_is_bdpt(rgb):
