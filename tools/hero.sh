@@ -1,9 +1,9 @@
 #!/usr/bin/env bash
 # hero.sh [SECONDS [REFERENCE_SECONDS]]: render docs/images/still_life.jpg, the picture of README.md: a still life by path and by
-# bdpm_auto, SECONDS (120) each, both also denoised, with their errors against a reference. The reference is kept in out/hero.
+# bdpm_auto, SECONDS (240) each, both also denoised, with their errors against a reference. The reference is kept in out/hero.
 set -euo pipefail
 cd "$(dirname "$0")/.."
-python=${PYTHON:-python3} seconds=${1:-120} reference_seconds=${2:-600} out=out/hero scene=scenes/gallery/still_life.xml
+python=${PYTHON:-python3} seconds=${1:-240} reference_seconds=${2:-600} out=out/hero scene=scenes/gallery/still_life.xml
 mkdir -p "$out"
 
 # Photons within a distance of two pixels: path does not converge on caustics, seen through glass or not.
