@@ -17,6 +17,8 @@ from ..core.windows import window_mean
 from ..paths.guides import albedo_and_normal
 from .output import picture_channels
 
+DOUBT = 4.0
+"""Tuned: by what the variance of direct light is multiplied before its noise is judged."""
 MISSING = "denoising needs mitsuba-oidn: pip install 'mis-integrators[denoise]'"
 
 
@@ -42,9 +44,12 @@ def shrunk(raw: np.ndarray, clean: np.ndarray, variance: np.ndarray) -> np.ndarr
     (of the mean of its channels, over a window), and the squared bias b of `clean`, which is nearly
     free of noise. The best weight of `raw` in a mean of both is b^2 / (v + b^2), the
     positive-part estimator of James and Stein 1961 with the differences measured over the window.
+
+    Both estimates are noisy, and where a few bright samples make them they differ by chance: raw
+    noise would come back as dots. So the variance counts `DOUBT` times.
     """
     apart = window_mean(np.square((raw - clean).mean(axis=-1)), WINDOW)
-    weight = np.maximum(1 - variance / np.maximum(apart, 1e-30), 0)
+    weight = np.maximum(1 - DOUBT * variance / np.maximum(apart, 1e-30), 0)
     return clean + weight[..., None] * (raw - clean)
 
 

@@ -23,6 +23,8 @@ from ..pilot.direct_paths import (
     EXPONENTS,
     MOST_PATHS,
     TRIALS,
+    DirectNoise,
+    coarser,
     direct_error,
     measure,
     paths_per_pixel,
@@ -109,22 +111,27 @@ class DirectLight:
     def measured(self):
         """The `noise`, which is measured if need be."""
         if self.noise is None:
-            self.noise = measure(self._trials(TRIALS), film_size(self.session.sensor)[0])
+            width, height = film_size(self.session.sensor)
+            rows, columns, nearest = coarser(width, height)
+            pixels = (rows[:, None] * width + columns).ravel()
+            found = measure(self._trials(pixels), len(columns))
+            self.noise = DirectNoise(*(values[nearest] for values in found))
             if self.session.integrator.denoised:
                 self.noise = self.noise.times(LEFT)
         return self.noise
 
-    def _trials(self, trials):
-        """Direct light of so many independent paths through each pixel, mean over the channels:
-        (trials, pixels)."""
-        pixels = film_sample_count(self.session.sensor)
+    def _trials(self, pixels):
+        """Direct light of `TRIALS` independent paths through each of these pixels, mean over the
+        channels: (trials, pixels)."""
+        counts = np.zeros(film_sample_count(self.session.sensor), int)
+        counts[pixels] = TRIALS
         passes = self.session.recorded(self._grey)
         spectral = self.session._spectral(PILOT_INDEX)
         values = [
             np.array(passes(*self._arguments(part, PILOT_INDEX, spectral)))
-            for part in self._split(np.full(pixels, trials))
+            for part in self._split(counts)
         ]
-        return np.concatenate(values)[: trials * pixels].reshape(pixels, trials).T
+        return np.concatenate(values)[: TRIALS * len(pixels)].reshape(-1, TRIALS).T
 
     @property
     def beyond(self):

@@ -20,6 +20,7 @@ few steps of a fixed point find them.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -28,6 +29,9 @@ from .noise import relative_weights, trimmed_mean
 
 TRIALS = 4
 """Tuned: independent paths through each pixel that tell how noisy its direct light is."""
+MOST_TRIED = 1 << 18
+"""Pixels with trials, at most or about: larger films have them in every second, or third, ... row
+and column."""
 COST = 0.08
 """Tuned: cost of a path for direct light, over that of one that gathers, photons included (0.03 to
 0.15 in eight rooms)."""
@@ -36,6 +40,15 @@ MOST_PATHS = 256
 EXPONENTS = {True: 1.5, False: 1.0}
 """By whether numbers are those of sequences: a above."""
 STEPS = 6
+
+
+def coarser(width: int, height: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The rows and columns of a film whose pixels have trials, and for each pixel of the film, row
+    by row, the place of one that is near among these."""
+    step = math.ceil(math.sqrt(width * height / MOST_TRIED))
+    rows, columns = np.arange(0, height, step), np.arange(0, width, step)
+    nearest = (np.arange(height) // step)[:, None] * len(columns) + np.arange(width) // step
+    return rows, columns, nearest.ravel()
 
 
 def smoothed(values: np.ndarray, width: int) -> np.ndarray:

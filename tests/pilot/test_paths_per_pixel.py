@@ -70,6 +70,19 @@ def test_an_edge_between_pixels_counts():
     assert np.all(paths[3:5] > 2) and np.all(paths[[0, 1, 6, 7]] == 1)
 
 
+def test_large_films_have_trials_in_some_pixels():
+    for width, height in ((256, 256), (512, 512)):
+        rows, columns, nearest = direct_paths.coarser(width, height)
+        assert (len(rows), len(columns)) == (height, width)
+        np.testing.assert_array_equal(nearest, np.arange(width * height))
+    width, height = 1921, 1083
+    rows, columns, nearest = direct_paths.coarser(width, height)
+    assert len(rows) * len(columns) <= 1.01 * direct_paths.MOST_TRIED
+    row, column = np.divmod(np.arange(width * height), width)
+    assert np.abs(rows[nearest // len(columns)] - row).max() <= 2
+    assert np.abs(columns[nearest % len(columns)] - column).max() <= 2
+
+
 def test_quiet_pixels_send_one_path():
     quiet = np.full((direct_paths.TRIALS, 8 * WIDTH), 0.3)
     assert np.all(direct_paths.paths_per_pixel(found_in(quiet), 0.0, 0.1, 16, 1.5) == 1)
