@@ -9,8 +9,9 @@ import numpy as np
 
 from . import segments
 from .packing import from_numpy
-from .stratified_variance import variance_nearby, variance_ratio
+from .stratified_variance import variance_ratio
 from .sums import Sums
+from .windows import window_mean
 
 
 def colour_matrix(wavelengths):
@@ -313,11 +314,18 @@ class Accumulator:
 
     def direct_variance(self):
         """Estimated variance of the mean of direct light, grey, mean over `WINDOW`: (height, width)
-        without the block's border. Its square where it is not known."""
-        total, done = self._inside(self.sums["total"]), self.sums.done
+        without the block's border. Its square where it is not known.
+
+        Iterations count as independent, though sequences make the mean less noisy than that: a
+        rare bright sample is then as large in the variance as it is in the image, whatever is
+        around it."""
+        total = self._inside(self.sums["total"])
         mean = grey_of(self._direct(total)) / np.where(total[..., -1:] == 0, 1, total[..., -1:])
-        found = variance_nearby(*self._deviations(2, mean), done.below, done.beyond, WINDOW)
-        return np.square(mean[..., 0]) if found is None else found
+        deviations, complete, length = self._deviations(2, mean)
+        if np.count_nonzero(complete) < 2:
+            return np.square(mean[..., 0])
+        of_segments = deviations[complete].var(axis=0, ddof=1)
+        return window_mean(of_segments * (length / self.iterations), WINDOW)
 
     def estimate(self):
         """Mean colour and its estimated variance, float64 (height, width, 3) each, without the

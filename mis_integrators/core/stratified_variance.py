@@ -24,8 +24,6 @@ from collections.abc import Collection, Sequence
 
 import numpy as np
 
-from .windows import window_mean
-
 TILE, GROUP = 16, 16
 """Tuned: width of the tiles in which pixels are grouped, and pixels a group, about."""
 FITS = 4
@@ -160,23 +158,6 @@ def groups_of_alike(values: np.ndarray) -> np.ndarray:
     groups = np.maximum(1, size // GROUP)
     first = np.cumsum(groups) - groups
     return (first[tile] + rank * groups[tile] // size[tile]).reshape(height, width)
-
-
-def variance_nearby(
-    means: np.ndarray,
-    complete: np.ndarray,
-    length: int,
-    below: int,
-    beyond: Collection[int],
-    width: int,
-) -> np.ndarray | None:
-    """The variance of each pixel's mean, (H, W), mean over a window of `width` pixels; None where
-    there is nothing to tell. Arguments as of `variance_ratio`."""
-    lengths, contrast, counts = contrasts(means, complete, length)
-    if not len(lengths):
-        return None
-    near = window_mean(contrast, width).reshape(len(lengths), -1)
-    return extrapolated(lengths, near, counts, below, beyond).reshape(means.shape[1:])
 
 
 def variance_ratio(

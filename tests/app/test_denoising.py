@@ -204,10 +204,12 @@ def test_direct_light_is_the_layer_of_that_name(rgb, plugin):
     assert 0.2 < direct.mean() / image[..., :3].mean() < 0.95
 
 
-@pytest.mark.parametrize("sampler", ["sobol", "independent"])
-def test_noise_of_direct_light_is_measured(rgb, sampler):
+@pytest.mark.parametrize("sampler, most", [("sobol", 16), ("independent", 1.5)])
+def test_noise_of_direct_light_is_measured(rgb, sampler, most):
     """The channel of its variance against that of 24 renders, in blocks of 8 x 8 pixels without
-    the lamp's: the median ratio is within a factor 1.5 (seeds are fixed)."""
+    the lamp's: the median ratio is within a factor 1.5 (seeds are fixed). Sequences make less
+    noise than the independent numbers that the channel is for, at best 16 iterations that of 256.
+    """
     scene, images, estimates = lamp_in_a_box(rgb), [], []
     for seed in range(24):
         image, names = denoised_with_names("bdpm", scene, seed, sampler=sampler)
@@ -216,7 +218,7 @@ def test_noise_of_direct_light_is_measured(rgb, sampler):
     cells = (6, 8, 6, 8)
     true = np.var(images, axis=0, ddof=1).reshape(cells).mean(axis=(1, 3))
     estimated = np.mean(estimates, axis=0).reshape(cells).mean(axis=(1, 3))
-    assert 1 / 1.5 < np.median(estimated / np.maximum(true, 1e-12)) < 1.5
+    assert 1 / 1.5 < np.median(estimated / np.maximum(true, 1e-12)) < most
 
 
 def test_edges_of_lamps_stay_sharp(rgb):
