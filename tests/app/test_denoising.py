@@ -174,7 +174,7 @@ def test_rare_bright_samples_do_not_come_back():
     raw = ((one + other) / 2)[..., None] * np.ones(3)
     left = shrunk(raw, np.ones_like(raw), variance)[..., 0]
     assert np.mean(left > 2) < 1e-3
-    assert np.mean((raw[..., 0] > 2)) > 0.1  # there was something to remove
+    assert np.mean(raw[..., 0] > 2) > 0.1  # there was something to remove
 
 
 def lamp_in_a_box(rgb, **film):
