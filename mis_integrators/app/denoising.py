@@ -19,6 +19,8 @@ from .output import picture_channels
 
 DOUBT = 4.0
 """Tuned: by what the variance of direct light is multiplied before its noise is judged."""
+AROUND = 25
+"""Tuned: width in pixels of the windows whose mean the variance of a pixel is not below."""
 MISSING = "denoising needs mitsuba-oidn: pip install 'mis-integrators[denoise]'"
 
 
@@ -46,8 +48,10 @@ def shrunk(raw: np.ndarray, clean: np.ndarray, variance: np.ndarray) -> np.ndarr
     positive-part estimator of James and Stein 1961 with the differences measured over the window.
 
     Both estimates are noisy, and where a few bright samples make them they differ by chance: raw
-    noise would come back as dots. So the variance counts `DOUBT` times.
+    noise would come back as dots, and as dark squares where all bright samples have missed. So the
+    variance counts `DOUBT` times, and is not below that of the surroundings.
     """
+    variance = np.maximum(variance, window_mean(variance, AROUND))
     apart = window_mean(np.square((raw - clean).mean(axis=-1)), WINDOW)
     weight = np.maximum(1 - DOUBT * variance / np.maximum(apart, 1e-30), 0)
     return clean + weight[..., None] * (raw - clean)

@@ -177,6 +177,17 @@ def test_rare_bright_samples_do_not_come_back():
     assert np.mean(raw[..., 0] > 2) > 0.1  # there was something to remove
 
 
+def test_windows_that_bright_samples_missed_are_not_dark():
+    """Five iterations in which a pixel in fifty is bright: one window in twelve has met none, and
+    its own variance is zero."""
+    hits = 50.0 * (np.random.default_rng(6).random((5, 256, 256)) < 0.02)
+    variance = window_mean(hits.var(axis=0, ddof=1) / 5, WINDOW)
+    raw = hits.mean(axis=0)[..., None] * np.ones(3)
+    assert np.mean(variance == 0) > 0.05
+    left = shrunk(raw, np.ones_like(raw), variance)[..., 0]
+    assert np.mean(left < 0.5) < 1e-3
+
+
 def lamp_in_a_box(rgb, **film):
     scene = mi.cornell_box()
     scene["sensor"]["film"] = {"type": "hdrfilm", "width": 48, "height": 48} | film
