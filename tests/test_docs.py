@@ -212,6 +212,12 @@ def test_links_lead_somewhere(page):
             assert heading in slugs, f"{page.name}: {target}"
 
 
+@pytest.mark.parametrize("page", [*PAGES, *OTHERS], ids=lambda page: str(page.relative_to(ROOT)))
+def test_merges_are_finished(page):
+    """No marks of a merge are left."""
+    assert not re.search("^(<{7}|={7}$|>{7})", page.read_text(), re.MULTILINE)
+
+
 def test_index_names_every_page():
     index = (DOCS / "README.md").read_text()
     names = {page.relative_to(DOCS).as_posix() for page in PAGES} - {"README.md"}

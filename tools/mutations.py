@@ -33,6 +33,7 @@ TRANSPORT = "tests/paths/test_transport.py"
 RADIUS = "tests/pilot/test_radius.py"
 PATHS = "tests/pilot/test_paths_per_pixel.py"
 CACHE = "tests/resampling/test_cache_points.py"
+DENOISING = "tests/app/test_denoising.py"
 SHIFTS = "tests/volume/test_shifts.py"
 VIEWS = "tests/volume/test_multiview.py"
 BDPM = "tests/integrators/test_bdpm.py"
@@ -447,6 +448,27 @@ MUTATIONS = [
         f"tests/core/test_variance_of_renders.py {BDPM}::test_variance_is_that_of_the_mean",
     ),
     # ------------------------------------------------------------------ app
+    Mutation(
+        "app/denoising.py",
+        "weight = np.maximum(1 - DOUBT * variance",
+        "weight = np.maximum(1 - variance",
+        "rare bright samples come back into denoised images",
+        f"{DENOISING}::test_rare_bright_samples_do_not_come_back",
+    ),
+    Mutation(
+        "app/denoising.py",
+        "variance = np.maximum(variance, window_mean(variance, AROUND))",
+        "pass",
+        "denoised images are dark where all bright samples missed",
+        f"{DENOISING}::test_windows_that_bright_samples_missed_are_not_dark",
+    ),
+    Mutation(
+        "pilot/direct_paths.py",
+        "nearest = (np.arange(height) // step)[:, None] * len(columns)",
+        "nearest = (np.arange(height) // step)[:, None] * width",
+        "pixels of large films take the noise of others",
+        f"{PATHS}::test_large_films_have_trials_in_some_pixels",
+    ),
     Mutation(
         "app/checkpoint.py",
         "if hashlib.sha256(body).digest() != digest:",
