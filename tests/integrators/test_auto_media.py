@@ -93,7 +93,7 @@ def test_bundled_scenes(rgb, name, chosen):
 def test_few_photons_tell_nothing(rgb, monkeypatch):
     """However cheap they were: the pilot does not even run. By the settings that users have, too
     few are left where most light sub-paths miss the fog."""
-    set_price_of_photons(monkeypatch, 1e-4, enough=0.5)
+    set_price_of_photons(monkeypatch, 1e-4, enough=0.3)
     session = decided(plain())
     assert session.settings["choice"] == "volpath_multiview"
     assert "too few to try them" in reasons(session)
