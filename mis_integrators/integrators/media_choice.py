@@ -1,9 +1,9 @@
 """The choice of `bdpm_auto` in participating media: photons, or camera paths alone.
 
 Camera paths are those of `volpath_multiview` with one view. Photons are tried where light sub-paths
-leave enough of them, and where camera paths cannot see all of the light. (From a far lamp few
-sub-paths meet a small cloud, and a pilot cannot tell how much so few photons blur.) Both are judged
-on the same pixels, as on surfaces (`choice`).
+leave enough of them and no medium is a grid, and where camera paths cannot see all of the light.
+(From a far lamp few sub-paths meet a small cloud, and a pilot cannot tell how much so few photons
+blur.) Both are judged on the same pixels, as on surfaces (`choice`).
 """
 
 from __future__ import annotations
@@ -81,6 +81,8 @@ def _photons(render):
     if not session.kinds():
         return None, no_photons(integrator, session)
     if not camera_paths_are_blind(session):
+        if session.traits.has_grids:
+            return None, "in media of grids a pilot of photons takes too long"
         found = session.photons_of_a_path()
         if found < ENOUGH:
             return None, f"light sub-paths leave {found:.2g} photons each, too few to try them"
