@@ -32,6 +32,7 @@ MODULES: tuple[str, ...] = (
     "volpath_multiview",
     "unidirectional",
     "choice",
+    "media_choice",
     "bdpm_auto",
 )
 

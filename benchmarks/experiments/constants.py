@@ -37,12 +37,14 @@ METHODS = {
     "resampling": "bdpt_ris",
     "integrators.resampled": "bdpt_ris",
     "integrators.choice": "bdpm_auto",
+    "integrators.media_choice": "bdpm_auto",
     "integrators.vcm": "vcm",
 }
 """What judges a constant, or those of a module or of a folder; others are judged by `USUAL`."""
 USUAL = "bdpm:bdd=0"
 BY_CLOCK = (
     "integrators.choice",
+    "integrators.media_choice",
     "integrators.piloted",
     "pilot.run.PILOT_TIME_SHARE",
 )

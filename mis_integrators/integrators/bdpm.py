@@ -28,6 +28,7 @@ from ..photons.queries import Queries, read_queries, trace_camera_paths
 from ..photons.trace import trace_light_paths
 from ..photons.volume import VolumeMap, build_volume_map
 from ..pilot.direct_paths import MOST_PATHS
+from ..pilot.run import PILOT_INDEX
 from ..pilot.setting import PilotSetting, pilot_light_paths
 from .common import MOST_LIGHT_PATHS, IterativeIntegrator
 from .direct_light import DirectLight
@@ -288,6 +289,11 @@ class BDPMSession(PilotedSession):
         pilot = super()._run_pilot()
         self._use_light_paths(self.iteration_light_paths)
         return pilot
+
+    def photons_of_a_path(self):
+        """How many photons a light sub-path leaves, on average: by the light pass of a pilot."""
+        self._photons(PILOT_INDEX, self._spectral(PILOT_INDEX))
+        return self.photons_found / self.light_path_count
 
     def _use_light_paths(self, count):
         """Traces so many in each light pass from now on."""

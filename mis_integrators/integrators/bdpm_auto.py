@@ -3,13 +3,13 @@ package or Mitsuba's `path` renders it."""
 
 from __future__ import annotations
 
-import mitsuba as mi
-
 from ..core.traits import UnsupportedScene, check_scene, has_media
 from ..core.untrusted import Fields
 from ..paths.layers import CHANNELS, SPLIT, written
 from ..volume.traits import check_volume_scene
-from .choice import CANDIDATES, Decision, choose, handed_on, new_session
+from ..volume.views import Views
+from . import choice, media_choice
+from .choice import Decision
 from .common import IterativeIntegrator, IterativeSession
 
 
@@ -36,7 +36,8 @@ class BDPMAuto(IterativeIntegrator):
     of ``path`` on the same pixels tell what that would bring in the same time. What an iteration
     costs is counted (segments, photons) and priced, not clocked. Where ``path`` cannot see all the
     light of the scene, it is not tried.
-    Scenes with media are rendered by ``volpath_multiview``.
+    In scenes with media the two are ``volpath_multiview``, with one view, and ``bdpm`` with ``bdd``
+    0. Photons are not tried there where light sub-paths leave few of them, nor in media of grids.
 
     The settings of the image (in the EXR's header) say which integrator was chosen and why, with
     the predictions; ``mis-render`` prints the reasons, too. Without a time limit, the same seed and
@@ -67,29 +68,27 @@ class BDPMAuto(IterativeIntegrator):
     def check(self, scene, sensor):
         if has_media(scene, sensor):
             check_volume_scene(scene, self.plugin)
+            Views.check_sensor(sensor, self.plugin)
             if self.layers:
                 raise UnsupportedScene(
                     f'{self.plugin}: parameter "aovs" = {written(self.layers)!r}: of scenes with '
-                    "media, which volpath_multiview renders, there are no layers"
+                    "media, which volpath_multiview may render, there are no layers; use bdpm"
                 )
         else:
             check_scene(scene, sensor, self.plugin)
 
     def new_session(self, scene, sensor, seed, iterations):
-        if has_media(scene, sensor):
-            volumetric = mi.load_dict({"type": "volpath_multiview", **handed_on(self)})
-            return volumetric.session(
-                scene, sensor, seed, (iterations or 0) * self.initial_camera_paths
-            )
         return AutoSession(self, scene, sensor, seed, iterations)
 
 
 class AutoSession(IterativeSession):
-    """Iterations of the integrator that is chosen before the first one."""
+    """Iterations of the session that is chosen before the first one: it keeps what it renders, and
+    this one is its face."""
 
     def __init__(self, integrator, scene, sensor, seed, iterations):
         super().__init__(integrator, scene, sensor, seed, iterations)
         self.seconds = self.decision = None
+        self.in_media = has_media(scene, sensor)
 
     def plan_time(self, seconds):
         """Rendering will last `seconds`: the choice is for as many iterations as fit."""
@@ -117,22 +116,21 @@ class AutoSession(IterativeSession):
         reasons = self.decision.reasons if self.decision else []
         return [*(f"{self.integrator.plugin}: {reason}" for reason in reasons), *super().remarks]
 
+    @property
+    def _render(self):
+        return self.integrator, self.scene, self.sensor, self.seed, self.iterations_planned
+
     def start(self):
         if self.decision is None:
-            self._take(
-                choose(
-                    self.integrator,
-                    self.scene,
-                    self.sensor,
-                    self.seed,
-                    self.iterations_planned,
-                    self.seconds,
-                )
-            )
+            choose = media_choice.choose_in_media if self.in_media else choice.choose
+            self._take(choose(*self._render, self.seconds))
         self.decision.session.start()
 
     def _take(self, decision):
-        self.decision, self.camera_paths = decision, decision.session.camera_paths
+        self.decision, chosen = decision, decision.session
+        self.camera_paths, self.iterations_planned = chosen.camera_paths, chosen.iterations_planned
+        chosen.accumulator.with_variance |= self.accumulator.with_variance
+        self.accumulator = chosen.accumulator
 
     @property
     def learned(self):
@@ -148,22 +146,25 @@ class AutoSession(IterativeSession):
 
     def recall(self, learned):
         fields = Fields(learned, "learned")
-        plugin = fields.choice("plugin", list(CANDIDATES))
+        plugin = fields.choice("plugin", list(self._candidates))
         expected = fields.object("errors")
         errors = {name: expected.number(name) for name in expected.names()}
         reasons, inner = fields.texts("reasons"), fields.any("session")
         fields.finish()
-        session = new_session(
-            plugin,
-            self.integrator,
-            self.scene,
-            self.sensor,
-            self.seed,
-            self.iterations_planned,
-        )
+        new_session = media_choice.new_session_in_media if self.in_media else choice.new_session
+        session = new_session(plugin, *self._render)
         session.recall(inner)
-        self.iterations_planned = session.iterations_planned
         self._take(Decision(plugin, session, reasons, errors))
 
-    def _iteration(self, iteration):
-        return self.decision.session._iteration(iteration)
+    @property
+    def _candidates(self):
+        return media_choice.CANDIDATES if self.in_media else choice.CANDIDATES
+
+    def _run(self, iteration):
+        self.decision.session._run(iteration)
+
+    def fill_film(self):
+        (self.decision.session if self.decision else super()).fill_film()
+
+    def _emptied(self, film):
+        return (self.decision.session if self.decision else super())._emptied(film)

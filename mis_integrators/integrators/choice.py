@@ -37,11 +37,11 @@ PATH_TRIALS = 16
 TRIAL_INDEX = 1 << 28
 """Iteration number of these samples: consecutive in the pixels' sequences."""
 UNSEEN = 1e-3
-"""Tuned: share of the light, brought by caustics, from which on a `path` that cannot see them is
-out of the question."""
+"""Tuned: share of the light, brought by caustics, from which on camera paths that cannot see them
+are out of the question."""
 RARE = 0.02
-"""Tuned: the same for a `path` that meets them by chance only: so seldom that a pilot does not see
-how noisy they are."""
+"""Tuned: the same for camera paths that meet them by chance only: so seldom that a pilot does not
+see how noisy they are."""
 
 
 @dataclass
@@ -121,7 +121,7 @@ def choose(integrator, scene, sensor, seed, iterations, seconds):
     photons = new_session(plugin, integrator, scene, sensor, seed, iterations)
     alone = (plugin, photons) if integrator.splits_light else ("path", path)
     if not photons.kinds():
-        return Decision(*alone, [f"{alone[0]}: {_no_photons(integrator, photons)}"])
+        return Decision(*alone, [f"{alone[0]}: {no_photons(integrator, photons)}"])
     photons.plan_time(seconds)
     photons.start()
     prediction = photons.prediction
@@ -143,15 +143,15 @@ def choose(integrator, scene, sensor, seed, iterations, seconds):
     usual = trials[0].cost
     budget = (prediction.iterations if seconds else iterations or UNPLANNED_ITERATIONS) * usual
     blind = "not path: it does not split the light" if integrator.splits_light else None
-    blind = blind or _why_not_path(photons, prediction)
+    blind = blind or why_not_camera_paths("path", photons, prediction)
     if blind:
         reasons.append(blind)
     else:
         trials.insert(0, _try_path(path, segments, pixels, prediction.mean, budget))
-    return _decision(trials, reasons, budget, usual)
+    return decide(trials, reasons, budget, usual)
 
 
-def _decision(trials, reasons, budget, usual):
+def decide(trials, reasons, budget, usual):
     """The `Decision` for the trial with the least error predicted for this budget."""
     best = min(trials, key=lambda trial: trial.product(budget))
     squared_bias, variance = best.parts["relmse"]
@@ -189,26 +189,30 @@ def new_session(plugin, integrator, scene, sensor, seed, iterations):
     )
 
 
-def _no_photons(integrator, session):
+def no_photons(integrator, session):
+    """Why a session has no photons, in one line."""
     if session.lights.dark:
         return "the scene has no light"
     return f"light of at most {integrator.max_depth} segments needs no photons"
 
 
-def _why_not_path(session, prediction):
-    """Why `path` is not tried, in one line; `None` if it is."""
+def camera_paths_are_blind(session):
+    """Whether there may be caustics that camera paths alone cannot make."""
+    lights = session.lights
+    unseen = not session.traits.has_light_surfaces or lights.needs_photons_for_direct_light()
+    return session.has_caustics and unseen
+
+
+def why_not_camera_paths(plugin, session, prediction):
+    """Why a `plugin` of camera paths alone is not tried, in one line; `None` if it is."""
     if not session.has_caustics:
         return None
-    if not session.traits.has_light_surfaces or session.lights.needs_photons_for_direct_light():
+    share = f"{prediction.caustic_share:.1%} of the light"
+    if camera_paths_are_blind(session):
         if prediction.caustic_share > UNSEEN:
-            return (
-                f"not path: it cannot see the caustics, {prediction.caustic_share:.1%} of the light"
-            )
+            return f"not {plugin}: it cannot see the caustics, {share}"
     elif prediction.caustic_share > RARE:
-        return (
-            f"not path: it would meet the caustics, {prediction.caustic_share:.1%} of the "
-            "light, by chance only"
-        )
+        return f"not {plugin}: it would meet the caustics, {share}, by chance only"
     return None
 
 
@@ -247,13 +251,16 @@ def _try_path(path, segments, pixels, mean, budget):
     samples = max(round(budget / cost), 1)
     values, left = np.array(values), LEFT if path.integrator.denoised else 1
     parts = {
-        measure: (0.0, left * _variance(path, values, weigh(mean), samples) / path.camera_paths)
+        measure: (
+            0.0,
+            left * variance_of_one(path, values, weigh(mean), samples) / path.camera_paths,
+        )
         for measure, weigh in MEASURES.items()
     }
     return Trial("path", path, parts, cost * path.camera_paths)
 
 
-def _variance(path, values, weights, samples):
+def variance_of_one(path, values, weights, samples):
     """Of one of so many samples a pixel, by the `values` (trials, pixels) of a few."""
     if path.integrator.low_discrepancy:  # `Trial.errors` divides by the samples
         return samples * _variance_of_samples(values, weights, samples)

@@ -385,11 +385,12 @@ class IterativeSession:
                 f"{self.variant}, but the active one is now "
                 f"{mi.variant()}"
             )
-        with dr.suspend_grad(), self.sums.all_or_nothing():
+        with dr.suspend_grad():
             self.start()
-            self._run(self.sums.done.first_missing if iteration is None else iteration)
-            dr.eval(self.sums.tensors)
-            dr.sync_thread()
+            with self.sums.all_or_nothing():
+                self._run(self.sums.done.first_missing if iteration is None else iteration)
+                dr.eval(self.sums.tensors)
+                dr.sync_thread()
 
     PASSES = {}
     """Recorded passes of sessions whose buffers grow one by one: the method of each, and the

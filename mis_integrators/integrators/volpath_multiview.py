@@ -387,15 +387,37 @@ class MultiViewSession(IterativeSession):
         return spectral
 
     def _run(self, iteration):
-        seed, spectral = self._seed(iteration, PATHS), self._spectral(iteration)
-        # Even and odd iterations are independent: what each learns serves the others (`films`).
-        half, parity = divmod(iteration, 2)
-        sequence = self._sequence(half, (EVEN, ODD)[parity], self.camera_paths)
+        spectral = self._spectral(iteration)
+        seed, sequence = self._numbers(iteration)
         layers = [
             self._part(first, seed, sequence, spectral)
             for first in range(0, self.views.paths, self.paths)
         ]
         self.accumulator.add(*(sum(layer[1:], layer[0]) for layer in zip(*layers)), iteration)
+
+    def radiance(self, iteration, numbers, variation=0):
+        """What the camera paths of these `numbers` bring in an iteration, where there is one view.
+        The variations of a pixel's first path are parts of one sequence."""
+        spectral = self._spectral(iteration + variation)
+        seed, sequence = self._numbers(iteration)
+        if variation:
+            seed = self._seed(iteration + variation, PATHS)
+            sequence.first += variation
+        pivots, radiance, _, _ = self._first_pass(
+            self.scene, self._tables, numbers, seed, sequence, spectral
+        )
+        dr.eval(pivots, radiance)
+        _, value = self._suffix_pass(
+            self.scene, self._tables, pivots, None, numbers, seed, sequence
+        )
+        return radiance + value
+
+    def _numbers(self, iteration):
+        """The seed and the sequence of an iteration. Even and odd ones are independent: what each
+        learns serves the others (`films`)."""
+        half, parity = divmod(iteration, 2)
+        sequence = self._sequence(half, (EVEN, ODD)[parity], self.camera_paths)
+        return self._seed(iteration, PATHS), sequence
 
     def estimate(self):
         """As of other sessions, with all pixels of all views in one row: (1, pixels, 3)."""

@@ -344,7 +344,9 @@ def interaction_at(hit, ray, scatters, active):
         ray.time,
         ray.wavelengths,
     )
-    within.sh_frame, within.wi = mi.Frame3f(-ray.d), mi.Vector3f(0, 0, 1)
+    # A frame passes on what its normal lacks of a unit vector, three times at each scattering.
+    towards = dr.normalize(-ray.d)
+    within.sh_frame, within.wi = mi.Frame3f(towards), mi.Vector3f(0, 0, 1)
     return dr.select(active & scatters, within, si)
 
 

@@ -15,9 +15,6 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from comparing import Estimate, PathBatches, agree, assert_same, block_means, collect_until
-from foggy import even, view, volpath
-from foggy import grid as smoke
-from foggy import world as foggy_world
 from selection import extended
 from test_against_path import MONO, RGB, SPECTRAL, caustic_scene
 from test_bdpm import glossy_box, last_words
@@ -379,18 +376,6 @@ def test_what_was_decided_can_be_recalled(rgb):
 
 def test_means(rgb):
     agree(auto(camera_paths=8), path(), tray("lambertian", "rectangle"))
-
-
-def test_media_are_handed_over(rgb):
-    scene = foggy_world(view((0, 1, 4)), smoke(even, 4))
-    session = auto(max_depth=6).session(scene, spp=16)
-    session.iterate()
-    assert (
-        session.settings["integrator"] == "volpath_multiview" and session.settings["max_depth"] == 6
-    )
-    image = np.array(mi.render(scene, integrator=auto(max_depth=6, camera_paths=16), spp=256))
-    oracle = np.array(mi.render(scene, integrator=volpath(max_depth=6, rr_depth=5), spp=256))
-    assert abs(image.mean() / oracle.mean() - 1) < 0.03
 
 
 def test_errors(rgb):

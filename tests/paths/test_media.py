@@ -7,7 +7,7 @@ from mis_integrators.core.random import streams
 from mis_integrators.core.sequences import SampleSequence
 from mis_integrators.core.traits import SceneTraits, UnsupportedScene
 from mis_integrators.lights.lights import Lights
-from mis_integrators.paths.media import fly, transmitted
+from mis_integrators.paths.media import fly, interaction_at, sample_phase, transmitted
 from mis_integrators.paths.vertex import Sides
 
 import drjit as dr
@@ -158,3 +158,28 @@ def test_emitters_in_several_media_are_refused(rgb):
     scene = fog_scene(homogeneous(), lamp={**LAMP, "center": [0, 1, 0]})
     with pytest.raises(UnsupportedScene, match=r"AreaLight .* stands in several media"):
         Lights(scene, "bdpt").find_media(scene.sensors()[0], "bdpt")
+
+
+def test_directions_stay_unit_vectors(rgb):
+    """However often a path scatters: what rounding adds must not grow from one to the next."""
+    medium, count = mi.load_dict(homogeneous(phase={"type": "hg", "g": 0.7})), 1000
+    rng = streams(dr.arange(mi.UInt32, count), mi.UInt32(1))
+    direction = dr.normalize(mi.Vector3f(1, 2, 3) + dr.zeros(mi.Vector3f, count))
+    hit = dr.zeros(mi.PreliminaryIntersection3f, count)
+    hit.t = mi.Float(1)
+    everywhere = dr.ones(mi.Bool, count)
+    for _ in range(60):
+        si = interaction_at(hit, mi.Ray3f(mi.Point3f(0), direction), everywhere, everywhere)
+        point = mi.Point2f(rng.next_float32(), rng.next_float32())
+        sample, _ = sample_phase(
+            mi.MediumPtr(medium),
+            si,
+            rng.next_float32(),
+            point,
+            dr.zeros(mi.BSDFSample3f, count),
+            mi.Spectrum(1),
+            everywhere,
+        )
+        direction = si.to_world(sample.wo)
+        dr.eval(direction, rng)
+    assert np.abs(np.array(dr.norm(direction)) - 1).max() < 1e-5

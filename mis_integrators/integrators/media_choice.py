@@ -1,0 +1,125 @@
+"""The choice of `bdpm_auto` in participating media: photons, or camera paths alone.
+
+Camera paths are those of `volpath_multiview` with one view. Photons are tried where light sub-paths
+leave enough of them and no medium is a grid, and where camera paths cannot see all of the light.
+(From a far lamp few sub-paths meet a small cloud, and a pilot cannot tell how much so few photons
+blur.) Both are judged on the same pixels, as on surfaces (`choice`).
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..core.spectra import channel_mean
+from ..core.traits import UnsupportedScene
+from ..pilot.denoiser import LEFT
+from ..pilot.noise import MEASURES
+from ..pilot.setting import UNPLANNED_ITERATIONS
+from ..volume.views import views_of
+from .choice import (
+    PATH_TRIALS,
+    TRIAL_INDEX,
+    Decision,
+    Trial,
+    camera_paths_are_blind,
+    decide,
+    handed_on,
+    no_photons,
+    variance_of_one,
+    why_not_camera_paths,
+)
+
+CAMERA, PHOTONS = "volpath_multiview", "bdpm"
+CANDIDATES = {CAMERA: {}, PHOTONS: {"bdd": 0}}
+"""Plugins that may be chosen, and their parameters."""
+ENOUGH = 0.3
+"""Tuned: photons that a light sub-path leaves, on average, from which on a pilot is worth its time
+and knows their blur."""
+PATHS_AN_ITERATION = 4.0
+"""Tuned: camera paths that cost as much as an iteration of photons, for each that it has itself.
+1.5 to 4.5 were measured. The most counts: where both are close, camera paths are the safer."""
+
+
+def choose_in_media(integrator, scene, sensor, seed, iterations, seconds):
+    """The `Decision` for a render of so many iterations, or of so many seconds (either may be
+    `None`)."""
+    render = integrator, scene, sensor, seed, iterations
+    camera = new_session_in_media(CAMERA, *render)
+    photons, reason = _photons(render)
+    if photons is not None:
+        photons.plan_time(seconds)
+        photons.start()
+        if photons.prediction is not None:
+            return _judged(camera, photons, iterations, seconds)
+        reason = "no camera path meets anything that scatters smoothly"
+    return Decision(CAMERA, camera, [f"{CAMERA}: {reason}"])
+
+
+def new_session_in_media(plugin, integrator, scene, sensor, seed, iterations):
+    """A session of a candidate, with the parameters of `integrator` that both share."""
+    parameters = {"type": plugin, **handed_on(integrator), **CANDIDATES[plugin]}
+    if iterations or plugin == PHOTONS:
+        parameters["camera_paths"] = integrator.initial_camera_paths
+    if plugin == PHOTONS:
+        parameters["denoised"] = integrator.denoised
+    made = mi.load_dict(parameters)
+    samples = (iterations or 0) * integrator.initial_camera_paths
+    return made.session(scene, sensor, seed, samples)
+
+
+def _photons(render):
+    """A session of photons, if they are worth a pilot; else `None`, and why not, in one line."""
+    integrator, _, sensor, *_ = render
+    if len(views_of(sensor)) > 1:
+        return None, "several views share their paths"
+    try:
+        session = new_session_in_media(PHOTONS, *render)
+    except UnsupportedScene as refusal:
+        return None, str(refusal)
+    if not session.kinds():
+        return None, no_photons(integrator, session)
+    if not camera_paths_are_blind(session):
+        if session.traits.has_grids:
+            return None, "in media of grids a pilot of photons takes too long"
+        found = session.photons_of_a_path()
+        if found < ENOUGH:
+            return None, f"light sub-paths leave {found:.2g} photons each, too few to try them"
+    return session, None
+
+
+def _judged(camera, photons, iterations, seconds):
+    """The `Decision` once a pilot has run."""
+    prediction, cost = photons.prediction, PATHS_AN_ITERATION * photons.camera_paths
+    budget = cost * (prediction.iterations if seconds else iterations or UNPLANNED_ITERATIONS)
+    trials, reasons = [_trial_of_photons(photons, cost)], []
+    blind = why_not_camera_paths(CAMERA, photons, prediction)
+    if blind:
+        reasons.append(blind)
+    else:
+        left = LEFT if photons.integrator.denoised else 1
+        trials.insert(0, _trial_of_camera_paths(camera, prediction, budget, left))
+    return decide(trials, reasons, budget, cost)
+
+
+def _trial_of_photons(session, cost):
+    errors = session.prediction.errors
+    parts = {name: (error.squared_bias, error.variance) for name, error in errors.items()}
+    return Trial(PHOTONS, session, parts, cost)
+
+
+def _trial_of_camera_paths(session, prediction, budget, left):
+    """Camera paths on the pilot's pixels, each of which costs one; `left`: what a denoiser leaves
+    of their noise."""
+    pixels = prediction.pixels
+    numbers = dr.arange(mi.UInt32, pixels.count) * (pixels.stride * session.camera_paths)
+    values = np.empty((PATH_TRIALS, pixels.count))
+    for number in range(PATH_TRIALS):
+        values[number] = channel_mean(session.radiance(TRIAL_INDEX, numbers, number))
+    samples = max(round(budget), 1)
+    parts = {
+        measure: (0.0, left * variance_of_one(session, values, weigh(prediction.mean), samples))
+        for measure, weigh in MEASURES.items()
+    }
+    return Trial(CAMERA, session, parts, 1.0)
