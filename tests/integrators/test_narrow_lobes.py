@@ -41,6 +41,10 @@ def test_concentration_is_an_integral(rgb):
 def box(**bsdfs):
     """A Cornell box with other materials, by shape; 48 pixels wide."""
     scene = mi.cornell_box()
+    # Off the floor: which of two faces in one plane a ray meets is chance, and not the same chance
+    # from above and from below.
+    lifted = mi.ScalarTransform4f().translate([0, 0.02, 0])
+    scene["small-box"]["to_world"] = lifted @ scene["small-box"]["to_world"]
     for name, bsdf in bsdfs.items():
         scene[name] = {**scene[name], "bsdf": bsdf}
     scene["sensor"]["film"] = {
