@@ -11,7 +11,9 @@ import lamplit
 import mitsuba as mi
 import numpy as np
 import pytest
+from comparing import in_one_thread
 from lamplit import read, same, write_scene
+from selection import extended
 
 pytest.importorskip("mitsuba_oidn")
 
@@ -188,7 +190,8 @@ def test_direct_light_is_the_layer_of_that_name(rgb, plugin):
     assert 0.2 < direct.mean() / image[..., :3].mean() < 0.95
 
 
-@pytest.mark.parametrize("sampler", ["sobol", "independent"])
+@pytest.mark.parametrize("sampler", ["sobol", *extended("independent")])
+@in_one_thread
 def test_noise_of_direct_light_is_measured(rgb, sampler):
     """The channel of its variance against that of 24 renders, in blocks of 8 x 8 pixels without
     the lamp's: the median ratio is within a factor 1.5 (seeds are fixed)."""

@@ -62,7 +62,6 @@ BY_DEFAULT = [
     ("disk", "mixed2", 2, ORTHO, MONO, "tent"),
     ("constant", "mixed0", 1, ORTHO, SPECTRAL, "box"),
     ("directionalarea", "smooth1", 0, PERSPECTIVE, RGB, "box"),
-    ("rectangle", "mixed0", 0, PERSPECTIVE, RGB, "box"),
 ]
 
 

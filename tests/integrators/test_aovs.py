@@ -1,7 +1,6 @@
 """The parameter `aovs`: layers besides the image."""
 
 import sys
-from itertools import product
 
 from mis_integrators import _plugins
 from mis_integrators.paths.layers import (
@@ -17,9 +16,16 @@ import lamplit
 import mitsuba as mi
 import numpy as np
 import pytest
-from comparing import Estimate, assert_same, block_means, differences, pictures
+from comparing import (
+    Estimate,
+    assert_same,
+    block_means,
+    differences,
+    in_one_thread,
+    pictures,
+)
 from light_by_class import traced
-from selection import extended
+from selection import extended, one_in_each_row
 from worlds import bdpm, film, look, path, ptracer, tray
 
 SURFACE_PLUGINS = [plugin for plugin in _plugins.PLUGINS if plugin != "volpath_multiview"]
@@ -255,7 +261,6 @@ def test_nothing_is_made_where_nothing_is_asked_for(rgb, monkeypatch):
 
 SPLIT_ALL = "d:direct,i:indirect,c:caustic"
 VARIANTS = "llvm_ad_rgb", "llvm_ad_mono", "llvm_ad_spectral", "cuda_ad_rgb"
-PAIRS = [("llvm_ad_spectral", "bdpm_opt3")]
 WIDE = {"rfilter": "gaussian", "pixel_format": "rgba"}
 LARGE = {"max_depth": 4, "camera_paths": 8, "sampler": "independent"}
 OF = {
@@ -267,6 +272,7 @@ OF = {
 """Parameters of plugins whose images are compared with others'."""
 
 
+@in_one_thread
 def split_batches(plugin, scene, count, blocks=3, **parameters):
     """Region means of iterations, for the three classes apart: an `Estimate` each."""
     given = {"aovs": SPLIT_ALL, **LARGE, **OF.get(plugin, {}), **parameters}
@@ -278,6 +284,7 @@ def split_batches(plugin, scene, count, blocks=3, **parameters):
     ]
 
 
+@in_one_thread
 def reference(integrator, scene, count=16, spp=64):
     """Region means of renders by one of Mitsuba's integrators."""
     images = (
@@ -321,10 +328,7 @@ def test_split_sums_to_the_image(rgb, plugin, options):
 
 @pytest.mark.parametrize(
     "variant, plugin",
-    [
-        *PAIRS,
-        *extended(*(pair for pair in product(VARIANTS, REPRESENTATIVES) if pair not in PAIRS)),
-    ],
+    one_in_each_row(VARIANTS, REPRESENTATIVES, [("llvm_ad_spectral", "bdpm_opt3")]),
     indirect=["variant"],
 )
 def test_split_in_all_variants(variant, plugin):

@@ -24,6 +24,7 @@ from comparing import (
     collect_until,
     differences,
     extrapolate,
+    in_one_thread,
     kernels_of,
     pictures,
     smallest_visible,
@@ -121,6 +122,7 @@ def test_strategies_agree(rgb, first, second):
     assert_same(*collect_until(a, b, block=0.05, most=600), block=0.05)
 
 
+@in_one_thread
 def test_bias_falls_with_the_square_of_the_radius(rgb):
     """Where irradiance is curved, E'' R^2 / 8: the bias at R over that at R / 2 is 4, and R -> 0 is
     unbiased.
@@ -188,6 +190,7 @@ def test_alpha_shrinks_the_radius(rgb):
     np.testing.assert_allclose(second, 2 * small.image() - one, rtol=2e-3, atol=1e-4)
 
 
+@pytest.mark.extended
 def test_alpha_leaves_the_mean(rgb):
     agree(
         bdpm(alpha=0.7, initial_radius=0.08, bdd=0), path(rr_depth=50), tray("lambertian", "point")
@@ -274,6 +277,7 @@ def test_error_falls_with_iterations(rgb):
 
 
 @pytest.mark.parametrize("rfilter", ["box", pytest.param("gaussian", marks=pytest.mark.full)])
+@in_one_thread
 def test_variance_is_that_of_the_mean(rgb, rfilter):
     """Mean over the image of the estimated variance, against that of 32 seeds: within 15 % (its own
     error is 3 %)."""
@@ -358,6 +362,7 @@ def test_crop_is_the_cropped_window(rgb, rfilter, bdd):
         ),
     ],
 )
+@in_one_thread
 def test_reconstruction_filters(rgb, rfilter, border):
     """Means of border rows and columns and of the whole agree with `path`, whatever the filter and
     its border."""
@@ -535,7 +540,7 @@ def test_roulette_leaves_the_mean(rgb, bdd, rr_depth):
     )
 
 
-@pytest.mark.parametrize("camera_paths, photon_count", [(7, 3000), *extended((2, 50000), (16, 0))])
+@pytest.mark.parametrize("camera_paths, photon_count", extended((7, 3000), (2, 50000), (16, 0)))
 def test_numbers_of_paths_leave_the_mean(rgb, camera_paths, photon_count):
     agree(
         bdpm(bdd=0, camera_paths=camera_paths, photon_count=photon_count),
@@ -871,6 +876,7 @@ def point_film():
     }
 
 
+@in_one_thread
 def test_a_camera_that_sees_one_point(rgb):
     """The automatic radius then follows from the photons, not from the spread of what is seen:
     indirect light, two fifths here, is not lost."""
@@ -954,6 +960,7 @@ def test_rare_photons_get_no_smallest_radius(rgb):
         ),
     ],
 )
+@in_one_thread
 def test_noise_of_several_camera_paths_is_foreseen(rgb, plugin, given, camera_paths):
     """The pilot has as many: within a factor 1.3 of twelve renders. (Its law is that of independent
     numbers.)"""
@@ -1176,6 +1183,7 @@ def test_spectral_colour():
     assert (np.sqrt(a.error2) < 0.05 * a.mean).all(), "test too weak"
 
 
+@pytest.mark.extended
 def test_variants_in_turn():
     """rgb, spectral, rgb: the plugin works each time, and the first image comes back."""
     images = []
