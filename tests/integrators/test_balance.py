@@ -356,7 +356,7 @@ def test_emission_ratio(rgb, emitter):
 
 RENDERS = [
     (RGB, "smooth0", "rectangle", 3, 1.0),
-    (MONO, "mixed0", "envmap", 2, 2.0),
+    *extended((MONO, "mixed0", "envmap", 2, 2.0)),
     *extended((SPECTRAL, "lambertian", "spot", 4, 1.0), (RGB, "lambertian", "sphere", 6, 1.5)),
 ]
 MORE_RENDERS = [

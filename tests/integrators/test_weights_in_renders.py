@@ -227,7 +227,7 @@ ROWS = [
 
 
 SLOW = ("sphere", "disk", "cube", "envmap rotated", "several", "sunsky", "point")
-BY_DEFAULT = ("rectangle", "constant")
+BY_DEFAULT = ("rectangle",)
 MARKS = {
     **{emitter: [pytest.mark.extended] for emitter in EMITTERS if emitter not in BY_DEFAULT},
     **{emitter: [pytest.mark.full] for emitter in SLOW},
