@@ -283,7 +283,7 @@ def failing(monkeypatch, plugin, error, at):
 @pytest.mark.parametrize(
     "plugin, error, message",
     [
-        ("bdpm", RuntimeError("the device is gone"), "the device is gone"),
+        ("bdpt", RuntimeError("the device is gone"), "the device is gone"),
         ("path", MemoryError(), "not enough memory"),
         ("volpath_multiview", TypeError("a defect"), "TypeError: a defect"),
     ],

@@ -277,7 +277,7 @@ def test_the_cheaper_wins(rgb, monkeypatch):
     assert dear["choice.relmse.path"] > dear["choice.relmse.bdpm"]
 
 
-@pytest.mark.parametrize("seconds, samples", [(1000.0, 8), (None, 1)])
+@pytest.mark.parametrize("seconds, samples", [(1000.0, 8), *extended((None, 1))])
 def test_a_path_of_given_time_keeps_the_processor_busy(rgb, monkeypatch, seconds, samples):
     """A launch of one sample a pixel is too small on small films; what is predicted of `path` is
     the same, however many it takes together."""
@@ -386,6 +386,7 @@ def test_what_was_decided_can_be_recalled(rgb):
     assert np.allclose(first.image(), second.image(), rtol=1e-3, atol=1e-5)
 
 
+@pytest.mark.extended
 def test_means(rgb):
     agree(auto(camera_paths=8), path(), tray("lambertian", "rectangle"))
 

@@ -536,7 +536,6 @@ ROWS = [
         {"light_paths": 50},
         marks=pytest.mark.full,
     ),
-    ("pcbpt", "several", "smooth1", "orthographic", MONO, {}),
     (
         "bdpt_ris",
         "several",
@@ -546,6 +545,7 @@ ROWS = [
         {"weights": "published", "target": "f_y_f_yz", "resamples": 2, "light_paths": 50},
     ),
     *extended(
+        ("pcbpt", "several", "smooth1", "orthographic", MONO, {}),
         ("pcbpt", "rectangle", "smooth0", "perspective", MONO, {"weights": "published"}),
         (
             "bdpt_ris",

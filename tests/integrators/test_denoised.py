@@ -55,6 +55,7 @@ def test_means_stay(scene):
     assert np.median(5.3 * error / a.mean(axis=0)) < 0.1, "test too weak"
 
 
+@pytest.mark.extended
 def test_noise_moves_from_near_pixels_together_to_each_apart(scene):
     """With disks of five pixels, weights for a denoiser leave less noise in blocks of 36 pixels,
     and more in pixels alone. (The seeds are fixed; the ratios are about 0.7 and 2.5.)"""

@@ -20,8 +20,8 @@ def integrator(plugin="bdpm", **parameters):
     "material, count, parameters",
     [
         ("lambertian", 5, {"bdd": 0, "camera_paths": 2}),
-        ("rough", 0, {"plugin": "bdpm_opt2"}),
         *extended(
+            ("rough", 0, {"plugin": "bdpm_opt2"}),
             ("lambertian", 5, {"bdd": 0}),
             ("lambertian", 0, {"bdd": 1}),
             ("rough", 0, {"bdd": 0, "camera_paths": 2}),

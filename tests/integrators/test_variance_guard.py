@@ -64,7 +64,7 @@ def iterations(scene, method, radius, mixture):
     return np.array([picture[..., :3] for picture in pictures(session, ITERATIONS)])
 
 
-@pytest.fixture(scope="module", params=["cornell_glossy", *extended("cornell_point")])
+@pytest.fixture(scope="module", params=extended("cornell_glossy", "cornell_point"))
 def measured(request):
     """Of a scene: its name, the mean relative variance of each method and group, and the maps and
     pictures."""

@@ -372,6 +372,7 @@ def test_weights_lower_the_noise(rgb):
         )
 
 
+@pytest.mark.extended
 @in_one_thread
 def test_noise_law(rgb):
     """Variance of an iteration = X / (N_F N_B) + B / N_B + (1 - 1 / N_B) F / N_F (Ershov et al.
@@ -533,7 +534,7 @@ HARD = {
 }
 
 
-@pytest.mark.thinned(2, 2, 6)
+@pytest.mark.thinned(2, 2, 12)
 @pytest.mark.parametrize(
     "plugin",
     [{"type": "bdpm_opt3"}, {"type": "bdpm_opt", "weights": "full", "mix_diffuse": True}],

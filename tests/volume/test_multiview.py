@@ -659,7 +659,7 @@ def test_films(rgb, rfilter, options):
         assert smallest_visible(a, b)[0] < 0.05 and np.median(smallest_visible(a, b)) < 0.25
 
 
-@pytest.mark.parametrize("sampler", ["sobol", *extended("independent")])
+@pytest.mark.parametrize("sampler", extended("sobol", "independent"))
 @in_one_thread
 def test_variance(rgb, sampler):
     """The variance channels against the variance of independent renders. Between iterations that
@@ -691,6 +691,7 @@ def test_means_of_independent_numbers(rgb):
     views_agree(multiview(sampler="independent"), reference(0.6), cloud(g=0.6), block=0.05)
 
 
+@pytest.mark.extended
 @in_one_thread
 def test_sequences_lower_the_variance(rgb):
     """One view, so that pixels are independent: the variance of 32 paths each, over 24 seeds,
