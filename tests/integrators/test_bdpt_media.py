@@ -139,22 +139,15 @@ SCENES = {
         homogeneous(), sun={"type": "directional", "direction": [0.3, -1, 0.2], "irradiance": 2.0}
     ),
     "many kinds": lambda: fog_scene(
-        {**coloured(), "scale": 1.5, "phase": blended()},
-        left=ball(
+        homogeneous(phase=blended()),
+        veil=ball(
             {"type": "mask", "opacity": 0.4, "nested": {"type": "twosided", "nested": diffuse()}},
             0.4,
             center=[-0.5, 0.3, 0],
             exterior=FOG,
             interior=homogeneous(3.0, 0.7, tabulated()),
         ),
-        right=ball(
-            {"type": "null"},
-            0.4,
-            center=[0.5, 0.3, 0],
-            exterior=FOG,
-            interior=grid(pockets, scale=3.0),
-        ),
-        plastic=ball({"type": "plastic"}, 0.25, center=[0, -0.4, 0.4], exterior=FOG),
+        plastic=ball({"type": "plastic"}, 0.3, center=[0.5, 0, 0], exterior=FOG),
         sky={"type": "constant", "radiance": grey(0.4)},
     ),
 }
