@@ -182,7 +182,7 @@ def channels_of(image, names, prefix):
     return image[..., [names.index(f"{prefix}.{name}") for name in "RGB"]]
 
 
-@pytest.mark.parametrize("plugin", ["bdpm", "bdpm_opt2"])
+@pytest.mark.parametrize("plugin", ["bdpm", *extended("bdpm_opt2")])
 def test_direct_light_is_the_layer_of_that_name(rgb, plugin):
     image, names = denoised_with_names(plugin, lamp_in_a_box(rgb), aovs="lit:direct,rest:indirect")
     direct = channels_of(image, names, "direct_light")

@@ -300,7 +300,7 @@ def measured_in_sphere(
 @pytest.mark.parametrize(
     "strategies, settings",
     [
-        (2, {"iterations": 200, "size": 24, "light_paths": 200}),
+        *extended((2, {"iterations": 200, "size": 24, "light_paths": 200})),
         # A gather for each pair of a vertex and a frozen photon: ten times the seconds.
         pytest.param(
             3,

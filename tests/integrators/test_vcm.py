@@ -112,8 +112,7 @@ def test_light_that_only_merging_makes_in_media(rgb):
 @pytest.mark.parametrize(
     "name",
     [
-        "sensor within",
-        *extended("coloured", "glass", "mask"),
+        *extended("sensor within", "coloured", "glass", "mask"),
         *(pytest.param(name, marks=pytest.mark.full) for name in ("grid", "sky", "lamp within")),
     ],
 )
