@@ -165,7 +165,7 @@ def test_agrees_with_volpath(rgb, name):
     agree_with_volpath(bdpt(), SCENES[name](), whole=0.02, block=0.06)
 
 
-@pytest.mark.parametrize("variant_name", ["llvm_ad_spectral", *extended("llvm_ad_mono")])
+@pytest.mark.parametrize("variant_name", extended("llvm_ad_spectral", "llvm_ad_mono"))
 def test_agrees_in_other_variants(variant_name):
     """Wavelengths have extinctions of their own; one free flight serves all of a path's."""
     mi.set_variant(variant_name)
@@ -204,7 +204,7 @@ def curtain(opacity, radius, fov):
 
 
 @pytest.mark.parametrize(
-    "max_depth, opacity, radius, fov", [(2, 0.3, 0.9, 20.0), *extended((4, 0.03, 0.5, 40.0))]
+    "max_depth, opacity, radius, fov", extended((2, 0.3, 0.9, 20.0), (4, 0.03, 0.5, 40.0))
 )
 def test_half_transparent_surfaces(rgb, max_depth, opacity, radius, fov):
     """All that is seen, and most light, comes through a mask: paths that pass it go on as if it

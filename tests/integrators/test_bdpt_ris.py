@@ -536,16 +536,16 @@ ROWS = [
         {"light_paths": 50},
         marks=pytest.mark.full,
     ),
-    (
-        "bdpt_ris",
-        "several",
-        "mixed1",
-        "thinlens",
-        RGB,
-        {"weights": "published", "target": "f_y_f_yz", "resamples": 2, "light_paths": 50},
-    ),
+    ("pcbpt", "several", "smooth1", "orthographic", MONO, {}),
     *extended(
-        ("pcbpt", "several", "smooth1", "orthographic", MONO, {}),
+        (
+            "bdpt_ris",
+            "several",
+            "mixed1",
+            "thinlens",
+            RGB,
+            {"weights": "published", "target": "f_y_f_yz", "resamples": 2, "light_paths": 50},
+        ),
         ("pcbpt", "rectangle", "smooth0", "perspective", MONO, {"weights": "published"}),
         (
             "bdpt_ris",
