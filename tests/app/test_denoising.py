@@ -13,7 +13,9 @@ import lamplit
 import mitsuba as mi
 import numpy as np
 import pytest
+from comparing import in_one_thread
 from lamplit import read, same, write_scene
+from selection import extended
 
 pytest.importorskip("mitsuba_oidn")
 
@@ -207,7 +209,7 @@ def channels_of(image, names, prefix):
     return image[..., [names.index(f"{prefix}.{name}") for name in "RGB"]]
 
 
-@pytest.mark.parametrize("plugin", ["bdpm", "bdpm_opt2"])
+@pytest.mark.parametrize("plugin", ["bdpm", *extended("bdpm_opt2")])
 def test_direct_light_is_the_layer_of_that_name(rgb, plugin):
     image, names = denoised_with_names(plugin, lamp_in_a_box(rgb), aovs="lit:direct,rest:indirect")
     direct = channels_of(image, names, "direct_light")
@@ -215,8 +217,14 @@ def test_direct_light_is_the_layer_of_that_name(rgb, plugin):
     assert 0.2 < direct.mean() / image[..., :3].mean() < 0.95
 
 
+<<<<<<< HEAD
 @pytest.mark.parametrize("sampler, most", [("sobol", 16), ("independent", 1.5)])
 def test_noise_of_direct_light_is_measured(rgb, sampler, most):
+=======
+@pytest.mark.parametrize("sampler", ["sobol", *extended("independent")])
+@in_one_thread
+def test_noise_of_direct_light_is_measured(rgb, sampler):
+>>>>>>> quick_tests
     """The channel of its variance against that of 24 renders, in blocks of 8 x 8 pixels without
     the lamp's: the median ratio is within a factor 1.5 (seeds are fixed). Sequences make less
     noise than the independent numbers that the channel is for, at best 16 iterations that of 256.

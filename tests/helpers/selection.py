@@ -11,6 +11,17 @@ def extended(*rows):
     ]
 
 
+def one_in_each_row(rows, columns, usual=()):
+    """All pairs for ``parametrize``: `usual` ones as they are; of each row besides one in the next
+    column, as ``extended``; the others as ``full``."""
+    pairs = []
+    for number, row in enumerate(rows):
+        for place, column in enumerate(columns):
+            mark = pytest.mark.full if (place - number) % len(columns) else pytest.mark.extended
+            pairs.append(pytest.param(row, column, marks=[] if (row, column) in usual else [mark]))
+    return pairs
+
+
 LIKE_OTHERS = "disk", "cylinder", "cube", "constant", "envmap"
 """Emitters (of `worlds.EMITTERS`) of kinds that others there have, too."""
 

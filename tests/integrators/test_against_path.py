@@ -6,8 +6,8 @@ BSDF; 8 % where mirrors and glass are about or rough glass stands under a point 
 full product) with a probability of 0.95, at a false-alarm rate of 1e-6 (`comparing`). The merge
 radius is a tenth of the spheres'; `test_bias_is_below_resolution` shows that what it blurs is not
 seen. The rows cover every pair of (emitter, family of BSDFs), the depths bdd, sensors, variants and
-filters in turn; those of `BY_DEFAULT` are in the default run, with each family and variant,
-the others are extended. `-m full` adds the full product of emitters, families and bdd.
+filters in turn; those of `BY_DEFAULT` are in the default run, with BSDFs of each family, the others
+are extended. `-m full` adds the full product of emitters, families and bdd.
 """
 
 import mitsuba as mi
@@ -61,8 +61,6 @@ ROWS = [
 BY_DEFAULT = [
     ("disk", "mixed2", 2, ORTHO, MONO, "tent"),
     ("constant", "mixed0", 1, ORTHO, SPECTRAL, "box"),
-    ("directionalarea", "smooth1", 0, PERSPECTIVE, RGB, "box"),
-    ("rectangle", "mixed0", 0, PERSPECTIVE, RGB, "box"),
 ]
 
 

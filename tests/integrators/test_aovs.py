@@ -1,7 +1,6 @@
 """The parameter `aovs`: layers besides the image."""
 
 import sys
-from itertools import product
 
 from mis_integrators import _plugins
 from mis_integrators.paths.layers import (
@@ -17,9 +16,16 @@ import lamplit
 import mitsuba as mi
 import numpy as np
 import pytest
-from comparing import Estimate, assert_same, block_means, differences, pictures
+from comparing import (
+    Estimate,
+    assert_same,
+    block_means,
+    differences,
+    in_one_thread,
+    pictures,
+)
 from light_by_class import traced
-from selection import extended
+from selection import extended, one_in_each_row
 from worlds import bdpm, film, look, path, ptracer, tray
 
 SURFACE_PLUGINS = [plugin for plugin in _plugins.PLUGINS if plugin != "volpath_multiview"]
@@ -28,8 +34,8 @@ ALL = ",".join(f"{kind}_1:{kind}" for kind in CHANNELS)
 REPRESENTATIVES = "bdpm", "bdpm_opt3", "vcm", "bdpt_ris"
 """Plugins that together have every strategy."""
 BY_DEFAULT = [
-    *("bdpm", "bdpt_ris"),
-    *extended(*(plugin for plugin in SURFACE_PLUGINS if plugin not in ("bdpm", "bdpt_ris"))),
+    "bdpt_ris",
+    *extended(*(plugin for plugin in SURFACE_PLUGINS if plugin != "bdpt_ris")),
 ]
 
 
@@ -255,7 +261,6 @@ def test_nothing_is_made_where_nothing_is_asked_for(rgb, monkeypatch):
 
 SPLIT_ALL = "d:direct,i:indirect,c:caustic"
 VARIANTS = "llvm_ad_rgb", "llvm_ad_mono", "llvm_ad_spectral", "cuda_ad_rgb"
-PAIRS = [("llvm_ad_spectral", "bdpm_opt3")]
 WIDE = {"rfilter": "gaussian", "pixel_format": "rgba"}
 LARGE = {"max_depth": 4, "camera_paths": 8, "sampler": "independent"}
 OF = {
@@ -264,9 +269,10 @@ OF = {
     "bdpm_opt3": {"initial_radius": 0.04, "photon_count": 20000},
     "vcm": {"initial_radius": 0.04},
 }
-"""Parameters of plugins whose images are compared with others'."""
+"""Parameters of plugins for which no pilot has to be compiled, as others look at that."""
 
 
+@in_one_thread
 def split_batches(plugin, scene, count, blocks=3, **parameters):
     """Region means of iterations, for the three classes apart: an `Estimate` each."""
     given = {"aovs": SPLIT_ALL, **LARGE, **OF.get(plugin, {}), **parameters}
@@ -278,6 +284,7 @@ def split_batches(plugin, scene, count, blocks=3, **parameters):
     ]
 
 
+@in_one_thread
 def reference(integrator, scene, count=16, spp=64):
     """Region means of renders by one of Mitsuba's integrators."""
     images = (
@@ -300,7 +307,7 @@ def reference(integrator, scene, count=16, spp=64):
 def test_split_sums_to_the_image(rgb, plugin, options):
     """Up to rounding; and the image is the one that is not split."""
     scene = tray("delta", "several", size=24, crop_offset_y=3, crop_height=17, **options)
-    given = {"max_depth": 5, "hide_emitters": bool(options)}
+    given = {"max_depth": 5, "hide_emitters": bool(options), **OF.get(plugin, {})}
     images = []
     for aovs in (SPLIT_ALL, "none"):
         session = mi.load_dict({"type": plugin, "aovs": aovs, **given}).session(
@@ -321,17 +328,14 @@ def test_split_sums_to_the_image(rgb, plugin, options):
 
 @pytest.mark.parametrize(
     "variant, plugin",
-    [
-        *PAIRS,
-        *extended(*(pair for pair in product(VARIANTS, REPRESENTATIVES) if pair not in PAIRS)),
-    ],
+    one_in_each_row(VARIANTS, REPRESENTATIVES, [("llvm_ad_spectral", "vcm")]),
     indirect=["variant"],
 )
 def test_split_in_all_variants(variant, plugin):
     scene = tray("delta", "constant", size=12)
-    session = mi.load_dict({"type": plugin, "aovs": SPLIT_ALL, "max_depth": 4}).session(
-        scene, seed=1, spp=4
-    )
+    session = mi.load_dict(
+        {"type": plugin, "aovs": SPLIT_ALL, "max_depth": 4, **OF.get(plugin, {})}
+    ).session(scene, seed=1, spp=4)
     session.iterate()
     image = session.image()
     layers = image[..., -9:].reshape(12, 12, 3, 3).sum(axis=2)
@@ -349,7 +353,7 @@ def of_paths():
 
 @pytest.mark.parametrize(
     "plugin",
-    ["bdpm_opt3", *extended("bdpm", "bdpm_balance", "bdpt", "vcm", "pcbpt", "bdpt_ris")],
+    ["bdpm", *extended("bdpm_opt3", "bdpm_balance", "bdpt", "vcm", "pcbpt", "bdpt_ris")],
 )
 def test_split_is_that_of_paths(rgb, of_paths, plugin):
     """Mirrors, glass, masks, and BSDFs that are both, each in a block of its own: each class
@@ -435,7 +439,8 @@ def test_light_that_leaves_through_glass(rgb, plugin):
 def test_split_of_films_in_parts(rgb, monkeypatch, plugin, module, size):
     monkeypatch.setattr(sys.modules[f"mis_integrators.integrators.{module}"], size, 200)
     scene = tray("delta", "constant", size=24)
-    session = mi.load_dict({"type": plugin, "aovs": SPLIT_ALL}).session(scene, seed=3, spp=4)
+    given = {"aovs": SPLIT_ALL, **OF.get(plugin, {})}
+    session = mi.load_dict({"type": plugin, **given}).session(scene, seed=3, spp=4)
     session.iterate()
     assert session.chunks > 2
     image = session.image()

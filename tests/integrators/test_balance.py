@@ -356,8 +356,11 @@ def test_emission_ratio(rgb, emitter):
 
 RENDERS = [
     (RGB, "smooth0", "rectangle", 3, 1.0),
-    (MONO, "mixed0", "envmap", 2, 2.0),
-    *extended((SPECTRAL, "lambertian", "spot", 4, 1.0), (RGB, "lambertian", "sphere", 6, 1.5)),
+    *extended(
+        (MONO, "mixed0", "envmap", 2, 2.0),
+        (SPECTRAL, "lambertian", "spot", 4, 1.0),
+        (RGB, "lambertian", "sphere", 6, 1.5),
+    ),
 ]
 MORE_RENDERS = [
     pytest.param(RGB, family, emitter, strategies, beta, marks=pytest.mark.full)

@@ -303,7 +303,6 @@ class ResampledPaths(JointPaths):
     "name, bsdf, light, sensor, length, parameters",
     [
         ("bdpt_ris", "rough", "area", "thinlens", 3, {"resamples": 4}),
-        ("bdpt_ris", "bump", "constant", "perspective", 2, {}),
         ("pcbpt", "plastic", "area", "perspective", 3, {"light_tracing": 4}),
         (
             "bdpt_ris",
@@ -322,6 +321,7 @@ class ResampledPaths(JointPaths):
             {"weights": "published", "light_paths": 30},
         ),
         *extended(
+            ("bdpt_ris", "bump", "constant", "perspective", 2, {}),
             ("bdpt_ris", "plastic", "point", "orthographic", 3, {"light_paths": 1}),
             ("bdpt_ris", "plastic", "sphere", "perspective", 3, {"cache_neighbors": 1}),
         ),
@@ -537,16 +537,16 @@ ROWS = [
         marks=pytest.mark.full,
     ),
     ("pcbpt", "several", "smooth1", "orthographic", MONO, {}),
-    (
-        "bdpt_ris",
-        "several",
-        "mixed1",
-        "thinlens",
-        RGB,
-        {"weights": "published", "target": "f_y_f_yz", "resamples": 2, "light_paths": 50},
-    ),
-    ("pcbpt", "rectangle", "smooth0", "perspective", MONO, {"weights": "published"}),
     *extended(
+        (
+            "bdpt_ris",
+            "several",
+            "mixed1",
+            "thinlens",
+            RGB,
+            {"weights": "published", "target": "f_y_f_yz", "resamples": 2, "light_paths": 50},
+        ),
+        ("pcbpt", "rectangle", "smooth0", "perspective", MONO, {"weights": "published"}),
         (
             "bdpt_ris",
             "textured",
@@ -554,7 +554,7 @@ ROWS = [
             "perspective",
             MONO,
             {"resamples": 4, "target": "f_y_f_yz"},
-        )
+        ),
     ),
 ]
 

@@ -9,6 +9,7 @@ from mis_integrators.pilot.noise import MEASURES
 import mitsuba as mi
 import numpy as np
 import pytest
+from comparing import in_one_thread
 
 SCENE = Path(__file__).parents[2] / "scenes" / "cornell_glossy.xml"
 SIZE, BLOCK, RENDERS = 48, 6, 24
@@ -19,6 +20,7 @@ def scene(rgb):
     return mi.load_file(str(SCENE), resx=str(SIZE), resy=str(SIZE))
 
 
+@in_one_thread
 def renders(scene, spp=4, **parameters):
     """Images of as many seeds, mean over the channels: (renders, height, width)."""
     integrator = mi.load_dict({"max_depth": 6, **parameters})
@@ -53,6 +55,7 @@ def test_means_stay(scene):
     assert np.median(5.3 * error / a.mean(axis=0)) < 0.1, "test too weak"
 
 
+@pytest.mark.extended
 def test_noise_moves_from_near_pixels_together_to_each_apart(scene):
     """With disks of five pixels, weights for a denoiser leave less noise in blocks of 36 pixels,
     and more in pixels alone. (The seeds are fixed; the ratios are about 0.7 and 2.5.)"""

@@ -3,7 +3,7 @@
 import mitsuba as mi
 import numpy as np
 import pytest
-from comparing import SessionBatches, assert_same, collect_until
+from comparing import SessionBatches, assert_same, collect_until, in_one_thread
 from selection import extended
 from worlds import tray
 
@@ -20,8 +20,8 @@ def integrator(plugin="bdpm", **parameters):
     "material, count, parameters",
     [
         ("lambertian", 5, {"bdd": 0, "camera_paths": 2}),
-        ("rough", 0, {"plugin": "bdpm_opt2"}),
         *extended(
+            ("rough", 0, {"plugin": "bdpm_opt2"}),
             ("lambertian", 5, {"bdd": 0}),
             ("lambertian", 0, {"bdd": 1}),
             ("rough", 0, {"bdd": 0, "camera_paths": 2}),
@@ -53,6 +53,7 @@ def test_light_behind_mirrors_and_holes(rgb):
     assert_same(*collect_until(*sides, **POWER), **POWER)
 
 
+@in_one_thread
 def test_noise_of_direct_light_falls(rgb):
     """Where nearly all noise is that of direct light, four independent paths have a quarter of the
     variance of one: ratio of two variances of 4000 values each, within 0.2 to 0.3 (false alarms

@@ -7,7 +7,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from comparing import agree
+from comparing import agree, in_one_thread
+from selection import extended
 from worlds import path
 
 METAL = {"type": "roughconductor", "material": "Al"}
@@ -77,7 +78,9 @@ def narrow_box():
     return box(**{"small-box": FROSTED, "large-box": {**METAL, "alpha": 0.05}})
 
 
-@pytest.mark.parametrize("bdd, more", [(0, {"direct_paths": 3}), (1, {"camera_paths": 2})])
+@pytest.mark.parametrize(
+    "bdd, more", [(0, {"direct_paths": 3}), *extended((1, {"camera_paths": 2}))]
+)
 def test_means(rgb, bdd, more):
     """As of `path`, with false alarms of 1e-6 each: no light is lost or counted twice where paths
     go on, whatever sees direct light besides."""
@@ -89,6 +92,7 @@ def test_means(rgb, bdd, more):
     agree(integrator, path(**settings), scene, block=0.08)
 
 
+@in_one_thread
 def test_no_dots_on_smooth_metal(rgb):
     """Of a plate of metal that fills the picture: a fifth of the variance, at the most, of photons
     gathered there. (The seeds are fixed.)"""

@@ -110,7 +110,11 @@ def test_light_that_only_merging_makes_in_media(rgb):
 
 
 @pytest.mark.parametrize(
-    "name", ["sensor within", *extended("grid", "coloured", "glass", "mask", "sky", "lamp within")]
+    "name",
+    [
+        *extended("sensor within", "coloured", "glass", "mask"),
+        *(pytest.param(name, marks=pytest.mark.full) for name in ("grid", "sky", "lamp within")),
+    ],
 )
 def test_agrees_in_media(rgb, name):
     """An error of 2 % of the whole image and of 6 % of a quarter is seen."""

@@ -18,6 +18,7 @@ from comparing import (
     assert_powerful,
     collect_until,
     differences,
+    in_one_thread,
     t_quantile,
 )
 from selection import extended
@@ -105,15 +106,30 @@ class JointPaths:
         return light_state.read(merged, notes, index, mi.Bool(True))
 
 
-@pytest.mark.thinned(3, 3)
-@pytest.mark.parametrize("kind, strategies", [("local", 2), ("local", 4), ("full", 3)])
+KINDS = ("local", 2), ("local", 4), ("full", 3)
+TRAYS = [
+    (RGB, "lambertian", "point", True),
+    (RGB, "rough", "rectangle", False),
+    (MONO, "mixed0", "envmap", False),
+    (SPECTRAL, "smooth1", "spot", True),
+]
+"""Variant, family, emitter, and whether diffuse surfaces mix."""
+USUAL = (1, 2), (2, 1)
+"""Pairs of them that the default run has."""
+
+
+def mark_of(tray, kind):
+    if (tray, kind) in USUAL:
+        return []
+    return pytest.mark.full if (tray + kind) % 3 else pytest.mark.extended
+
+
 @pytest.mark.parametrize(
-    "variant_name, family, emitter, mix",
+    "variant_name, family, emitter, mix, kind, strategies",
     [
-        (RGB, "lambertian", "point", True),
-        (RGB, "rough", "rectangle", False),
-        (MONO, "mixed0", "envmap", False),
-        (SPECTRAL, "smooth1", "spot", True),
+        pytest.param(*tray, *kind, marks=mark_of(i, j))
+        for i, tray in enumerate(TRAYS)
+        for j, kind in enumerate(KINDS)
     ],
 )
 def test_weights_of_a_path_sum_to_one(variant_name, family, emitter, mix, kind, strategies):
@@ -211,7 +227,7 @@ ROWS = [
 
 
 SLOW = ("sphere", "disk", "cube", "envmap rotated", "several", "sunsky", "point")
-BY_DEFAULT = ("rectangle", "constant")
+BY_DEFAULT = ("rectangle",)
 MARKS = {
     **{emitter: [pytest.mark.extended] for emitter in EMITTERS if emitter not in BY_DEFAULT},
     **{emitter: [pytest.mark.full] for emitter in SLOW},
@@ -263,6 +279,7 @@ def test_one_strategy_is_bdpm(rgb):
 # --- Noise --------------------------------------------------------------------
 
 
+@in_one_thread
 def variances(scene, integrator, iterations=48, trimmed=1e-3):
     """Mean variance of an iteration's pixels, relative to the squared image, with its standard
     error over groups of pixels; the noisiest pixels are left out."""
@@ -355,6 +372,8 @@ def test_weights_lower_the_noise(rgb):
         )
 
 
+@pytest.mark.extended
+@in_one_thread
 def test_noise_law(rgb):
     """Variance of an iteration = X / (N_F N_B) + B / N_B + (1 - 1 / N_B) F / N_F (Ershov et al.
     2019: cross, camera and light noise): fitted to three pairs (N_B, N_F), it predicts three others
@@ -410,6 +429,7 @@ def noise_in_sphere(direct_weight, final_weight):
     return share / SPHERE["light_paths"] * photon**2 * squares
 
 
+@in_one_thread
 def measured_in_sphere(iterations):
     """The same of the weights as they are: mean, and standard error over blocks of the image."""
     scene = mi.load_dict(
@@ -468,7 +488,8 @@ def test_predicted_optimum(rgb):
 
 
 @pytest.mark.parametrize(
-    "number", [0, *extended(1), *(pytest.param(n, marks=pytest.mark.full) for n in range(2, 20))]
+    "number",
+    [*extended(0), *(pytest.param(n, marks=pytest.mark.full) for n in range(1, 20))],
 )
 def test_other_weights_are_worse(rgb, monkeypatch, number):
     """Weights that differ from the optimal ones by 20 % (RMS over the two kinds of paths, in a
@@ -513,7 +534,7 @@ HARD = {
 }
 
 
-@pytest.mark.thinned(2, 2, 6)
+@pytest.mark.thinned(2, 2, 12)
 @pytest.mark.parametrize(
     "plugin",
     [{"type": "bdpm_opt3"}, {"type": "bdpm_opt", "weights": "full", "mix_diffuse": True}],

@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from selection import one_of_each_kind
+from selection import extended, one_of_each_kind
 from worlds import EMITTERS, tray
 
 COUNT = 4096
@@ -61,14 +61,11 @@ def test_flux_is_light_over_densities(rgb, emitter):
 @pytest.mark.parametrize(
     "emitter",
     [
-        "rectangle",
         "textured",
-        "sphere",
         "spot",
-        "directional",
         "envmap rotated",
-        "several",
         "projector",
+        *extended("rectangle", "sphere", "directional", "several"),
     ],
 )
 def test_starts_light_the_scene(rgb, emitter):

@@ -17,7 +17,14 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from comparing import Estimate, assert_same, collect_until, differences, smallest_visible
+from comparing import (
+    Estimate,
+    assert_same,
+    collect_until,
+    differences,
+    in_one_thread,
+    smallest_visible,
+)
 from foggy import (
     SIZE,
     THREE_VIEWS,
@@ -108,7 +115,7 @@ def test_one_view_is_volpath(variant_name):
     views_agree(multiview(), volpath("volpathmis" if mi.is_spectral else "volpath"), smoky(sensor))
 
 
-@pytest.mark.parametrize("medium", ["grid", "homogeneous"])
+@pytest.mark.parametrize("medium", ["grid", *extended("homogeneous")])
 def test_furnace(rgb, medium):
     """Albedo one under a sky of radiance one: every pixel of every view is one, whatever is in the
     way. (Depth 200: what is cut off is far below 1e-4 of it.)"""
@@ -131,7 +138,7 @@ def test_furnace(rgb, medium):
     assert_same(*estimates, 0.003, 0.01, slack=1e-4)
 
 
-@pytest.mark.parametrize("scale", [1.0, 5.0])
+@pytest.mark.parametrize("scale", [5.0, *extended(1.0)])
 def test_transmittance(rgb, scale):
     """Ratio tracking through a grid of one value, with its majorant far above it, against the
     exponential; roulette included."""
@@ -157,11 +164,9 @@ def test_transmittance(rgb, scale):
 # --- Several views ------------------------------------------------------------
 
 
-BY_DEFAULT = "majorant_optical_depth", "raw_depth_copy"
-
-
 @pytest.mark.parametrize(
-    "shift", [*BY_DEFAULT, *extended(*(shift for shift in SHIFTS if shift not in BY_DEFAULT))]
+    "shift",
+    ["raw_depth_copy", *extended(*(shift for shift in SHIFTS if shift != "raw_depth_copy"))],
 )
 def test_shifts(rgb, shift):
     batches, _ = views_agree(multiview(shift=shift), reference(0.6), cloud(g=0.6), block=0.05)
@@ -220,7 +225,8 @@ def test_equal_weights(rgb):
 
 
 @pytest.mark.parametrize(
-    "variant_name", ["llvm_ad_rgb", pytest.param("llvm_ad_mono", marks=pytest.mark.full)]
+    "variant_name",
+    [*extended("llvm_ad_rgb"), pytest.param("llvm_ad_mono", marks=pytest.mark.full)],
 )
 def test_variants(variant_name):
     """Media, surfaces and all kinds of light together; coloured where there are colours."""
@@ -346,7 +352,7 @@ def reference_of_three():
 
 
 @pytest.mark.parametrize(
-    "shift", ["majorant_optical_depth", "raw_depth", *extended("primary_sample")]
+    "shift", ["raw_depth", *extended("majorant_optical_depth", "primary_sample")]
 )
 def test_three_media(rgb, shift):
     """Where majorants differ along a line of sight, so do raw depth and majorant optical depth;
@@ -653,7 +659,8 @@ def test_films(rgb, rfilter, options):
         assert smallest_visible(a, b)[0] < 0.05 and np.median(smallest_visible(a, b)) < 0.25
 
 
-@pytest.mark.parametrize("sampler", ["sobol", *extended("independent")])
+@pytest.mark.parametrize("sampler", extended("sobol", "independent"))
+@in_one_thread
 def test_variance(rgb, sampler):
     """The variance channels against the variance of independent renders. Between iterations that
     share a sequence they see noise that the mean does not have: they tell too much, never too
@@ -679,10 +686,13 @@ def test_variance(rgb, sampler):
 # --- Random numbers -----------------------------------------------------------
 
 
+@pytest.mark.extended
 def test_means_of_independent_numbers(rgb):
     views_agree(multiview(sampler="independent"), reference(0.6), cloud(g=0.6), block=0.05)
 
 
+@pytest.mark.extended
+@in_one_thread
 def test_sequences_lower_the_variance(rgb):
     """One view, so that pixels are independent: the variance of 32 paths each, over 24 seeds,
     against that of independent numbers; 0.57, by the median over pixels. Were they equal, a pixel's
@@ -747,7 +757,7 @@ def test_order_of_iterations(rgb, sampler):
     """An iteration is the same whatever was rendered before."""
     images = []
     for order in ((0, 1, 2, 3), (3, 1, 0, 2)):
-        session = multiview(sampler=sampler, camera_paths=2).session(smoky(batch(uneven())), spp=0)
+        session = multiview(sampler=sampler).session(smoky(batch(uneven())), spp=0)
         for iteration in order:
             session.iterate(iteration)
         images.append(session.image())
