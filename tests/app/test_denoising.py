@@ -217,14 +217,9 @@ def test_direct_light_is_the_layer_of_that_name(rgb, plugin):
     assert 0.2 < direct.mean() / image[..., :3].mean() < 0.95
 
 
-<<<<<<< HEAD
-@pytest.mark.parametrize("sampler, most", [("sobol", 16), ("independent", 1.5)])
-def test_noise_of_direct_light_is_measured(rgb, sampler, most):
-=======
-@pytest.mark.parametrize("sampler", ["sobol", *extended("independent")])
+@pytest.mark.parametrize("sampler, most", [("sobol", 16), *extended(("independent", 1.5))])
 @in_one_thread
-def test_noise_of_direct_light_is_measured(rgb, sampler):
->>>>>>> quick_tests
+def test_noise_of_direct_light_is_measured(rgb, sampler, most):
     """The channel of its variance against that of 24 renders, in blocks of 8 x 8 pixels without
     the lamp's: the median ratio is within a factor 1.5 (seeds are fixed). Sequences make less
     noise than the independent numbers that the channel is for, at best 16 iterations that of 256.
