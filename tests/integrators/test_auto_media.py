@@ -170,7 +170,9 @@ def test_image_is_that_of_the_integrator_chosen(rgb, monkeypatch, chosen):
     assert np.allclose(session.image(), alone.image(), rtol=1e-3, atol=1e-5)
     assert session.channels == alone.channels and "var.R" in session.channels
     again = decided(scene, spp=3, variance=True)
-    assert again.learned == session.learned
+    assert again.learned["plugin"] == session.learned["plugin"]
+    # Threads add in any order.
+    assert again.learned["errors"] == pytest.approx(session.learned["errors"], rel=1e-4)
 
 
 @pytest.mark.parametrize("chosen", ["bdpm", "volpath_multiview"])
