@@ -292,6 +292,7 @@ class BDPMSession(PilotedSession):
 
     def photons_of_a_path(self):
         """How many photons a light sub-path leaves, on average: by the light pass of a pilot."""
+        self._use_light_paths(pilot_light_paths(self.iteration_light_paths))
         self._photons(PILOT_INDEX, self._spectral(PILOT_INDEX))
         return self.photons_found / self.light_path_count
 

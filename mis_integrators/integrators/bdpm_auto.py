@@ -88,7 +88,7 @@ class AutoSession(IterativeSession):
     def __init__(self, integrator, scene, sensor, seed, iterations):
         super().__init__(integrator, scene, sensor, seed, iterations)
         self.seconds = self.decision = None
-        self.in_media = has_media(scene, sensor)
+        self._choice = media_choice if has_media(scene, sensor) else choice
 
     def plan_time(self, seconds):
         """Rendering will last `seconds`: the choice is for as many iterations as fit."""
@@ -122,8 +122,7 @@ class AutoSession(IterativeSession):
 
     def start(self):
         if self.decision is None:
-            choose = media_choice.choose_in_media if self.in_media else choice.choose
-            self._take(choose(*self._render, self.seconds))
+            self._take(self._choice.choose(*self._render, self.seconds))
         self.decision.session.start()
 
     def _take(self, decision):
@@ -146,19 +145,14 @@ class AutoSession(IterativeSession):
 
     def recall(self, learned):
         fields = Fields(learned, "learned")
-        plugin = fields.choice("plugin", list(self._candidates))
+        plugin = fields.choice("plugin", list(self._choice.CANDIDATES))
         expected = fields.object("errors")
         errors = {name: expected.number(name) for name in expected.names()}
         reasons, inner = fields.texts("reasons"), fields.any("session")
         fields.finish()
-        new_session = media_choice.new_session_in_media if self.in_media else choice.new_session
-        session = new_session(plugin, *self._render)
+        session = self._choice.new_session(plugin, *self._render)
         session.recall(inner)
         self._take(Decision(plugin, session, reasons, errors))
-
-    @property
-    def _candidates(self):
-        return media_choice.CANDIDATES if self.in_media else choice.CANDIDATES
 
     def _run(self, iteration):
         self.decision.session._run(iteration)

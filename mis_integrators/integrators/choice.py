@@ -217,14 +217,16 @@ def why_not_camera_paths(plugin, session, prediction):
 
 
 def _trial(plugin, session, segments):
-    prediction = session.prediction
-    counted = costs.events(session, segments, session.last_vertex, prediction.gathered)
-    return Trial(
-        plugin,
-        session,
-        {name: (error.squared_bias, error.variance) for name, error in prediction.errors.items()},
-        costs.cost(plugin, counted) + costs.of_direct_paths(session, segments),
-    )
+    counted = costs.events(session, segments, session.last_vertex, session.prediction.gathered)
+    cost = costs.cost(plugin, counted) + costs.of_direct_paths(session, segments)
+    return trial_of_photons(plugin, session, cost)
+
+
+def trial_of_photons(plugin, session, cost):
+    """The `Trial` of a session whose pilot has run."""
+    errors = session.prediction.errors
+    parts = {name: (error.squared_bias, error.variance) for name, error in errors.items()}
+    return Trial(plugin, session, parts, cost)
 
 
 def _try_path(path, segments, pixels, mean, budget):
@@ -248,21 +250,25 @@ def _try_path(path, segments, pixels, mean, budget):
             )
         )
     cost = costs.cost("path", costs.events(path, segments, None, 0.0))
-    samples = max(round(budget / cost), 1)
-    values, left = np.array(values), LEFT if path.integrator.denoised else 1
-    parts = {
-        measure: (
-            0.0,
-            left * variance_of_one(path, values, weigh(mean), samples) / path.camera_paths,
-        )
-        for measure, weigh in MEASURES.items()
-    }
+    share = (LEFT if path.integrator.denoised else 1) / path.camera_paths
+    parts = parts_of_samples(path, np.array(values), mean, budget / cost, share)
     return Trial("path", path, parts, cost * path.camera_paths)
 
 
-def variance_of_one(path, values, weights, samples):
+def parts_of_samples(session, values, mean, samples, share):
+    """Those of a `Trial` of camera paths alone, by the `values` (trials, pixels) of a few samples
+    of pixels with this `mean`, where a render has so many `samples` a pixel; `share`: what counts
+    of their noise."""
+    samples = max(round(samples), 1)
+    return {
+        measure: (0.0, share * _variance_of_one(session, values, weigh(mean), samples))
+        for measure, weigh in MEASURES.items()
+    }
+
+
+def _variance_of_one(session, values, weights, samples):
     """Of one of so many samples a pixel, by the `values` (trials, pixels) of a few."""
-    if path.integrator.low_discrepancy:  # `Trial.errors` divides by the samples
+    if session.integrator.low_discrepancy:  # `Trial.errors` divides by the samples
         return samples * _variance_of_samples(values, weights, samples)
     return trimmed_mean(weights * np.var(values, axis=0, ddof=1))
 

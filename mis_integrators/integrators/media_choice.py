@@ -15,7 +15,6 @@ import numpy as np
 from ..core.spectra import channel_mean
 from ..core.traits import UnsupportedScene
 from ..pilot.denoiser import LEFT
-from ..pilot.noise import MEASURES
 from ..pilot.setting import UNPLANNED_ITERATIONS
 from ..volume.views import views_of
 from .choice import (
@@ -27,7 +26,8 @@ from .choice import (
     decide,
     handed_on,
     no_photons,
-    variance_of_one,
+    parts_of_samples,
+    trial_of_photons,
     why_not_camera_paths,
 )
 
@@ -42,11 +42,11 @@ PATHS_AN_ITERATION = 4.0
 1.5 to 4.5 were measured. The most counts: where both are close, camera paths are the safer."""
 
 
-def choose_in_media(integrator, scene, sensor, seed, iterations, seconds):
+def choose(integrator, scene, sensor, seed, iterations, seconds):
     """The `Decision` for a render of so many iterations, or of so many seconds (either may be
     `None`)."""
     render = integrator, scene, sensor, seed, iterations
-    camera = new_session_in_media(CAMERA, *render)
+    camera = new_session(CAMERA, *render)
     photons, reason = _photons(render)
     if photons is not None:
         photons.plan_time(seconds)
@@ -57,7 +57,7 @@ def choose_in_media(integrator, scene, sensor, seed, iterations, seconds):
     return Decision(CAMERA, camera, [f"{CAMERA}: {reason}"])
 
 
-def new_session_in_media(plugin, integrator, scene, sensor, seed, iterations):
+def new_session(plugin, integrator, scene, sensor, seed, iterations):
     """A session of a candidate, with the parameters of `integrator` that both share."""
     parameters = {"type": plugin, **handed_on(integrator), **CANDIDATES[plugin]}
     if iterations or plugin == PHOTONS:
@@ -75,7 +75,7 @@ def _photons(render):
     if len(views_of(sensor)) > 1:
         return None, "several views share their paths"
     try:
-        session = new_session_in_media(PHOTONS, *render)
+        session = new_session(PHOTONS, *render)
     except UnsupportedScene as refusal:
         return None, str(refusal)
     if not session.kinds():
@@ -93,7 +93,7 @@ def _judged(camera, photons, iterations, seconds):
     """The `Decision` once a pilot has run."""
     prediction, cost = photons.prediction, PATHS_AN_ITERATION * photons.camera_paths
     budget = cost * (prediction.iterations if seconds else iterations or UNPLANNED_ITERATIONS)
-    trials, reasons = [_trial_of_photons(photons, cost)], []
+    trials, reasons = [trial_of_photons(PHOTONS, photons, cost)], []
     blind = why_not_camera_paths(CAMERA, photons, prediction)
     if blind:
         reasons.append(blind)
@@ -101,12 +101,6 @@ def _judged(camera, photons, iterations, seconds):
         left = LEFT if photons.integrator.denoised else 1
         trials.insert(0, _trial_of_camera_paths(camera, prediction, budget, left))
     return decide(trials, reasons, budget, cost)
-
-
-def _trial_of_photons(session, cost):
-    errors = session.prediction.errors
-    parts = {name: (error.squared_bias, error.variance) for name, error in errors.items()}
-    return Trial(PHOTONS, session, parts, cost)
 
 
 def _trial_of_camera_paths(session, prediction, budget, left):
@@ -117,9 +111,5 @@ def _trial_of_camera_paths(session, prediction, budget, left):
     values = np.empty((PATH_TRIALS, pixels.count))
     for number in range(PATH_TRIALS):
         values[number] = channel_mean(session.radiance(TRIAL_INDEX, numbers, number))
-    samples = max(round(budget), 1)
-    parts = {
-        measure: (0.0, left * variance_of_one(session, values, weigh(prediction.mean), samples))
-        for measure, weigh in MEASURES.items()
-    }
+    parts = parts_of_samples(session, values, prediction.mean, budget, left)
     return Trial(CAMERA, session, parts, 1.0)
