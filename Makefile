@@ -6,7 +6,7 @@
 # make figures set everything up, then measure all figures of docs/results.md anew (half an hour)
 # make lint     set everything up, then check style, layout and type hints
 # make gallery  set everything up, then render the pictures of docs/ (minutes)
-# make hero     set everything up, then render the picture of README.md (a quarter of an hour)
+# make hero     set everything up, then render the picture of README.md (twenty minutes)
 # make docs     set everything up, then build the documentation site: out/site/index.html
 
 PYTHON ?= python3
