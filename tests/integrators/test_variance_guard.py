@@ -24,7 +24,7 @@ from mis_integrators.analysis.variance_maps import relative_variance
 import mitsuba as mi
 import numpy as np
 import pytest
-from comparing import in_one_thread, pictures
+from comparing import pictures
 from selection import extended
 
 ROOT = Path(__file__).parents[2]
@@ -57,7 +57,6 @@ def integrator(method, radius, mixture):
     )
 
 
-@in_one_thread
 def iterations(scene, method, radius, mixture):
     """Pictures of independent iterations, (ITERATIONS, H, W, 3)."""
     session = integrator(method, radius, mixture).session(scene, seed=5)
