@@ -3,10 +3,10 @@
 # make test-all the same with all extended cases (forty minutes; what continuous integration runs)
 # make mutants  set everything up, then see how many of sixty errors the tests find (a quarter of an hour)
 # make bench    set everything up, then compare all methods on all bundled scenes: out/bench/index.html (half an hour to three quarters)
-# make figures set everything up, then measure all figures of docs/results.md anew (half an hour)
+# make figures set everything up, then measure all figures of docs/results.md anew (two hours)
 # make lint     set everything up, then check style, layout and type hints
 # make gallery  set everything up, then render the pictures of docs/ (minutes)
-# make hero     set everything up, then render the picture of README.md (twenty minutes)
+# make hero     set everything up, then render the pictures of README.md (half an hour)
 # make docs     set everything up, then build the documentation site: out/site/index.html
 
 PYTHON ?= python3

@@ -175,13 +175,13 @@ def _parser() -> argparse.ArgumentParser:
     command = _measuring(commands, "choice", choice)
     _renders(command, (1.0, 5.0, 20.0))
     _compares_with_references(command)
-    command.set_defaults(seeds=1, integrators=registered(CHOSEN_FROM))
+    command.set_defaults(seeds=1, integrators=registered(CHOSEN_FROM), scenes=None)
     command.add_argument(
         "--rooms",
         type=int,
         default=0,
         metavar="N",
-        help="random rooms besides the scenes (default: 0)",
+        help="random rooms, in place of the bundled scenes or besides those named (default: 0)",
     )
 
     command = _measuring(commands, "converge", converge)

@@ -9,6 +9,7 @@ import numpy as np
 
 from common.rooms import write_rooms
 from common.rows import Row, save, show
+from common.scene_files import bundled
 from experiments.compare import compare, measure_scene
 
 AUTO = "bdpm_auto"
@@ -19,7 +20,8 @@ BOUNDS = (1.05, 1.15, 1.3)
 def run(options: argparse.Namespace) -> None:
     """The sub-command ``choice``."""
     rows: list[Row] = []
-    scenes = [*options.scenes, *write_rooms(options.out / "rooms", options.rooms)]
+    rooms = write_rooms(options.out / "rooms", options.rooms)
+    scenes = [*(options.scenes or ([] if rooms else bundled())), *rooms]
     for path in scenes:
         for seconds in options.times:
             options.time = seconds

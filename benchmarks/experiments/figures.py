@@ -61,6 +61,9 @@ class Part:
 
 _EFFORT = ("method", "size", "seeds", "samples_per_pixel", "seconds", "first", "settings")
 _CANDIDATES = "path path:sampler=multijitter bdpm:bdd=0 bdpm_opt2 bdpm_opt3 bdpm_auto"
+_ROOMS = (
+    "--rooms 12 --times 1 5 20 --integrators path path:sampler=multijitter bdpm:bdd=0 bdpm_auto"
+)
 
 PARTS = {
     "compare10": Part(
@@ -82,6 +85,21 @@ PARTS = {
             "denoised MSE / best path",
             "denoised FLIP / best path",
         ),
+    ),
+    "choice": Part(
+        f"choice {_ROOMS}",
+        "choice",
+        ("scene", "seconds", "relMSE / best path", "MSE / best path", "artefacts", "chosen"),
+        bundled=EVERYWHERE,
+    ),
+    "choice_denoised": Part(
+        f"choice --denoise {_ROOMS}",
+        "choice",
+        (
+            *("scene", "seconds", "denoised relMSE / best path", "denoised MSE / best path"),
+            *("denoised artefacts", "chosen"),
+        ),
+        bundled=EVERYWHERE,
     ),
     "compare1.5": Part(
         "compare --time 1.5 --seeds 2 --integrators path path:sampler=multijitter bdpm:bdd=0"
@@ -149,7 +167,7 @@ PARTS = {
     ),
 }
 """By name. The order is that in which they are measured: what matters most comes first. Together
-they take half an hour, so methods are those that a reader would choose between."""
+they take two hours, so methods are those that a reader would choose between."""
 
 
 def run(options: argparse.Namespace) -> None:

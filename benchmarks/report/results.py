@@ -107,6 +107,39 @@ def _over_path(entries: Mapping[str, Entry], first: str, second: str, corner: st
     return markdown(head, [*lines, [f"geometric mean of {len(lines)}", *means]])
 
 
+def choice(entries: Mapping[str, Entry]) -> str:
+    """How far `bdpm_auto` is behind the better `path`, and how often, by rendering time."""
+    return _behind(entries, "")
+
+
+def choice_denoised(entries: Mapping[str, Entry]) -> str:
+    """The same of denoised images."""
+    return _behind(entries, "denoised ")
+
+
+BEHIND = 1.05
+"""From which ratio on a row counts as behind."""
+
+
+def _behind(entries: Mapping[str, Entry], kind: str) -> str:
+    """A row for each rendering time: geometric mean, largest, and how many are behind."""
+    measures = "relMSE", "MSE"
+    found = [row for entry in entries.values() for row in entry["rows"]]
+    lines = []
+    for seconds in sorted({row["seconds"] for row in found}):
+        rows = [row for row in found if row["seconds"] == seconds]
+        cells = [f"{seconds:g} s", str(sum(row["chosen"] != "path" for row in rows))]
+        for measure in measures:
+            ratios = [row[f"{kind}{measure} / best path"] for row in rows]
+            behind = sum(ratio > BEHIND for ratio in ratios)
+            cells += [short(geometric_mean(ratios)), short(max(ratios)), f"{behind} of {len(rows)}"]
+        lines.append(cells)
+    head = [f"{kind or 'raw '}images after", "photons chosen"]
+    for measure in measures:
+        head += [f"{measure}, geometric mean", "largest", f"above {BEHIND:g}"]
+    return markdown(head, lines)
+
+
 def short_renders(entries: Mapping[str, Entry]) -> str:
     """relMSE without the worst pixels over that of the better `path`, and the least of all."""
     labels = [label for label in _labels(entries) if label not in (PLAIN, STRATIFIED)]
@@ -217,6 +250,8 @@ def multiview(entries: Mapping[str, Entry]) -> str:
 TABLES: dict[str, Callable[[Mapping[str, Entry]], str]] = {
     "compare10": ten_seconds,
     "denoised10": denoised,
+    "choice": choice,
+    "choice_denoised": choice_denoised,
     "compare1.5": short_renders,
     "charts": charts,
     "stability": stability,

@@ -77,6 +77,19 @@ def test_ratios_and_means_of_the_table(results):
     assert table[5] == "| geometric mean of 3 | 1.04 (1.04) | 0.40 (0.40) |"
 
 
+def test_how_far_the_choice_is_behind(results):
+    """A row for each time; a room is behind from a twentieth on."""
+    ratios = {1: [(1.2, 0.25), (0.3, 1.0)], 20: [(1.04, 1.06)]}
+    rows = [
+        {"seconds": time, "relMSE / best path": a, "MSE / best path": b, "chosen": chosen}
+        for time, pairs in ratios.items()
+        for (a, b), chosen in zip(pairs, ("path", "bdpm"))
+    ]
+    first, last = results.choice({"room": entry("choice", rows)}).splitlines()[2:]
+    assert first == "| 1 s | 1 | 0.60 | 1.20 | 1 of 2 | 0.50 | 1.00 | 0 of 2 |"
+    assert last == "| 20 s | 0 | 1.04 | 1.04 | 0 of 1 | 1.06 | 1.06 | 1 of 1 |"
+
+
 @pytest.mark.parametrize(
     "value, text",
     [(0.8, "0.80"), (0.0221, "0.022"), (0.000339, "0.00034"), (12.469, "12.47"), (-0.02, "-0.02")]
