@@ -83,7 +83,7 @@ def pytest_configure(config):
     )
     config.addinivalue_line(
         "markers",
-        "extended: more cases of the same kind, ten minutes of them; left out unless asked for, as "
+        "extended: more cases of the same kind, an hour of them; left out unless asked for, as "
         "`make test-all` does (-m 'not full')",
     )
     config.addinivalue_line(

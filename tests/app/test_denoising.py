@@ -13,6 +13,7 @@ import lamplit
 import mitsuba as mi
 import numpy as np
 import pytest
+from comparing import in_one_thread
 from lamplit import read, same, write_scene
 from selection import extended
 
@@ -217,6 +218,7 @@ def test_direct_light_is_the_layer_of_that_name(rgb, plugin):
 
 
 @pytest.mark.parametrize("sampler, most", [("sobol", 16), *extended(("independent", 1.5))])
+@in_one_thread
 def test_noise_of_direct_light_is_measured(rgb, sampler, most):
     """The channel of its variance against that of 24 renders, in blocks of 8 x 8 pixels without
     the lamp's: the median ratio is within a factor 1.5 (seeds are fixed). Sequences make less

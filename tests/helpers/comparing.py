@@ -20,7 +20,9 @@ path.)
 
 from __future__ import annotations
 
+import functools
 import math
+import os
 from dataclasses import dataclass
 from statistics import NormalDist
 
@@ -203,6 +205,27 @@ def assert_same(a: Estimate, b: Estimate, whole=WHOLE, block=BLOCK, slack=1e-5):
 # --- Renders ------------------------------------------------------------------
 
 
+def in_one_thread(function):
+    """The function, for which Dr.Jit has one thread in each of the processes of pytest-xdist. There
+    is one a core: more threads would wait for one another, a third of the processor time of many
+    small renders. (Not for tests to which the order of threads could make a difference.)"""
+
+    @functools.wraps(function)
+    def run(*args, **kwargs):
+        if "PYTEST_XDIST_WORKER" not in os.environ:
+            return function(*args, **kwargs)
+        usual = dr.thread_count()
+        dr.sync_thread()
+        dr.set_thread_count(1)
+        try:
+            return function(*args, **kwargs)
+        finally:
+            dr.sync_thread()
+            dr.set_thread_count(usual)
+
+    return run
+
+
 def render_batches(
     integrator, scene, count: int, blocks: int, spp: int = 16, first_seed: int = 0, sensor=0
 ):
@@ -294,6 +317,7 @@ class PathBatches:
         return Estimate.of(self.batches)
 
 
+@in_one_thread
 def collect_until(a, b, whole=WHOLE, block=BLOCK, start=16, most=1024):
     """Adds batches to whichever of the two is noisier until the comparison has the power that
     `assert_same` demands.

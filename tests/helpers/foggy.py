@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import mitsuba as mi
 import numpy as np
-from comparing import Estimate, agree, assert_same, collect_until
+from comparing import Estimate, agree, assert_same, collect_until, in_one_thread
 from worlds import T, bitmap, film, grey, look, waves
 
 SIZE = 16
@@ -238,6 +238,7 @@ class MultiviewBatches:
         self.statistics = {"tried": 0, "reached": 0, "lost": 0}
         self.weights = []
 
+    @in_one_thread
     def add(self, count):
         for _ in range(count):
             self.session.restart(1000 * self.seed + len(self.batches))
@@ -268,6 +269,7 @@ class OracleBatches:
             [],
         )
 
+    @in_one_thread
     def add(self, count):
         for _ in range(count):
             seed = self.first_seed + len(self.batches)

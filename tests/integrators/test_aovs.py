@@ -21,6 +21,7 @@ from comparing import (
     assert_same,
     block_means,
     differences,
+    in_one_thread,
     pictures,
 )
 from light_by_class import traced
@@ -271,6 +272,7 @@ OF = {
 """Parameters of plugins for which no pilot has to be compiled, as others look at that."""
 
 
+@in_one_thread
 def split_batches(plugin, scene, count, blocks=3, **parameters):
     """Region means of iterations, for the three classes apart: an `Estimate` each."""
     given = {"aovs": SPLIT_ALL, **LARGE, **OF.get(plugin, {}), **parameters}
@@ -282,6 +284,7 @@ def split_batches(plugin, scene, count, blocks=3, **parameters):
     ]
 
 
+@in_one_thread
 def reference(integrator, scene, count=16, spp=64):
     """Region means of renders by one of Mitsuba's integrators."""
     images = (

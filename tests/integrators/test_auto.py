@@ -21,6 +21,7 @@ from comparing import (
     assert_same,
     block_means,
     collect_until,
+    in_one_thread,
 )
 from selection import extended
 from test_against_path import MONO, RGB, SPECTRAL, caustic_scene
@@ -108,6 +109,7 @@ def test_mean_of_whole_renders(rgb, sampler):
         assert_same(*collect_until(ours, theirs, block=0.08), block=0.08)
 
 
+@in_one_thread
 def test_sequences_lower_the_variance_of_path(rgb):
     """The variance of 32 paths a pixel, over 24 seeds, is much less than that of independent
     numbers: a fifth, by the median over pixels. Were they equal, a pixel's ratio would follow

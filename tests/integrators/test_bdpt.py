@@ -47,6 +47,7 @@ from comparing import (
     block_means,
     collect_until,
     differences,
+    in_one_thread,
     pictures,
 )
 from selection import extended
@@ -446,6 +447,7 @@ def test_states_of_traced_subpaths(rgb, kind):
 # --- Each technique alone -----------------------------------------------------
 
 
+@in_one_thread
 def technique_estimates(scene, integrator, batches, blocks=1):
     """{(s, t): Estimate} of the block means of each technique's unweighted image."""
     session = integrator.session(scene, 0, seed=1, spp=0)

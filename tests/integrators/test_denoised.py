@@ -9,6 +9,7 @@ from mis_integrators.pilot.noise import MEASURES
 import mitsuba as mi
 import numpy as np
 import pytest
+from comparing import in_one_thread
 
 SCENE = Path(__file__).parents[2] / "scenes" / "cornell_glossy.xml"
 SIZE, BLOCK, RENDERS = 48, 6, 24
@@ -19,6 +20,7 @@ def scene(rgb):
     return mi.load_file(str(SCENE), resx=str(SIZE), resy=str(SIZE))
 
 
+@in_one_thread
 def renders(scene, spp=4, **parameters):
     """Images of as many seeds, mean over the channels: (renders, height, width)."""
     integrator = mi.load_dict({"max_depth": 6, **parameters})

@@ -3,7 +3,7 @@
 import mitsuba as mi
 import numpy as np
 import pytest
-from comparing import SessionBatches, assert_same, collect_until
+from comparing import SessionBatches, assert_same, collect_until, in_one_thread
 from selection import extended
 from worlds import tray
 
@@ -53,6 +53,7 @@ def test_light_behind_mirrors_and_holes(rgb):
     assert_same(*collect_until(*sides, **POWER), **POWER)
 
 
+@in_one_thread
 def test_noise_of_direct_light_falls(rgb):
     """Where nearly all noise is that of direct light, four independent paths have a quarter of the
     variance of one: ratio of two variances of 4000 values each, within 0.2 to 0.3 (false alarms

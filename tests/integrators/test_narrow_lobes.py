@@ -7,7 +7,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from comparing import agree
+from comparing import agree, in_one_thread
 from selection import extended
 from worlds import path
 
@@ -92,6 +92,7 @@ def test_means(rgb, bdd, more):
     agree(integrator, path(**settings), scene, block=0.08)
 
 
+@in_one_thread
 def test_no_dots_on_smooth_metal(rgb):
     """Of a plate of metal that fills the picture: a fifth of the variance, at the most, of photons
     gathered there. (The seeds are fixed.)"""

@@ -9,7 +9,7 @@ import glossy_sphere
 import mitsuba as mi
 import numpy as np
 import pytest
-from comparing import agree
+from comparing import agree, in_one_thread
 from selection import extended
 from test_against_path import MONO, PERSPECTIVE, RGB, SPECTRAL, oracle
 from test_weights_in_renders import SPHERE, JointPaths, weighted
@@ -236,6 +236,7 @@ def least_noise(strategies):
     return noise_of_three(0, *np.meshgrid(grid, grid)).min()
 
 
+@in_one_thread
 def measured_in_sphere(
     strategies, weights, iterations, size, light_paths=LIGHT_PATHS, frozen=FROZEN_PATHS
 ):

@@ -24,7 +24,7 @@ from mis_integrators.analysis.variance_maps import relative_variance
 import mitsuba as mi
 import numpy as np
 import pytest
-from comparing import pictures
+from comparing import in_one_thread, pictures
 from selection import extended
 
 ROOT = Path(__file__).parents[2]
@@ -57,13 +57,14 @@ def integrator(method, radius, mixture):
     )
 
 
+@in_one_thread
 def iterations(scene, method, radius, mixture):
     """Pictures of independent iterations, (ITERATIONS, H, W, 3)."""
     session = integrator(method, radius, mixture).session(scene, seed=5)
     return np.array([picture[..., :3] for picture in pictures(session, ITERATIONS)])
 
 
-@pytest.fixture(scope="module", params=extended("cornell_glossy", "cornell_point"))
+@pytest.fixture(scope="module", params=["cornell_glossy", *extended("cornell_point")])
 def measured(request):
     """Of a scene: its name, the mean relative variance of each method and group, and the maps and
     pictures."""

@@ -18,6 +18,7 @@ from comparing import (
     assert_powerful,
     collect_until,
     differences,
+    in_one_thread,
     t_quantile,
 )
 from selection import extended
@@ -278,6 +279,7 @@ def test_one_strategy_is_bdpm(rgb):
 # --- Noise --------------------------------------------------------------------
 
 
+@in_one_thread
 def variances(scene, integrator, iterations=48, trimmed=1e-3):
     """Mean variance of an iteration's pixels, relative to the squared image, with its standard
     error over groups of pixels; the noisiest pixels are left out."""
@@ -371,6 +373,7 @@ def test_weights_lower_the_noise(rgb):
 
 
 @pytest.mark.extended
+@in_one_thread
 def test_noise_law(rgb):
     """Variance of an iteration = X / (N_F N_B) + B / N_B + (1 - 1 / N_B) F / N_F (Ershov et al.
     2019: cross, camera and light noise): fitted to three pairs (N_B, N_F), it predicts three others
@@ -426,6 +429,7 @@ def noise_in_sphere(direct_weight, final_weight):
     return share / SPHERE["light_paths"] * photon**2 * squares
 
 
+@in_one_thread
 def measured_in_sphere(iterations):
     """The same of the weights as they are: mean, and standard error over blocks of the image."""
     scene = mi.load_dict(

@@ -22,6 +22,7 @@ from comparing import (
     assert_same,
     collect_until,
     differences,
+    in_one_thread,
     smallest_visible,
 )
 from foggy import (
@@ -659,6 +660,7 @@ def test_films(rgb, rfilter, options):
 
 
 @pytest.mark.parametrize("sampler", extended("sobol", "independent"))
+@in_one_thread
 def test_variance(rgb, sampler):
     """The variance channels against the variance of independent renders. Between iterations that
     share a sequence they see noise that the mean does not have: they tell too much, never too
@@ -690,6 +692,7 @@ def test_means_of_independent_numbers(rgb):
 
 
 @pytest.mark.extended
+@in_one_thread
 def test_sequences_lower_the_variance(rgb):
     """One view, so that pixels are independent: the variance of 32 paths each, over 24 seeds,
     against that of independent numbers; 0.57, by the median over pixels. Were they equal, a pixel's
