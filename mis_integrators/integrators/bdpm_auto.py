@@ -30,12 +30,10 @@ class BDPMAuto(IterativeIntegrator):
        -
        - As of :monosp:`bdpm`.
 
-    Chooses between ``path`` and a photon mapper: ``bdpm_opt3``, or ``bdpm`` with ``bdd`` 0 in
-    renders of less than five seconds or 32 iterations, with ``bdd`` 1 in those that will be
-    denoised. The photon mapper runs its pilot; a few samples
-    of ``path`` on the same pixels tell what that would bring in the same time. What an iteration
-    costs is counted (segments, photons) and priced, not clocked. Where ``path`` cannot see all the
-    light of the scene, it is not tried.
+    Chooses between ``path`` and a photon mapper: ``bdpm`` with ``bdd`` 0, or 1 in renders that will
+    be denoised. The photon mapper runs its pilot; a few samples of ``path`` on the same pixels tell
+    what that would bring in the same time. What an iteration costs is counted (segments, photons)
+    and priced, not clocked. Where ``path`` cannot see all the light of the scene, it is not tried.
     In scenes with media the two are ``volpath_multiview``, with one view, and ``bdpm`` with ``bdd``
     0. Photons are not tried there where light sub-paths leave few of them, nor in media of grids.
 

@@ -26,12 +26,11 @@ from ..pilot.setting import UNPLANNED_ITERATIONS
 from . import costs
 from .unidirectional import PathSession
 
-CANDIDATES = {"path": {}, "bdpm": {"bdd": 0}, "bdpm_opt3": {}}
+CANDIDATES = {"path": {}, "bdpm": {"bdd": 0}}
 """Plugins that may be chosen, and their parameters."""
 FOR_DENOISERS = {"bdpm": {"bdd": 1}}
-"""Parameters in place of these where the image will be denoised."""
-SHORT_SECONDS, SHORT_ITERATIONS = 5.0, 32
-"""Tuned: renders for which learning weights takes longer than they save."""
+"""Parameters in place of these where the image will be denoised: nearly all noise is then that of
+camera paths, which a denoiser takes away."""
 PATH_TRIALS = 16
 """Tuned: samples of `path` on each of the pilot's pixels; a power of two."""
 TRIAL_INDEX = 1 << 28
@@ -97,29 +96,12 @@ def handed_on(integrator):
     }
 
 
-def photon_mapper(iterations, seconds, denoised):
-    """The plugin that stands for all photon mappers.
-
-    For a denoiser photons are gathered at the second vertex: nearly all noise is then that of
-    camera paths, which it takes away. Else three strategies are near the best number of them in
-    every scene, and are one where all smooth surfaces are diffuse. Short renders have one
-    strategy."""
-    if denoised:
-        return "bdpm"
-    if seconds is not None and seconds < SHORT_SECONDS:
-        return "bdpm"
-    if seconds is None and iterations is not None and iterations < SHORT_ITERATIONS:
-        return "bdpm"
-    return "bdpm_opt3"
-
-
 def choose(integrator, scene, sensor, seed, iterations, seconds):
     """The `Decision` for a render of so many iterations, or of so many seconds (either may be
     `None`)."""
     path = PathSession(integrator, scene, sensor, seed, iterations)
-    plugin = photon_mapper(iterations, seconds, integrator.denoised)
-    photons = new_session(plugin, integrator, scene, sensor, seed, iterations)
-    alone = (plugin, photons) if integrator.splits_light else ("path", path)
+    photons = new_session("bdpm", integrator, scene, sensor, seed, iterations)
+    alone = ("bdpm", photons) if integrator.splits_light else ("path", path)
     if not photons.kinds():
         return Decision(*alone, [f"{alone[0]}: {no_photons(integrator, photons)}"])
     photons.plan_time(seconds)
@@ -139,7 +121,7 @@ def choose(integrator, scene, sensor, seed, iterations, seconds):
         integrator.max_depth,
         integrator.rr_depth,
     )
-    trials, reasons = [_trial(plugin, photons, segments)], []
+    trials, reasons = [_trial("bdpm", photons, segments)], []
     usual = trials[0].cost
     budget = (prediction.iterations if seconds else iterations or UNPLANNED_ITERATIONS) * usual
     blind = "not path: it does not split the light" if integrator.splits_light else None

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..core.sequences import sobol
 from ..core.spectra import channel_mean
-from ..core.traits import registry_table, used_bsdfs
+from ..core.traits import lookup, registry_table, used_bsdfs
 
 NARROW = 10.0
 """Tuned: concentration from which on photons are gathered one vertex later."""
@@ -19,14 +19,23 @@ SAMPLES = 64
 
 
 def narrow_bsdfs(scene):
-    """A registry table: of each BSDF of the scene whether its median `concentration` over the
-    angles is above `NARROW`. None where there is no such BSDF."""
+    """A registry table: of each BSDF of the scene a bit for each of the `COSINES`, whether its
+    `concentration` is above `NARROW` there. None where there is no such BSDF."""
     smooth = [b for b in used_bsdfs(scene) if mi.has_flag(b.flags(), mi.BSDFFlags.Smooth)]
     rough = [b for b in smooth if int(b.flags()) & ~_EVEN]
     if not rough:
         return None
-    narrow = np.median(concentration(rough), axis=1) > NARROW
-    return registry_table(rough, mi.BSDFPtr, narrow, mi.Bool) if narrow.any() else None
+    narrow = concentration(rough) > NARROW
+    bits = narrow @ (1 << np.arange(len(COSINES)))
+    return registry_table(rough, mi.BSDFPtr, bits, mi.UInt32) if narrow.any() else None
+
+
+def is_narrow(table, bsdf, si, active):
+    """Whether the lobes of a BSDF are narrow, as seen from where `si` is: by the nearest of the
+    `COSINES`. `table`: of `narrow_bsdfs`."""
+    bits = lookup(table, bsdf, mi.UInt32, active)
+    nearest = mi.UInt32(dr.clip(dr.abs(si.wi.z) * len(COSINES) - 0.5, 0, len(COSINES) - 1))
+    return (bits >> nearest) & 1 != 0
 
 
 _EVEN = int(

@@ -14,10 +14,10 @@ from ..core.packing import Store, pack_direction
 from ..core.recording import lanes
 from ..core.records import Layout
 from ..core.spectra import channel_mean
-from ..core.traits import lookup
 from ..lights.lights import mis_power
 from ..paths.camera import trace_camera, whole_or_nothing
 from ..paths.light_classes import class_of, scattered_history, start_of_camera_path
+from ..paths.lobes import is_narrow
 from ..paths.media import direct_light, next_hit_either, next_hit_straight_on
 from ..paths.setting import CameraPass, Limits, ListedPass, World
 from ..paths.subpaths import selected, smooth_at
@@ -253,7 +253,7 @@ class QueryVisitor:
             smooth &= vertex <= self.bdd
         at.ends = vertex >= self.bdd  # the path's last smooth vertex
         if self.queries.narrow is not None:
-            at.ends &= ~lookup(self.queries.narrow, bsdf, mi.Bool, smooth)
+            at.ends &= ~is_narrow(self.queries.narrow, bsdf, at.si, smooth)
         if self.beyond is not None:
             # Other paths go straight through media.
             unseen = met | at.scatters if self.flies else met
@@ -335,7 +335,7 @@ class QueryVisitor:
             sums = self.weights.scatter(sums, at.si, self._scattering(at), bs, vertex, scattered)
         beyond = dr.select(at.ends, mi.UInt32(self.bdd), vertex) + 1
         if self.queries.narrow is not None:
-            narrow = ~at.ends & lookup(self.queries.narrow, at.bsdf, mi.Bool, scattered)
+            narrow = ~at.ends & is_narrow(self.queries.narrow, at.bsdf, at.si, scattered)
             beyond = dr.select(narrow, vertex, beyond)
         state = [
             dr.select(scattered, beyond, vertex),

@@ -298,17 +298,6 @@ def test_a_path_of_given_time_keeps_the_processor_busy(rgb, monkeypatch, seconds
         assert variance * samples == pytest.approx(single.parts[measure][1], rel=0.3)
 
 
-@pytest.mark.parametrize("seconds, chosen", [(4.9, "bdpm"), (5.0, "bdpm_opt3")])
-def test_short_renders_learn_no_weights(rgb, monkeypatch, seconds, chosen):
-    """By the time that is planned where one is, whatever number of samples is planned too."""
-    set_price_of_path(monkeypatch, 1e4)
-    for spp in (0, 8):
-        session = auto().session(glossy_box(), spp=spp)
-        session.plan_time(seconds)
-        session.start()
-        assert session.settings["choice"] == chosen
-
-
 def test_a_photon_mapper_learns_once(rgb, monkeypatch):
     """One pilot a render, whatever is chosen."""
     from mis_integrators.integrators import piloted
@@ -357,11 +346,10 @@ def test_image_is_that_of_the_integrator_chosen(variant_name, spp):
     while session.iterations < session.iterations_planned:
         session.iterate()
     settings = session.settings
-    assert settings["choice"] == ("bdpm" if spp < 32 else "bdpm_opt3")
-    given = {"bdd": 0} if settings["choice"] == "bdpm" else {}
-    alone = mi.load_dict(
-        {"type": settings["choice"], "max_depth": 4, "variance": True, **given}
-    ).session(scene, seed=3, spp=spp)
+    assert settings["choice"] == "bdpm"
+    alone = mi.load_dict({"type": "bdpm", "bdd": 0, "max_depth": 4, "variance": True}).session(
+        scene, seed=3, spp=spp
+    )
     while alone.iterations < spp:
         alone.iterate()
     assert settings["radius.indirect"] == alone.settings["radius.indirect"]

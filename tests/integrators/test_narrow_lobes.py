@@ -1,6 +1,5 @@
 """Surfaces with narrow lobes, at which `bdpm` gathers none but caustic photons: paths go on."""
 
-from mis_integrators.core.traits import lookup
 from mis_integrators.paths import lobes
 
 import drjit as dr
@@ -65,17 +64,23 @@ def test_which_surfaces_are_narrow(rgb):
         back={**METAL, "alpha": 0.5},
     )
     table = lobes.narrow_bsdfs(scene)
-    found = {
-        shape.id(): bool(lookup(table, mi.BSDFPtr(shape.bsdf()), mi.Bool)[0])
-        for shape in scene.shapes()
-    }
-    assert {name for name, narrow in found.items() if narrow} == {"small-box", "large-box"}
+    from_cosines = dr.zeros(mi.SurfaceInteraction3f, 5)
+    from_cosines.wi = mi.Vector3f(0, 0, mi.Float(0.05, 0.37, -0.37, 0.38, 1.0))
+    found = {}
+    for shape in scene.shapes():
+        bsdf = dr.opaque(mi.BSDFPtr, shape.bsdf(), 5)
+        found[shape.id()] = list(lobes.is_narrow(table, bsdf, from_cosines, True))
+    assert found.pop("small-box") == found.pop("large-box") == [True] * 5
+    assert found.pop("floor") == [True, True, True, False, False]  # the coat, at grazing angles
+    assert not np.any(list(found.values()))
     assert lobes.narrow_bsdfs(box()) is None
-    assert lobes.narrow_bsdfs(box(floor=plastic)) is None
+    assert lobes.narrow_bsdfs(box(floor={**plastic, "alpha": 0.4})) is None
 
 
 def narrow_box():
-    return box(**{"small-box": FROSTED, "large-box": {**METAL, "alpha": 0.05}})
+    """Of lobes that are narrow from everywhere, and of a coat that is so at grazing angles."""
+    coat = {"type": "roughplastic", "alpha": 0.1}
+    return box(**{"small-box": FROSTED, "large-box": {**METAL, "alpha": 0.05}}, floor=coat)
 
 
 @pytest.mark.parametrize(
