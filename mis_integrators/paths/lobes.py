@@ -10,7 +10,7 @@ from ..core.sequences import sobol
 from ..core.spectra import channel_mean
 from ..core.traits import lookup, registry_table, used_bsdfs
 
-NARROW = 10.0
+NARROW = 30.0
 """Tuned: concentration from which on photons are gathered one vertex later."""
 COSINES = 0.25, 0.5, 0.75, 1.0
 """Of the angles under which BSDFs are looked at."""
