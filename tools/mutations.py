@@ -48,6 +48,7 @@ BEAMS = "tests/photons/test_beams.py"
 OPTIMAL = "tests/integrators/test_weights_in_renders.py"
 ANALYTIC = "tests/integrators/test_analytic.py"
 LONG = "tests/app/test_long_renders.py"
+LOBES = "tests/integrators/test_narrow_lobes.py"
 
 MUTATIONS = [
     # ------------------------------------------------------------------ weights
@@ -222,6 +223,20 @@ MUTATIONS = [
         "mixed = own_pdf + AIMED_SHARE * portals",
         "the density of direct light from windows is more than one in all",
         f"{TRANSPORT}::test_densities_of_direct_light_at_windows_are_one_in_all",
+    ),
+    Mutation(
+        "paths/lobes.py",
+        "dr.abs(si.wi.z) * len(COSINES) - 0.5",
+        "dr.abs(si.wi.z) * len(COSINES) + 0.5",
+        "lobes are narrow from other angles than those they were looked at",
+        LOBES,
+    ),
+    Mutation(
+        "photons/queries.py",
+        "beyond = dr.select(narrow, vertex, beyond)",
+        "beyond = dr.select(narrow, beyond, beyond)",
+        "paths end behind narrow lobes that they pass",
+        LOBES,
     ),
     # ------------------------------------------------------------------ photons
     Mutation(
