@@ -61,9 +61,7 @@ class Part:
 
 _EFFORT = ("method", "size", "seeds", "samples_per_pixel", "seconds", "first", "settings")
 _CANDIDATES = "path path:sampler=multijitter bdpm:bdd=0 bdpm_opt2 bdpm_opt3 bdpm_auto"
-_ROOMS = (
-    "--rooms 6 --times 1 5 20 --integrators path path:sampler=multijitter bdpm:bdd=0 bdpm_auto"
-)
+_ROOMS = "--rooms 6 --times 1 5 20 --integrators path path:sampler=multijitter bdpm:bdd=0 bdpm_auto"
 
 PARTS = {
     "compare10": Part(
