@@ -102,7 +102,8 @@ def test_only_where_photons_are_gathered(rgb):
 
 
 def test_sessions_of_a_render_send_the_same_paths(rgb):
-    """What another session has learned is all that it takes, the seed apart."""
+    """What another session has learned is all that it takes, the seed apart. The same but for the
+    last digit: photons that threads have stored in another order are added in another order."""
     scene = tray("rough", "rectangle")
     one, other = (integrator(initial_radius=0).session(scene, 0, 7, 16) for _ in range(2))
     one.start()
@@ -111,7 +112,7 @@ def test_sessions_of_a_render_send_the_same_paths(rgb):
     assert one.direct_light.mean_paths > 0
     for session in (one, other):
         session.iterate(3)
-    np.testing.assert_array_equal(one.image(), other.image())
+    np.testing.assert_allclose(one.image(), other.image(), rtol=1e-5)
 
 
 def test_purposes_differ(rgb):
