@@ -233,8 +233,8 @@ MUTATIONS = [
     ),
     Mutation(
         "photons/queries.py",
-        "beyond = dr.select(narrow, vertex, beyond)",
-        "beyond = dr.select(narrow, beyond, beyond)",
+        "beyond = dr.select(at.narrow & ~at.ends, vertex, beyond)",
+        "beyond = dr.select(at.narrow & ~at.ends, beyond, beyond)",
         "paths end behind narrow lobes that they pass",
         LOBES,
     ),

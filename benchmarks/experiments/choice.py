@@ -11,9 +11,10 @@ from common.rooms import write_rooms
 from common.rows import Row, save, show
 from common.scene_files import bundled
 from experiments.compare import compare, measure_scene
+from report.results import BEHIND
 
 AUTO = "bdpm_auto"
-BOUNDS = (1.05, 1.15, 1.3)
+BOUNDS = (BEHIND, 1.15, 1.3)
 """Ratios below which rows are counted."""
 
 

@@ -26,9 +26,10 @@ from ..pilot.setting import UNPLANNED_ITERATIONS
 from . import costs
 from .unidirectional import PathSession
 
-CANDIDATES = {"path": {}, "bdpm": {"bdd": 0}}
+CAMERA, PHOTONS = "path", "bdpm"
+CANDIDATES = {CAMERA: {}, PHOTONS: {"bdd": 0}}
 """Plugins that may be chosen, and their parameters."""
-FOR_DENOISERS = {"bdpm": {"bdd": 1}}
+FOR_DENOISERS = {PHOTONS: {"bdd": 1}}
 """Parameters in place of these where the image will be denoised: nearly all noise is then that of
 camera paths, which a denoiser takes away."""
 PATH_TRIALS = 16
@@ -99,9 +100,9 @@ def handed_on(integrator):
 def choose(integrator, scene, sensor, seed, iterations, seconds):
     """The `Decision` for a render of so many iterations, or of so many seconds (either may be
     `None`)."""
-    path = PathSession(integrator, scene, sensor, seed, iterations)
-    photons = new_session("bdpm", integrator, scene, sensor, seed, iterations)
-    alone = ("bdpm", photons) if integrator.splits_light else ("path", path)
+    render = integrator, scene, sensor, seed, iterations
+    path, photons = new_session(CAMERA, *render), new_session(PHOTONS, *render)
+    alone = (PHOTONS, photons) if integrator.splits_light else (CAMERA, path)
     if not photons.kinds():
         return Decision(*alone, [f"{alone[0]}: {no_photons(integrator, photons)}"])
     photons.plan_time(seconds)
@@ -121,11 +122,11 @@ def choose(integrator, scene, sensor, seed, iterations, seconds):
         integrator.max_depth,
         integrator.rr_depth,
     )
-    trials, reasons = [_trial("bdpm", photons, segments)], []
+    trials, reasons = [_try_photons(photons, segments)], []
     usual = trials[0].cost
     budget = (prediction.iterations if seconds else iterations or UNPLANNED_ITERATIONS) * usual
-    blind = "not path: it does not split the light" if integrator.splits_light else None
-    blind = blind or why_not_camera_paths("path", photons, prediction)
+    blind = f"not {CAMERA}: it does not split the light" if integrator.splits_light else None
+    blind = blind or why_not_camera_paths(CAMERA, photons, prediction)
     if blind:
         reasons.append(blind)
     else:
@@ -155,7 +156,7 @@ def decide(trials, reasons, budget, usual):
 
 def new_session(plugin, integrator, scene, sensor, seed, iterations):
     """A session of a candidate, with the parameters of `integrator` that all share."""
-    if plugin == "path":
+    if plugin == CAMERA:
         return PathSession(integrator, scene, sensor, seed, iterations)
     shared = {
         **handed_on(integrator),
@@ -198,10 +199,10 @@ def why_not_camera_paths(plugin, session, prediction):
     return None
 
 
-def _trial(plugin, session, segments):
+def _try_photons(session, segments):
     counted = costs.events(session, segments, session.last_vertex, session.prediction.gathered)
-    cost = costs.cost(plugin, counted) + costs.of_direct_paths(session, segments)
-    return trial_of_photons(plugin, session, cost)
+    cost = costs.cost(PHOTONS, counted) + costs.of_direct_paths(session, segments)
+    return trial_of_photons(PHOTONS, session, cost)
 
 
 def trial_of_photons(plugin, session, cost):
@@ -231,10 +232,10 @@ def _try_path(path, segments, pixels, mean, budget):
                 at_once, count
             )
         )
-    cost = costs.cost("path", costs.events(path, segments, None, 0.0))
+    cost = costs.cost(CAMERA, costs.events(path, segments, None, 0.0))
     share = (LEFT if path.integrator.denoised else 1) / path.camera_paths
     parts = parts_of_samples(path, np.array(values), mean, budget / cost, share)
-    return Trial("path", path, parts, cost * path.camera_paths)
+    return Trial(CAMERA, path, parts, cost * path.camera_paths)
 
 
 def parts_of_samples(session, values, mean, samples, share):

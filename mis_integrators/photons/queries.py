@@ -253,7 +253,8 @@ class QueryVisitor:
             smooth &= vertex <= self.bdd
         at.ends = vertex >= self.bdd  # the path's last smooth vertex
         if self.queries.narrow is not None:
-            at.ends &= ~is_narrow(self.queries.narrow, bsdf, at.si, smooth)
+            at.narrow = is_narrow(self.queries.narrow, bsdf, at.si, smooth)
+            at.ends &= ~at.narrow
         if self.beyond is not None:
             # Other paths go straight through media.
             unseen = met | at.scatters if self.flies else met
@@ -335,8 +336,7 @@ class QueryVisitor:
             sums = self.weights.scatter(sums, at.si, self._scattering(at), bs, vertex, scattered)
         beyond = dr.select(at.ends, mi.UInt32(self.bdd), vertex) + 1
         if self.queries.narrow is not None:
-            narrow = ~at.ends & is_narrow(self.queries.narrow, at.bsdf, at.si, scattered)
-            beyond = dr.select(narrow, vertex, beyond)
+            beyond = dr.select(at.narrow & ~at.ends, vertex, beyond)
         state = [
             dr.select(scattered, beyond, vertex),
             met | scattered,

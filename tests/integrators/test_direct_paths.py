@@ -110,6 +110,7 @@ def test_sessions_of_a_render_send_the_same_paths(rgb):
     other.recall(one.learned)
     other.start()
     assert one.direct_light.mean_paths > 0
+    np.testing.assert_array_equal(one.direct_light._paths, other.direct_light._paths)
     for session in (one, other):
         session.iterate(3)
     np.testing.assert_allclose(one.image(), other.image(), rtol=1e-5)
