@@ -1,7 +1,8 @@
 """Denoised pictures, by Open Image Denoise (the package `mitsuba-oidn`).
 
 Images rendered with the parameter `denoised` have their direct light in channels of its own. That
-is denoised apart, and only as far as it is noisy: see `shrunk`.
+is denoised apart, and only as far as it is noisy: see `shrunk`. The denoiser is told that the
+guides of the other light have no noise: see `without_noise`.
 """
 
 from __future__ import annotations
@@ -57,6 +58,26 @@ def shrunk(raw: np.ndarray, clean: np.ndarray, variance: np.ndarray) -> np.ndarr
     return clean + weight[..., None] * (raw - clean)
 
 
+def without_noise(
+    light: np.ndarray, guides: Sequence[np.ndarray] = (), all_edges: bool = False
+) -> np.ndarray:
+    """An image (H, W, 1 or 3) without its noise. `guides`: its albedo and normals.
+
+    With `all_edges` all edges of the light are taken to be in the guides, too: the denoiser then
+    follows these to the pixel, and smooths the more between them. So it is with light that many
+    directions bring, not with highlights and shadows. The guides' own noise is removed before."""
+    oidn, colours = require(), np.broadcast_to(light, (*light.shape[:2], 3))
+    if guides and all_edges:
+        albedo, normal = guides
+        albedo = np.clip(np.asarray(oidn.denoise(albedo)), 0, 1)
+        normal = 2 * np.asarray(oidn.denoise(0.5 + 0.5 * normal)) - 1
+        guides = albedo, normal
+    told = {"hdr": True, "clean_aux": bool(guides) and all_edges}
+    return np.asarray(oidn.denoise(np.ascontiguousarray(colours), *guides, **told))[
+        ..., : light.shape[2]
+    ]
+
+
 def denoise(
     image: Any,
     scene: mi.Scene | None = None,
@@ -93,13 +114,13 @@ def denoise(
         If the image has another shape, another size than the sensor's film, or another number of
         channels than are named.
     """
-    oidn = require()
+    require()
     pixels = np.array(image, dtype=np.float32)
     if pixels.ndim not in (2, 3) or 0 in pixels.shape:
         raise ValueError(f"an image of shape (height, width, channels), not {pixels.shape}")
     if channels and len(channels) != (1 if pixels.ndim == 2 else pixels.shape[2]):
         raise ValueError(f"{len(channels)} names of channels for an image of shape {pixels.shape}")
-    guides: tuple[np.ndarray, ...] = ()
+    guides: Sequence[np.ndarray] = ()
     if scene is not None:
         sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
         size = tuple(int(edge) for edge in sensor.film().crop_size())
@@ -111,19 +132,16 @@ def denoise(
         guides = albedo_and_normal(scene, sensor)
     planes = pixels[..., None] if pixels.ndim == 2 else pixels
     colours = planes[..., : 3 if planes.shape[2] >= 3 else 1]
-    clean = np.maximum(np.nan_to_num(colours, nan=0, posinf=0, neginf=0), 0)
-
-    def without_noise(light: np.ndarray) -> np.ndarray:
-        grey_too = np.ascontiguousarray(np.broadcast_to(light, (*light.shape[:2], 3)))
-        return np.asarray(oidn.denoise(grey_too, *guides, hdr=True))[..., : light.shape[2]]
-
-    if set(direct_channels()) <= set(channels):
-        *direct, variance = (planes[..., channels.index(name)] for name in direct_channels())
-        light = np.clip(np.stack(direct[: colours.shape[2]], axis=-1), 0, clean)
-        found = shrunk(light, without_noise(light), variance) + without_noise(clean - light)
+    finite = np.maximum(np.nan_to_num(colours, nan=0, posinf=0, neginf=0), 0)
+    split = [channels.index(name) for name in direct_channels() if name in channels]
+    if split and planes[..., split].any():  # `path` has these channels, and nothing in them
+        *direct, variance = np.moveaxis(planes[..., split], -1, 0)
+        light = np.clip(np.stack(direct[: colours.shape[2]], axis=-1), 0, finite)
+        found = shrunk(light, without_noise(light, guides), variance)
+        found += without_noise(finite - light, guides, all_edges=True)
         colours[...] = np.maximum(found, 0)
     else:
-        colours[...] = without_noise(clean)
+        colours[...] = without_noise(finite, guides)
     return pixels
 
 

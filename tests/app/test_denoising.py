@@ -4,7 +4,7 @@ import sys
 
 import mis_integrators
 from mis_integrators.app import cli
-from mis_integrators.app.denoising import DOUBT, shrunk
+from mis_integrators.app.denoising import DOUBT, shrunk, without_noise
 from mis_integrators.core.film import WINDOW
 from mis_integrators.core.windows import window_mean
 from mis_integrators.paths.guides import albedo_and_normal
@@ -133,6 +133,23 @@ def test_grey_images_stay_grey(rgb, shape):
     np.testing.assert_allclose(found, image, atol=0.1)
     if len(shape) == 3:
         np.testing.assert_array_equal(found[..., 1:], image[..., 1:])
+
+
+def test_edges_that_guides_have_stay_and_the_rest_is_smoother(rgb):
+    """Stripes of two albedos under light that changes slowly, and the guides' own noise: a quarter
+    of the error goes at least. (One seed, 16384 pixels; it is nearly half.)"""
+    rng = np.random.default_rng(3)
+    stripes = np.where(np.arange(128) // 5 % 2, 0.8, 0.3)[None, :, None]
+    clean = stripes * np.linspace(0.5, 1.5, 128)[:, None, None] * np.ones(3)
+    noisy = np.maximum(clean + rng.normal(0, 0.3, clean.shape), 0).astype(np.float32)
+    albedo = np.broadcast_to(stripes, clean.shape) + rng.normal(0, 0.02, clean.shape)
+    normal = np.broadcast_to([0.0, 0.0, 1.0], clean.shape)
+    guides = [np.ascontiguousarray(guide, np.float32) for guide in (albedo, normal)]
+    left, less = (
+        np.mean(np.square(without_noise(noisy, guides, all_edges) - clean))
+        for all_edges in (False, True)
+    )
+    assert less < 0.75 * left
 
 
 def test_broken_pixels_and_black_ones(rgb):
