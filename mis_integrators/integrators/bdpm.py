@@ -29,7 +29,7 @@ from ..photons.trace import trace_light_paths
 from ..photons.volume import VolumeMap, build_volume_map
 from ..pilot.direct_paths import MOST_PATHS
 from ..pilot.run import PILOT_INDEX
-from ..pilot.setting import PilotSetting, pilot_light_paths
+from ..pilot.setting import LIGHT_SHARES, PilotSetting, pilot_light_paths
 from .common import MOST_LIGHT_PATHS, IterativeIntegrator
 from .direct_light import DirectLight
 from .piloted import PilotedSession
@@ -63,8 +63,8 @@ class BDPM(IterativeIntegrator):
          yes, i.e. |true|)
      * - photon_count
        - |int|
-       - Light sub-paths an iteration; 0 stands for as many as the cropped film has pixels.
-         (Default: 0)
+       - Light sub-paths an iteration; 0 stands for as many as the cropped film has pixels, or with
+         an automatic radius for that share of them which pays. (Default: 0)
      * - initial_radius
        - |float|
        - Merge radius of the first iteration, in scene units; 0 balances noise against blur in a
@@ -156,7 +156,7 @@ class BDPM(IterativeIntegrator):
     def read_photon_parameters(self, parameters):
         """Reads what concerns the photon map."""
         self.photon_count = parameters.integer(
-            "photon_count", 0, 0, "at least 0 (0: as many as pixels)", high=MOST_LIGHT_PATHS
+            "photon_count", 0, 0, "at least 0 (0: automatic)", high=MOST_LIGHT_PATHS
         )
         self.initial_radius, self.alpha = read_radius(parameters)
         self.direct_paths = parameters.integer(
@@ -183,6 +183,10 @@ class BDPM(IterativeIntegrator):
 class BDPMSession(PilotedSession):
     """Iterations of `bdpm`: light pass, photon maps, camera pass, gather."""
 
+    chooses_light_paths = True
+    """Whether the pilot chooses how many light sub-paths an iteration has. (Weights would have to
+    know of it before they are made.)"""
+
     def __init__(self, integrator, scene, sensor, seed, iterations):
         super().__init__(integrator, scene, sensor, seed, iterations)
         self.traits = SceneTraits(scene, sensor)
@@ -192,7 +196,7 @@ class BDPMSession(PilotedSession):
         self.world = World(scene, self.lights, self.traits)
         self.iteration_light_paths = self.light_path_count = integrator.photon_count or min(
             film_sample_count(sensor), MOST_LIGHT_PATHS
-        )  # the latter are fewer in a pilot
+        )  # the latter are fewer in a pilot, and where so many do not pay
         depth = integrator.max_depth
         unreachable = self.lights.needs_photons_for_direct_light()
         self.has_caustics = not self.lights.dark and (
@@ -218,7 +222,8 @@ class BDPMSession(PilotedSession):
         if integrator.initial_radius:
             self.radii = dict.fromkeys(self.kinds(), integrator.initial_radius)
         self.corrected = dict.fromkeys(self.kinds(), False)
-        self.photons_found = 0  # by the last light pass
+        self.photons_a_path = 0.0  # those that a light sub-path left, in the last light pass
+        self.light_share = 1.0  # of `iteration_light_paths`, what an iteration has
         self.recorded = recorder()
         self.direct_light = DirectLight(self)
         self._freeze()
@@ -276,6 +281,7 @@ class BDPMSession(PilotedSession):
             self.seconds,
             self.iteration_light_paths / self.light_path_count,
             integrator.denoised,
+            LIGHT_SHARES if self.chooses_light_paths and not integrator.photon_count else (1.0,),
         )
 
     def pilot_passes(self, setting, pixels):
@@ -294,7 +300,7 @@ class BDPMSession(PilotedSession):
         """How many photons a light sub-path leaves, on average: by the light pass of a pilot."""
         self._use_light_paths(pilot_light_paths(self.iteration_light_paths))
         self._photons(PILOT_INDEX, self._spectral(PILOT_INDEX))
-        return self.photons_found / self.light_path_count
+        return self.photons_a_path
 
     def _use_light_paths(self, count):
         """Traces so many in each light pass from now on."""
@@ -303,12 +309,20 @@ class BDPMSession(PilotedSession):
             self._make_room_for_photons()
             self._freeze()
 
+    def _use_share(self, share):
+        """Traces that share of the light sub-paths in each iteration from now on."""
+        self.light_share = share
+        self._use_light_paths(max(round(share * self.iteration_light_paths), 1))
+
     def start(self):
         super().start()
         if self.direct_light.mean_paths is None:
             self.direct_light.spread()
 
     def _take(self, choice):
+        if choice.light_share != self.light_share:
+            self.kept.clear()
+        self._use_share(choice.light_share)
         super()._take(choice)
         if self.prediction is None:
             self.direct_light.spread()
@@ -318,9 +332,14 @@ class BDPMSession(PilotedSession):
     @property
     def learned(self):
         learned = super().learned
-        return learned and {**learned, "direct_light": self.direct_light.learned}
+        return learned and {
+            **learned,
+            "light_share": self.light_share,
+            "direct_light": self.direct_light.learned,
+        }
 
     def recall_more(self, fields):
+        self._use_share(fields.number("light_share", 1.0, LIGHT_SHARES[-1]))
         of_direct_light = fields.object("direct_light")
         self.direct_light.recall(of_direct_light)
         of_direct_light.finish()
@@ -338,7 +357,13 @@ class BDPMSession(PilotedSession):
     def _freeze(self):
         """Records the passes anew; from the second iteration on, their kernels run without their
         Python."""
-        self._tables = [self.traits.lambertian, self.traits.perturbed, *self.lights.tables()]
+        self._light_paths = dr.opaque(mi.Float, self.light_path_count)  # one kernel for any number
+        self._tables = [
+            self._light_paths,
+            self.traits.lambertian,
+            self.traits.perturbed,
+            *self.lights.tables(),
+        ]
         if self.narrow is not None:
             self._tables.append(self.narrow)
         self._light_pass = self.recorded(self._trace_light)
@@ -397,7 +422,7 @@ class BDPMSession(PilotedSession):
                 photon_map,
                 Beams.read(vertices["beams"], spectral["wavelengths"]),
                 radii,
-                self.light_path_count,
+                self._light_paths,
                 self.integrator.max_depth,
                 grey,
                 self.integrator.splits_light,
@@ -413,7 +438,7 @@ class BDPMSession(PilotedSession):
             photon_map,
             vertices,
             radii,
-            self.light_path_count,
+            self._light_paths,
             self.integrator.max_depth,
             weigh,
             grey,
@@ -555,7 +580,7 @@ class BDPMSession(PilotedSession):
             dr.eval(photons)
             found = int(photons[2][0])
             in_media = int(photons[-1][2][0]) if self.traits.has_media else 0
-            self.photons_found = found + in_media
+            self.photons_a_path = (found + in_media) / self.light_path_count
             if in_media > self.volume_capacity:
                 self.volume_capacity = rounded_up(in_media + in_media // 8)
                 self._freeze()

@@ -23,10 +23,8 @@ def events(session, segments, last_vertex, gathered):
     that shades (`None`: all); `gathered`: photons within a vertex's merge disks.
     """
     camera = float(sum(segments if last_vertex is None else segments[: last_vertex + 1]))
-    paths = getattr(session, "light_path_count", 0)
-    light = (
-        (paths + getattr(session, "photons_found", 0)) * session.camera_paths / session.path_count
-    )
+    paths = getattr(session, "light_path_count", 0) * session.camera_paths / session.path_count
+    light = paths * (1 + getattr(session, "photons_a_path", 0))
     return camera, light, gathered, 1.0
 
 

@@ -38,6 +38,8 @@ class PublishedSession(BDPMSession):
     The pilot of an automatic radius merges at the first strategy's vertex, unweighted.
     """
 
+    chooses_light_paths = False
+
     def __init__(self, integrator, scene, sensor, seed, iterations):
         super().__init__(integrator, scene, sensor, seed, iterations)
         self.split_paths(CHAIN_CHUNK)

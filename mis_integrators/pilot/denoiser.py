@@ -36,6 +36,15 @@ def variance_left(samples: np.ndarray) -> np.ndarray:
     """
     found = samples.mean(axis=-2).var(axis=0, ddof=1)
     if samples.shape[-2] == GROUPS:
-        apart = (samples[..., 0, :] - samples[..., 1, :]) / 2
-        found -= (1 - 2 * LEFT) * apart.var(axis=0, ddof=1)
+        found -= (1 - 2 * LEFT) * _half_of_own(samples)
     return found
+
+
+def own_variance_left(samples: np.ndarray) -> np.ndarray:
+    """LEFT B, the part of `variance_left` that camera paths make; of two groups."""
+    return 2 * LEFT * _half_of_own(samples)
+
+
+def _half_of_own(samples: np.ndarray) -> np.ndarray:
+    """B / 2."""
+    return ((samples[..., 0, :] - samples[..., 1, :]) / 2).var(axis=0, ddof=1)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
-from .denoiser import variance_left
+from .denoiser import GROUPS, own_variance_left, variance_left
 
 FEW_DISKS = 64
 """Tuned: merge disks that found photons, fewer than which tell nothing of the noise of that
@@ -56,15 +57,28 @@ def shrink_to_neighbours(samples: np.ndarray, cells: np.ndarray) -> np.ndarray:
     return cell[cells] + real[cells] * (means - cell[cells])
 
 
-def photon_variance(
+class Noise(NamedTuple):
+    """V(R), the relative variance of an iteration, in two parts."""
+
+    photons: np.ndarray
+    """What photons make of it, one a radius."""
+    floor: float
+    """What camera paths make of it at every radius, however many photons there are."""
+
+    def at(self, light_share: float = 1.0) -> np.ndarray:
+        """V(R) with that share of the light sub-paths."""
+        return self.floor + self.photons / light_share
+
+
+def noise_by_radius(
     radii: np.ndarray,
     samples: np.ndarray,
     weights: np.ndarray,
     photons_only: bool = True,
     alike: bool = False,
     light_paths: float = 1.0,
-) -> np.ndarray:
-    """V(R), one a radius.
+) -> Noise:
+    """The `Noise` of estimates.
 
     Parameters
     ----------
@@ -81,10 +95,20 @@ def photon_variance(
         How many times as many light sub-paths as in these iterations V is for: noise of photons
         falls with their number.
     """
-    variance = np.array([trimmed_mean(values) for values in weights * variance_left(samples)])
+    variance = _means(weights * variance_left(samples))
     disks = np.count_nonzero(samples.mean(axis=2), axis=(0, 2)) if alike else None
-    floor = 0.0 if photons_only else variance.min()
-    return floor + (bounded_by_larger_disks(radii, variance, floor, disks) - floor) / light_paths
+    floor = 0.0
+    if not photons_only:
+        told_apart = samples.shape[2] == GROUPS
+        own = _means(weights * own_variance_left(samples)) if told_apart else variance
+        floor = min(own.min(), variance.min())
+    photons = bounded_by_larger_disks(radii, variance, floor, disks) - floor
+    return Noise(photons / light_paths, floor)
+
+
+def _means(values: np.ndarray) -> np.ndarray:
+    """The `trimmed_mean` of each row."""
+    return np.array([trimmed_mean(row) for row in values])
 
 
 def bounded_by_larger_disks(

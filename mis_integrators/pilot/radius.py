@@ -34,7 +34,7 @@ import numpy as np
 
 from .bias import LEAST_BIAS, LEAST_CORRECTED, expected_squared_bias, squared_difference
 from .edges import light_lost_at_edges
-from .noise import photon_variance
+from .noise import Noise, noise_by_radius
 
 LADDER_STEPS = 7
 """Tuned: radii of the ladder."""
@@ -75,15 +75,15 @@ class ErrorByRadius(NamedTuple):
     """Radii to choose from."""
     squared_bias: dict[bool, np.ndarray]
     """At the fine radii."""
-    variance: dict[bool, np.ndarray]
+    noise: dict[bool, Noise]
     """Of an iteration of the render, at the ladder."""
 
-    def at(self, radius: float, corrected: bool) -> tuple[float, float]:
-        """Squared bias and variance at a radius."""
-        if corrected not in self.variance:
+    def at(self, radius: float, corrected: bool, light_share: float = 1.0) -> tuple[float, float]:
+        """Squared bias and variance at a radius, with that share of the light sub-paths."""
+        if corrected not in self.noise:
             return 0.0, 0.0
         bias = between(np.array([radius]), self.fine, self.squared_bias[corrected])
-        variance = between(np.array([radius]), self.ladder, self.variance[corrected])
+        variance = between(np.array([radius]), self.ladder, self.noise[corrected].at(light_share))
         return float(bias[0]), float(variance[0])
 
 
@@ -107,13 +107,13 @@ def error_by_radius(
     weights : (pixels,)
         Of the pixels' squared errors, see `noise.MEASURES`.
     photons_only, alike, light_paths
-        See `noise.photon_variance`.
+        See `noise.noise_by_radius`.
     """
     fine = np.exp(np.linspace(np.log(radii[0]), np.log(radii[-1]), 16 * len(radii)))
     if not np.any(plain):
         return ErrorByRadius(radii, fine, {}, {})
-    variance = {
-        which: photon_variance(radii, samples, weights, photons_only, alike, light_paths)
+    noise = {
+        which: noise_by_radius(radii, samples, weights, photons_only, alike, light_paths)
         for which, samples in ((False, plain), (True, corrected))
         if samples is not None
     }
@@ -132,8 +132,8 @@ def error_by_radius(
     return ErrorByRadius(
         radii,
         fine,
-        {which: blur + at_edges[which] for which in variance},
-        variance,
+        {which: blur + at_edges[which] for which in noise},
+        noise,
     )
 
 
@@ -149,6 +149,7 @@ def best_radius(
     iterations: Callable[[np.ndarray, bool], np.ndarray],
     used: tuple[float, bool] | None = None,
     reluctance: float = 0.0,
+    light_share: float = 1.0,
 ) -> RadiusChoice:
     """The `RadiusChoice` with the least bias^2 + V / n. Where the pilot found no photon it is a
     middling radius.
@@ -160,11 +161,13 @@ def best_radius(
     used : (radius, corrected)
         A choice that is kept unless the least error is below its by more than the share
         `reluctance`.
+    light_share
+        Of the light sub-paths, those that an iteration has.
     """
     radii, fine = errors.ladder, errors.fine
     choices = []
     for corrected, bias in errors.squared_bias.items():
-        variance = between(fine, radii, errors.variance[corrected])
+        variance = between(fine, radii, errors.noise[corrected].at(light_share))
         predicted = bias + variance / iterations(fine, corrected)
         at = int(np.argmin(predicted))
         candidates = [(float(predicted[at]), float(fine[at]))]

@@ -76,6 +76,8 @@ class Choice:
     radii: dict[str, float]
     corrected: dict[str, bool]
     prediction: Prediction | None
+    light_share: float = 1.0
+    """Of the light sub-paths, those that an iteration has."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +91,7 @@ class PilotResult:
     seconds: float
     """Of the pilot's last iteration."""
     photons: dict[str, float]
-    """As in `PilotSamples`, but of an iteration of the render."""
+    """As in `PilotSamples`, but of an iteration of the render with all its light sub-paths."""
     errors: dict[str, dict[str, ErrorByRadius]]
     """By measure, and by kind of photons."""
     direct: dict[str, float]
@@ -109,13 +111,30 @@ class PilotResult:
             Iterations of usual cost that there is time for.
         kept
             A choice that is kept, kind by kind, unless the error falls by more than the share
-            `reluctance`.
+            `reluctance`; and so is its share of the light sub-paths.
         """
+        best, least = None, np.inf
+        for share in self.setting.light_shares:
+            used = kept if kept is not None and kept.light_share == share else None
+            choice = self._choose(share, count, used, reluctance)
+            error = 0.0
+            if choice.prediction is not None:
+                error = choice.prediction.errors["relmse"].after(choice.prediction.iterations)
+            error *= 1 - reluctance * (used is not None)
+            if best is None or error < least:
+                best, least = choice, error
+        assert best is not None
+        return best
+
+    def _choose(self, share: float, count: float, kept: Choice | None, reluctance: float) -> Choice:
+        """The same with this `share` of the light sub-paths."""
         radius = RADIUS_WITHOUT_VERTICES * self.setting.extent
         if not self.errors:
             kinds = self.setting.kinds
             return Choice(dict.fromkeys(kinds, radius), dict.fromkeys(kinds, False), None)
-        chosen = {kind: self._best_radius(kind, count, kept, reluctance) for kind in self._met}
+        chosen = {
+            kind: self._best_radius(kind, share, count, kept, reluctance) for kind in self._met
+        }
         choice = Choice(
             {
                 kind: chosen[kind].radius if kind in chosen else radius
@@ -123,6 +142,7 @@ class PilotResult:
             },
             {kind: kind in chosen and chosen[kind].corrected for kind in self.setting.kinds},
             None,
+            share,
         )
         return replace(choice, prediction=self._predict(choice, count))
 
@@ -132,24 +152,25 @@ class PilotResult:
         return list(self.errors["relmse"])
 
     def _best_radius(
-        self, kind: str, count: float, kept: Choice | None, reluctance: float
+        self, kind: str, share: float, count: float, kept: Choice | None, reluctance: float
     ) -> RadiusChoice:
-        """The `RadiusChoice` for one kind of photons."""
+        """The `RadiusChoice` for one kind of photons, with a `share` of the light sub-paths."""
 
         def iterations(radius: np.ndarray, corrected: bool) -> np.ndarray:
-            gathered = self.gathered(kind, radius)
-            cost = iteration_cost(gathered, corrected, self.setting.camera_paths)
+            gathered = self.gathered(kind, radius) * share
+            cost = iteration_cost(gathered, corrected, self.setting.camera_paths, share)
             return np.maximum(count / cost, 1)
 
         used = None if kept is None else (kept.radii[kind], kept.corrected[kind])
-        return best_radius(self.errors["relmse"][kind], iterations, used, reluctance)
+        return best_radius(self.errors["relmse"][kind], iterations, used, reluctance, share)
 
     def _predict(self, choice: Choice, count: float) -> Prediction:
         """The `Prediction` for a choice."""
-        errors = {}
+        errors, share = {}, choice.light_share
         for measure, by_kind in self.errors.items():
             found = [
-                by_kind[kind].at(choice.radii[kind], choice.corrected[kind]) for kind in by_kind
+                by_kind[kind].at(choice.radii[kind], choice.corrected[kind], share)
+                for kind in by_kind
             ]
             errors[measure] = PredictedError(
                 sum(squared_bias for squared_bias, _ in found),
@@ -158,7 +179,7 @@ class PilotResult:
         return Prediction(
             errors,
             self.photon_light,
-            sum(self.gathered(kind, choice.radii[kind]) for kind in self._met),
+            sum(self.gathered(kind, choice.radii[kind]) * share for kind in self._met),
             count / self.cost(choice),
             self.mean,
             self.pixels,
@@ -166,7 +187,7 @@ class PilotResult:
         )
 
     def gathered(self, kind: str, radius: Radii) -> Radii:
-        """Photons of a kind within `radius` of a vertex, on average."""
+        """Photons of a kind within `radius` of a vertex, on average, of all light sub-paths."""
         return self.photons[kind] * (radius / self.errors["relmse"][kind].ladder[-1]) ** 2
 
     def cost(self, choice: Choice) -> float:
@@ -174,7 +195,10 @@ class PilotResult:
         return max(
             (
                 iteration_cost(
-                    self.gathered(kind, radius), choice.corrected[kind], self.setting.camera_paths
+                    self.gathered(kind, radius) * choice.light_share,
+                    choice.corrected[kind],
+                    self.setting.camera_paths,
+                    choice.light_share,
                 )
                 for kind, radius in choice.radii.items()
                 if kind in self._met

@@ -19,6 +19,8 @@ MOST_CAMERA_PATHS = 16
 of photons."""
 NEIGHBOURS = 16
 """Tuned: pilot pixels that are expected to look alike."""
+LIGHT_SHARES = tuple(2.0**-k for k in range(6))
+"""Of the light sub-paths, what an iteration may do with. (1/16 and 1/32 differ little in error.)"""
 UNPLANNED_ITERATIONS = 64
 """Tuned: iterations that a render without a planned end is taken to have."""
 
@@ -49,6 +51,8 @@ class PilotSetting:
     """Light sub-paths of an iteration over those of one of the pilot's."""
     denoised: bool = False
     """Whether the errors that count are those that a denoiser leaves (see `denoiser`)."""
+    light_shares: tuple[float, ...] = (1.0,)
+    """To choose from: the share of its light sub-paths that an iteration has."""
 
     @property
     def planned_iterations(self) -> int:

@@ -168,9 +168,11 @@ def test_learned_radii_are_not_learned_again(scene):
     learned = {
         "radii": dict.fromkeys(session.kinds(), 0.123),
         "corrected": dict.fromkeys(session.kinds(), False),
+        "light_share": 0.25,
         "direct_light": {},
     }
     session.recall(learned)
+    assert session.light_path_count == 64
     session.plan_time(5.0)
     session.iterate()
     assert session.learned == learned and len(learned["radii"]) == 2

@@ -265,35 +265,52 @@ def test_any_text_is_refused_or_read(text):
 LEARNED = {
     "bdpm": [
         {"radii": {}},
-        {"radii": {"indirect": 0.1}, "corrected": {"indirect": False}, "direct_light": {}},
+        {
+            "radii": {"indirect": 0.1},
+            "corrected": {"indirect": False},
+            "light_share": 1.0,
+            "direct_light": {},
+        },
         {
             "radii": {"indirect": -1, "caustic": 0.1},
             "corrected": {"indirect": True, "caustic": True},
+            "light_share": 1.0,
             "direct_light": {},
         },
         {
             "radii": {"indirect": 1, "caustic": 1e999},
             "corrected": {"indirect": True, "caustic": True},
+            "light_share": 1.0,
             "direct_light": {},
         },
         {
             "radii": {"indirect": 1, "caustic": 1},
             "corrected": {"indirect": True, "caustic": 1},
+            "light_share": 1.0,
             "direct_light": {},
         },
         {
             "radii": {"indirect": 1, "caustic": 1},
             "corrected": {"indirect": True, "caustic": True},
+            "light_share": 1.0,
             "direct_light": {"photon_light": 1, "photon_error": -1, "iterations": 1},
         },
         {
             "radii": {"indirect": 1, "caustic": 1},
             "corrected": {"indirect": True, "caustic": True},
+            "light_share": 1.0,
             "direct_light": {"photon_light": 1, "photon_error": 1},
+        },
+        {
+            "radii": {"indirect": 1, "caustic": 1},
+            "corrected": {"indirect": True, "caustic": True},
+            "light_share": 2.0,
+            "direct_light": {},
         },
         {
             "radii": {"indirect": 1, "caustic": 1, "more": 1},
             "corrected": {"indirect": True, "caustic": True},
+            "light_share": 1.0,
             "direct_light": {},
         },
     ],
@@ -389,6 +406,7 @@ def test_any_value_that_was_learned(sessions, name, value):
     learned = {
         "radii": {"indirect": 0.1, "caustic": 0.1},
         "corrected": {"indirect": False, "caustic": False},
+        "light_share": 1.0,
         "direct_light": {},
         name: value,
     }

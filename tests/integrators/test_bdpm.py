@@ -219,6 +219,7 @@ def test_same_seed_same_edges(rgb):
             {
                 "radii": dict.fromkeys(session.kinds(), 0.3),
                 "corrected": {"caustic": False, "indirect": True},
+                "light_share": 1.0,
                 "direct_light": {},
             }
         )
@@ -650,7 +651,7 @@ def test_photons_that_overflow_later_are_not_lost(rgb):
     found = {}
     for number in range(8):
         room._photons(number, room._spectral(number))
-        found[number] = room.photons_found
+        found[number] = round(room.photons_a_path * room.light_path_count)
     order = sorted(found, key=found.get)
     tight.photon_capacity = found[order[4]]
     tight._freeze()
@@ -1269,6 +1270,29 @@ def test_timed_iterations_are_of_the_radii_rendered_with(rgb, monkeypatch, chang
             session.iterate()
     np.testing.assert_allclose(timed.image(), same.image(), rtol=1e-4, atol=1e-5)
     assert not timed.kept
+
+
+def test_fewer_light_sub_paths_where_they_pay(rgb):
+    """Paths that gather at their second vertex make more noise than photons do. What gathers at the
+    first has no other noise, weights are made for the photons there are, and a number that is given
+    is given. Another session needs no pilot to render the same."""
+    scene = box_scene()
+    pixels = 32 * 32
+    for plugin, parameters in (
+        ("bdpm", {"bdd": 0}),
+        ("bdpm", {"bdd": 1, "photon_count": pixels}),
+        ("bdpm_opt2", {}),
+    ):
+        session = mi.load_dict({"type": plugin, **parameters}).session(scene, seed=1)
+        session.start()
+        assert session.light_path_count == session.settings["photon_count"] == pixels
+    one, other = (mi.load_dict({"type": "bdpm"}).session(scene, seed=1) for _ in range(2))
+    one.start()
+    assert one.light_path_count == one.light_share * pixels < pixels
+    other.recall(one.learned)
+    for session in (one, other):
+        session.iterate()
+    np.testing.assert_allclose(one.image(), other.image(), rtol=1e-4, atol=1e-5)
 
 
 def kernels(integrator, scene, seed):
