@@ -32,6 +32,7 @@ SEQUENCES = "tests/core/test_sequences.py"
 TRANSPORT = "tests/paths/test_transport.py"
 RADIUS = "tests/pilot/test_radius.py"
 PATHS = "tests/pilot/test_paths_per_pixel.py"
+LIGHT_SHARE = "tests/pilot/test_light_share.py"
 CACHE = "tests/resampling/test_cache_points.py"
 DENOISING = "tests/app/test_denoising.py"
 SHIFTS = "tests/volume/test_shifts.py"
@@ -269,6 +270,13 @@ MUTATIONS = [
     ),
     # ------------------------------------------------------------------ pilot
     Mutation(
+        "pilot/noise.py",
+        "return self.floor + self.photons / light_share",
+        "return self.floor + self.photons * light_share",
+        "fewer photons make less noise",
+        LIGHT_SHARE,
+    ),
+    Mutation(
         "pilot/bias.py",
         "m * (m - 1)\n    )",
         "m * m\n    )",
@@ -463,6 +471,13 @@ MUTATIONS = [
         f"tests/core/test_variance_of_renders.py {BDPM}::test_variance_is_that_of_the_mean",
     ),
     # ------------------------------------------------------------------ app
+    Mutation(
+        "app/denoising.py",
+        '"clean_aux": bool(guides) and all_edges',
+        '"clean_aux": False',
+        "the denoiser takes the guides' edges for noise",
+        f"{DENOISING}::test_edges_that_guides_have_stay_and_the_rest_is_smoother",
+    ),
     Mutation(
         "app/denoising.py",
         "weight = np.maximum(1 - DOUBT * variance",
