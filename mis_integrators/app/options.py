@@ -120,7 +120,7 @@ def _how_long(parser: argparse.ArgumentParser) -> None:
         "--time",
         type=_positive_number,
         metavar="SECONDS",
-        help="render for so long, at least one iteration; compiling kernels does not count",
+        help="render for about so long, at least one iteration; compiling kernels does not count",
     )
     add(
         "--target-error",

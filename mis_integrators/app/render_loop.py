@@ -132,23 +132,30 @@ def iterate(
 ) -> None:
     """Iterate until there are as many iterations as ``planned``, ``seconds`` of rendering have
     passed, or the error reaches its target, whichever is first of those that are given, or the user
-    interrupts; but at least as many as an image needs. A session that has enough already is left as
-    it is. Its remarks, if it has some, are said once. A session that only waits for others may
-    return from ``iterate`` with nothing new.
+    interrupts; but at least as many as an image needs. An iteration of which more than half would
+    lie beyond the ``seconds``, by the shortest so far, is not begun. A session that has enough
+    already is left as it is. Its remarks, if it has some, are said once. A session that only waits
+    for others may return from ``iterate`` with nothing new.
     """
+    shortest = math.inf
+    """Seconds of an iteration; those of the first hold what goes before it, too."""
 
     def enough() -> bool:
+        half = shortest / 2 if shortest < math.inf else 0.0
         return (
             (planned is not None and session.iterations >= planned)
-            or (seconds is not None and clock.rendering >= seconds)
+            or (seconds is not None and clock.rendering + half >= seconds)
             or (target is not None and target.reached(session))
         )
 
     remarked = False
     interrupt.have_result = session.iterations > 0
     while session.iterations < fewest_iterations(session) or not (enough() or interrupt.requested):
+        first, before = session.iterations == 0, clock.rendering
         with clock:
             session.iterate()
+        if not first:
+            shortest = min(shortest, clock.rendering - before)
         interrupt.have_result = (
             session.iterations > 0
         )  # before a chore shows that there is something

@@ -3,6 +3,7 @@ Pure functions."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import NamedTuple, TypeVar
 
@@ -112,19 +113,30 @@ class PilotResult:
         kept
             A choice that is kept, kind by kind, unless the error falls by more than the share
             `reluctance`; and so is its share of the light sub-paths.
+
+        Where there is a time limit, only whole iterations count, so that one fits if any share of
+        the light sub-paths lets it.
         """
-        best, least = None, np.inf
+        best, least = None, math.inf
         for share in self.setting.light_shares:
             used = kept if kept is not None and kept.light_share == share else None
             choice = self._choose(share, count, used, reluctance)
-            error = 0.0
-            if choice.prediction is not None:
-                error = choice.prediction.errors["relmse"].after(choice.prediction.iterations)
-            error *= 1 - reluctance * (used is not None)
-            if best is None or error < least:
+            error = self._error(choice)
+            if used is not None:
+                error = error * (1 - reluctance) if reluctance < 1 else 0.0
+            if error < least or least == math.inf:  # as long as none fits, the shortest
                 best, least = choice, error
         assert best is not None
         return best
+
+    def _error(self, choice: Choice) -> float:
+        """The predicted relative error of a choice; infinite where no iteration fits."""
+        if choice.prediction is None:
+            return 0.0
+        count = choice.prediction.iterations
+        if self.setting.seconds is not None:
+            count = math.floor(count)
+        return choice.prediction.errors["relmse"].after(count) if count > 0 else math.inf
 
     def _choose(self, share: float, count: float, kept: Choice | None, reluctance: float) -> Choice:
         """The same with this `share` of the light sub-paths."""

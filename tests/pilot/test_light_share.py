@@ -13,7 +13,7 @@ RADII = 0.01 * 2.0 ** np.arange(7)
 SIZE, ITERATIONS = 64, 16
 
 
-def setting_of(denoised, shares=LIGHT_SHARES, first_vertex=False):
+def setting_of(denoised, shares=LIGHT_SHARES, first_vertex=False, seconds=None):
     return PilotSetting(
         SIZE,
         SIZE * SIZE,
@@ -23,7 +23,7 @@ def setting_of(denoised, shares=LIGHT_SHARES, first_vertex=False):
         False,
         1,
         None,
-        None,
+        seconds,
         1.0,
         denoised,
         shares,
@@ -94,3 +94,18 @@ def test_kept_choices_keep_their_share():
     far = result._choose(LIGHT_SHARES[-1], 1000, None, 0.0)
     assert far.light_share < choice.light_share < near.light_share
     assert result.choose(1000, far, reluctance=0.05).light_share == choice.light_share
+
+
+def test_an_iteration_fits_into_the_time():
+    """Photons make all of the noise, so that all of them would be best; where there is no time for
+    all, as many as there is time for. A choice that has taken all of the time is kept."""
+    result, _ = choice_of(setting_of(False, first_vertex=True, seconds=1.0), 1.0, 0.0)
+    assert result.choose(5.0).light_share == 1
+    fits = result.choose(0.8)
+    assert fits.light_share < 1 and fits.prediction.iterations >= 1
+    assert (
+        result.cost(fits) <= 0.8 < result.cost(result._choose(2 * fits.light_share, 0.8, None, 0))
+    )
+    assert result.choose(0.01).light_share == LIGHT_SHARES[-1]
+    late = result._choose(1.0, 0.01, None, 0.0)
+    assert result.choose(0.01, late, reluctance=1.0).light_share == 1
