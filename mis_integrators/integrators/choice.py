@@ -20,7 +20,6 @@ from ..core.spectra import channel_mean
 from ..core.stratified_variance import contrasts, extrapolated
 from ..paths.layers import written
 from ..paths.path_length_statistics import mean_segments
-from ..pilot.denoiser import LEFT
 from ..pilot.noise import MEASURES, trimmed_mean
 from ..pilot.setting import UNPLANNED_ITERATIONS
 from . import costs
@@ -125,10 +124,11 @@ def choose(integrator, scene, sensor, seed, iterations, seconds):
     trials, reasons = [_try_photons(photons, segments)], []
     usual = trials[0].cost
     budget = (prediction.iterations if seconds else iterations or UNPLANNED_ITERATIONS) * usual
-    blind = f"not {CAMERA}: it does not split the light" if integrator.splits_light else None
-    blind = blind or why_not_camera_paths(CAMERA, photons, prediction)
-    if blind:
-        reasons.append(blind)
+    excluded = why_not_camera_paths(CAMERA, photons, prediction)
+    if integrator.kept_classes:
+        excluded = f"not {CAMERA}: it does not split the light"
+    if excluded:
+        reasons.append(excluded)
     else:
         trials.insert(0, _try_path(path, segments, pixels, prediction.mean, budget))
     return decide(trials, reasons, budget, usual)
@@ -233,8 +233,7 @@ def _try_path(path, segments, pixels, mean, budget):
             )
         )
     cost = costs.cost(CAMERA, costs.events(path, segments, None, 0.0))
-    share = (LEFT if path.integrator.denoised else 1) / path.camera_paths
-    parts = parts_of_samples(path, np.array(values), mean, budget / cost, share)
+    parts = parts_of_samples(path, np.array(values), mean, budget / cost, 1 / path.camera_paths)
     return Trial(CAMERA, path, parts, cost * path.camera_paths)
 
 
