@@ -114,7 +114,7 @@ def denoise(
         If the image has another shape, another size than the sensor's film, or another number of
         channels than are named.
     """
-    require()
+    require()  # before anything is traced
     pixels = np.array(image, dtype=np.float32)
     if pixels.ndim not in (2, 3) or 0 in pixels.shape:
         raise ValueError(f"an image of shape (height, width, channels), not {pixels.shape}")
@@ -133,9 +133,11 @@ def denoise(
     planes = pixels[..., None] if pixels.ndim == 2 else pixels
     colours = planes[..., : 3 if planes.shape[2] >= 3 else 1]
     finite = np.maximum(np.nan_to_num(colours, nan=0, posinf=0, neginf=0), 0)
-    split = [channels.index(name) for name in direct_channels() if name in channels]
-    if split and planes[..., split].any():  # `path` has these channels, and nothing in them
-        *direct, variance = np.moveaxis(planes[..., split], -1, 0)
+    split = planes[..., :0]
+    if set(direct_channels()) <= set(channels):
+        split = planes[..., [channels.index(name) for name in direct_channels()]]
+    if split.any():  # `path` has these channels, and nothing in them
+        *direct, variance = np.moveaxis(split, -1, 0)
         light = np.clip(np.stack(direct[: colours.shape[2]], axis=-1), 0, finite)
         found = shrunk(light, without_noise(light, guides), variance)
         found += without_noise(finite - light, guides, all_edges=True)

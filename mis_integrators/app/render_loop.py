@@ -137,11 +137,9 @@ def iterate(
     already is left as it is. Its remarks, if it has some, are said once. A session that only waits
     for others may return from ``iterate`` with nothing new.
     """
-    shortest = math.inf
-    """Seconds of an iteration; those of the first hold what goes before it, too."""
+    half = 0.0  # of the shortest iteration, without the first, which holds what goes before it
 
     def enough() -> bool:
-        half = shortest / 2 if shortest < math.inf else 0.0
         return (
             (planned is not None and session.iterations >= planned)
             or (seconds is not None and clock.rendering + half >= seconds)
@@ -155,7 +153,8 @@ def iterate(
         with clock:
             session.iterate()
         if not first:
-            shortest = min(shortest, clock.rendering - before)
+            spent = clock.rendering - before
+            half = min(half or spent, spent / 2)
         interrupt.have_result = (
             session.iterations > 0
         )  # before a chore shows that there is something

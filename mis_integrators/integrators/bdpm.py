@@ -223,7 +223,6 @@ class BDPMSession(PilotedSession):
             self.radii = dict.fromkeys(self.kinds(), integrator.initial_radius)
         self.corrected = dict.fromkeys(self.kinds(), False)
         self.photons_a_path = 0.0  # those that a light sub-path left, in the last light pass
-        self.light_share = 1.0  # of `iteration_light_paths`, what an iteration has
         self.recorded = recorder()
         self.direct_light = DirectLight(self)
         self._freeze()
@@ -309,10 +308,8 @@ class BDPMSession(PilotedSession):
             self._make_room_for_photons()
             self._freeze()
 
-    def _use_share(self, share):
-        """Traces that share of the light sub-paths in each iteration from now on."""
-        self.light_share = share
-        self._use_light_paths(max(round(share * self.iteration_light_paths), 1))
+    def _use_light_share(self):
+        self._use_light_paths(max(round(self.light_share * self.iteration_light_paths), 1))
 
     def start(self):
         super().start()
@@ -320,9 +317,6 @@ class BDPMSession(PilotedSession):
             self.direct_light.spread()
 
     def _take(self, choice):
-        if choice.light_share != self.light_share:
-            self.kept.clear()
-        self._use_share(choice.light_share)
         super()._take(choice)
         if self.prediction is None:
             self.direct_light.spread()
@@ -332,14 +326,9 @@ class BDPMSession(PilotedSession):
     @property
     def learned(self):
         learned = super().learned
-        return learned and {
-            **learned,
-            "light_share": self.light_share,
-            "direct_light": self.direct_light.learned,
-        }
+        return learned and {**learned, "direct_light": self.direct_light.learned}
 
     def recall_more(self, fields):
-        self._use_share(fields.number("light_share", 1.0, LIGHT_SHARES[-1]))
         of_direct_light = fields.object("direct_light")
         self.direct_light.recall(of_direct_light)
         of_direct_light.finish()

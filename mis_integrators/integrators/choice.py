@@ -124,9 +124,10 @@ def choose(integrator, scene, sensor, seed, iterations, seconds):
     trials, reasons = [_try_photons(photons, segments)], []
     usual = trials[0].cost
     budget = (prediction.iterations if seconds else iterations or UNPLANNED_ITERATIONS) * usual
-    excluded = why_not_camera_paths(CAMERA, photons, prediction)
     if integrator.kept_classes:
         excluded = f"not {CAMERA}: it does not split the light"
+    else:
+        excluded = why_not_camera_paths(CAMERA, photons, prediction)
     if excluded:
         reasons.append(excluded)
     else:

@@ -10,7 +10,7 @@ import mitsuba as mi
 from ..core.untrusted import Fields
 from ..pilot.result import Choice
 from ..pilot.run import run_pilot
-from ..pilot.setting import pilot_pixels
+from ..pilot.setting import LIGHT_SHARES, pilot_pixels
 from .common import IterativeSession
 from .schedule import LARGEST_RADIUS, SMALLEST_RADIUS, shrunk
 
@@ -35,6 +35,7 @@ class PilotedSession(IterativeSession):
         self.seconds = None  # what rendering may take
         self.radii = None  # by kind of photons, once they are known
         self.corrected = {}  # whether estimates are corrected at edges, by kind of photons
+        self.light_share = 1.0  # of the light sub-paths, those that an iteration has
         self.prediction = None  # a `Prediction`, where a pilot has chosen
         self.kept = {}  # iterations that were rendered to measure their time, by number
 
@@ -58,6 +59,10 @@ class PilotedSession(IterativeSession):
         """Records the camera pass anew, because its estimates are others."""
         raise TypeError(f"{type(self).__name__} does not define _record_camera_pass")
 
+    def _use_light_share(self):
+        """Traces the `light_share` in each iteration from now on."""
+        raise TypeError(f"{type(self).__name__} does not define _use_light_share")
+
     def plan_time(self, seconds):
         """Rendering will last `seconds`, from `start` on: the automatic radius is chosen for as
         many iterations as fit."""
@@ -76,6 +81,7 @@ class PilotedSession(IterativeSession):
         return {
             "radii": {kind: float(radius) for kind, radius in self.radii.items()},
             "corrected": {kind: bool(flag) for kind, flag in self.corrected.items()},
+            "light_share": self.light_share,
         }
 
     def recall(self, learned):
@@ -87,6 +93,8 @@ class PilotedSession(IterativeSession):
             kind: radii.number(kind, LARGEST_RADIUS, SMALLEST_RADIUS) for kind in self.kinds()
         }
         self.corrected = {kind: corrected.boolean(kind) for kind in self.kinds()}
+        self.light_share = fields.number("light_share", 1.0, LIGHT_SHARES[-1])
+        self._use_light_share()
         self.recall_more(fields)
         for each in (radii, corrected, fields):
             each.finish()
@@ -140,11 +148,13 @@ class PilotedSession(IterativeSession):
     def _take(self, choice: Choice):
         """Renders with this choice from now on. What was rendered with another is no longer
         kept."""
-        if (choice.radii, choice.corrected) != (self.radii, self.corrected):
+        used = self.radii, self.corrected, self.light_share
+        if (choice.radii, choice.corrected, choice.light_share) != used:
             self.kept.clear()
         changed = choice.corrected != self.corrected
         self.radii, self.corrected = dict(choice.radii), dict(choice.corrected)
-        self.prediction = choice.prediction
+        self.prediction, self.light_share = choice.prediction, choice.light_share
+        self._use_light_share()
         if changed:
             self._record_camera_pass()
 

@@ -168,7 +168,7 @@ class WeightedSession(BDPMSession):
             photon_map,
             beams,
             radii,
-            self.light_path_count,
+            self._light_paths,
             self.integrator.max_depth,
             grey,
             self.integrator.splits_light,

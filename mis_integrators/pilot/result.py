@@ -169,9 +169,7 @@ class PilotResult:
         """The `RadiusChoice` for one kind of photons, with a `share` of the light sub-paths."""
 
         def iterations(radius: np.ndarray, corrected: bool) -> np.ndarray:
-            gathered = self.gathered(kind, radius) * share
-            cost = iteration_cost(gathered, corrected, self.setting.camera_paths, share)
-            return np.maximum(count / cost, 1)
+            return np.maximum(count / self._cost(kind, radius, corrected, share), 1)
 
         used = None if kept is None else (kept.radii[kind], kept.corrected[kind])
         return best_radius(self.errors["relmse"][kind], iterations, used, reluctance, share)
@@ -191,27 +189,29 @@ class PilotResult:
         return Prediction(
             errors,
             self.photon_light,
-            sum(self.gathered(kind, choice.radii[kind]) * share for kind in self._met),
+            sum(self.gathered(kind, choice.radii[kind], share) for kind in self._met),
             count / self.cost(choice),
             self.mean,
             self.pixels,
             self.caustic_share,
         )
 
-    def gathered(self, kind: str, radius: Radii) -> Radii:
-        """Photons of a kind within `radius` of a vertex, on average, of all light sub-paths."""
-        return self.photons[kind] * (radius / self.errors["relmse"][kind].ladder[-1]) ** 2
+    def gathered(self, kind: str, radius: Radii, share: float) -> Radii:
+        """Photons of a kind within `radius` of a vertex, on average, of that `share` of the light
+        sub-paths."""
+        disks = (radius / self.errors["relmse"][kind].ladder[-1]) ** 2
+        return share * self.photons[kind] * disks
+
+    def _cost(self, kind: str, radius: Radii, corrected: bool, share: float) -> Radii:
+        """Cost of an iteration by one kind of photons, see `cost`."""
+        gathered = self.gathered(kind, radius, share)
+        return iteration_cost(gathered, corrected, self.setting.camera_paths, share)
 
     def cost(self, choice: Choice) -> float:
         """Cost of an iteration with the radii and corrections of a choice, see `cost`."""
         return max(
             (
-                iteration_cost(
-                    self.gathered(kind, radius) * choice.light_share,
-                    choice.corrected[kind],
-                    self.setting.camera_paths,
-                    choice.light_share,
-                )
+                self._cost(kind, radius, choice.corrected[kind], choice.light_share)
                 for kind, radius in choice.radii.items()
                 if kind in self._met
             ),
