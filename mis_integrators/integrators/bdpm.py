@@ -24,12 +24,14 @@ from ..photons.beams import Beams, gather_along, mean_count_along, read_beams
 from ..photons.coverage import covered_share
 from ..photons.gather import QueryVertices, gather_photons, mean_photon_count
 from ..photons.grid import PhotonMap, build_photon_map, smallest_cell
+from ..photons.layered import LayeredMap, build_layered_map, gather_layers
 from ..photons.queries import Queries, read_queries, trace_camera_paths
 from ..photons.trace import trace_light_paths
 from ..photons.volume import VolumeMap, build_volume_map
 from ..pilot.direct_paths import MOST_PATHS
 from ..pilot.run import PILOT_INDEX
 from ..pilot.setting import LIGHT_SHARES, PilotSetting, pilot_light_paths
+from .caustic_spread import MOST_ITERATIONS_SPREAD, CausticSpread
 from .common import MOST_LIGHT_PATHS, IterativeIntegrator
 from .direct_light import DirectLight
 from .piloted import PilotedSession
@@ -69,7 +71,8 @@ class BDPM(IterativeIntegrator):
        - |float|
        - Merge radius of the first iteration, in scene units; 0 balances noise against blur in a
          short pilot, apart for caustic and for other photons, and corrects the estimate near edges
-         where that pays. (Default: 0)
+         where that pays. Caustic photons that are few around then have larger radii of their own.
+         (Default: 0)
      * - alpha
        - |float|
        - Radius reduction of progressive photon mapping, in (0, 1]: iteration i uses R_i^2 = R_0^2
@@ -186,6 +189,8 @@ class BDPMSession(PilotedSession):
     chooses_light_paths = True
     """Whether the pilot chooses how many light sub-paths an iteration has. (Weights would have to
     know of it before they are made.)"""
+    spreads_caustics = True
+    """Whether caustic photons have radii of their own where the radius is automatic."""
 
     def __init__(self, integrator, scene, sensor, seed, iterations):
         super().__init__(integrator, scene, sensor, seed, iterations)
@@ -225,6 +230,7 @@ class BDPMSession(PilotedSession):
         self.photons_a_path = 0.0  # those that a light sub-path left, in the last light pass
         self.recorded = recorder()
         self.direct_light = DirectLight(self)
+        self.caustic_spread = CausticSpread(self)
         self._freeze()
 
     @property
@@ -298,8 +304,12 @@ class BDPMSession(PilotedSession):
     def photons_of_a_path(self):
         """How many photons a light sub-path leaves, on average: by the light pass of a pilot."""
         self._use_light_paths(pilot_light_paths(self.iteration_light_paths))
-        self._photons(PILOT_INDEX, self._spectral(PILOT_INDEX))
+        self.trace_photons(PILOT_INDEX)
         return self.photons_a_path
+
+    def trace_photons(self, iteration):
+        """The photons of the light pass of an iteration."""
+        return self._photons(iteration, self._spectral(iteration))
 
     def _use_light_paths(self, count):
         """Traces so many in each light pass from now on."""
@@ -318,6 +328,8 @@ class BDPMSession(PilotedSession):
 
     def _take(self, choice):
         super()._take(choice)
+        if choice.prediction is not None:
+            self.caustic_spread.plan(choice.prediction.iterations)
         if self.prediction is None:
             self.direct_light.spread()
         else:
@@ -326,9 +338,14 @@ class BDPMSession(PilotedSession):
     @property
     def learned(self):
         learned = super().learned
-        return learned and {**learned, "direct_light": self.direct_light.learned}
+        return learned and {
+            **learned,
+            "direct_light": self.direct_light.learned,
+            "caustic_spread": self.caustic_spread.iterations,
+        }
 
     def recall_more(self, fields):
+        self.caustic_spread.recall(fields.number("caustic_spread", MOST_ITERATIONS_SPREAD))
         of_direct_light = fields.object("direct_light")
         self.direct_light.recall(of_direct_light)
         of_direct_light.finish()
@@ -423,15 +440,12 @@ class BDPMSession(PilotedSession):
         vertices = QueryVertices(
             self.traits, record, spectral["wavelengths"], kind == "indirect", scale
         )
+        light_paths, max_depth = self._light_paths, self.integrator.max_depth
+        marked = self.integrator.splits_light
+        if isinstance(photon_map, LayeredMap):
+            return gather_layers(photon_map, vertices, light_paths, max_depth, weigh, marked)
         return gather_photons(
-            photon_map,
-            vertices,
-            radii,
-            self._light_paths,
-            self.integrator.max_depth,
-            weigh,
-            grey,
-            self.integrator.splits_light,
+            photon_map, vertices, radii, light_paths, max_depth, weigh, grey, marked
         )
 
     def _covered(self, scene, tables, vertices, radius, seed):
@@ -489,6 +503,8 @@ class BDPMSession(PilotedSession):
         """The map of the arrays of one."""
         if kind == "volume":
             return VolumeMap.with_grid(arrays, radius, self.volume_capacity)
+        if LayeredMap.has_made(arrays):
+            return LayeredMap(arrays, self.traits.bounds, self.photon_capacity)
         return PhotonMap.with_grid(
             arrays, self.traits.bounds, self._cell(radius), self.photon_capacity
         )
@@ -496,8 +512,21 @@ class BDPMSession(PilotedSession):
     def _cell(self, radius):
         return dr.maximum(radius, smallest_cell(self.traits.bounds, self.photon_capacity))
 
-    def _build_maps(self, photons, radii):
-        return {kind: self._map(photons, kind, radius).arrays() for kind, radius in radii.items()}
+    def _build_maps(self, photons, radii, around):
+        maps = {}
+        for kind, radius in radii.items():
+            if kind == "caustic" and around is not None:
+                photon_map = self._layered_map(photons, radius, around)
+            else:
+                photon_map = self._map(photons, kind, radius)
+            maps[kind] = photon_map.arrays()
+        return maps
+
+    def _layered_map(self, photons, radius, around):
+        """The map of caustic photons, which are spread by the light around them."""
+        return build_layered_map(
+            *photons[:3], self.traits.bounds, radius, self.photon_capacity, around
+        )
 
     def _render_chunk(self, scene, sensor, tables, maps, sequence, first, spectral, radii, beyond):
         camera_pass = self.describe_camera_pass(sensor, sequence, first, spectral)
@@ -588,7 +617,7 @@ class BDPMSession(PilotedSession):
         photons = (
             self._photons(iteration, spectral) if radii else None
         )  # before any pass is looked up: they may have to be recorded anew
-        maps = self._map_pass(photons, radii) if radii else None
+        maps = self._map_pass(photons, radii, self.caustic_spread.around) if radii else None
 
         def render(chunk, first):
             while True:

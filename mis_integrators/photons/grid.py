@@ -42,11 +42,12 @@ class Grid:
     """Cells of edge `cell` (width one) over a bounding box, with two cells of margin.
 
     Odd numbers of columns and rows keep layers apart when numbers wrap around a table whose size is
-    a power of two.
+    a power of two. The table may be a part of a larger one, from entry `first` on.
     """
 
-    def __init__(self, bbox, cell, size):
+    def __init__(self, bbox, cell, size, first=0):
         self.origin, self.cell, self.size = mi.Point3f(bbox.min), cell, size
+        self.first = first
         extent = mi.Vector3f(bbox.max - bbox.min)
         self.columns = (mi.UInt32(dr.floor(extent.x / cell)) + 5) | 1
         self.lines = (mi.UInt32(dr.floor(extent.y / cell)) + 5) | 1
@@ -62,7 +63,7 @@ class Grid:
 
     def row(self, y, z):
         """Table entry of the cell x = 0 of row (y, z); x counts up from there."""
-        return (self.row_number(y, z) * self.columns) & (self.size - 1)
+        return ((self.row_number(y, z) * self.columns) & (self.size - 1)) + self.first
 
 
 class PhotonMap:
@@ -99,16 +100,21 @@ class PhotonMap:
         return cls(Grid(bbox, cell, table_size(capacity)), **arrays)
 
 
-def sort_by_cell(grid, p, active):
+def table_room(size):
+    """Entries that a table of this size takes, with those beyond its end."""
+    return size + longest_row(size)
+
+
+def sort_by_cell(grid, p, active, tables=1):
     """Sorts photons at `p` by the grid's cells: `(start, target)`, the first photon of each table
     entry, and the place of each photon. Three passes: count, prefix sum, scatter (the last one is
-    left to the caller)."""
+    left to the caller). There may be more than one of the grid's `tables`, one after the other."""
     size = grid.size
     coordinates = grid.coordinates(p)
     slot = grid.row(coordinates.y, coordinates.z) + dr.minimum(
         mi.UInt32(coordinates.x), longest_row(size) - 4
     )
-    counts = dr.zeros(mi.UInt32, size + longest_row(size))
+    counts = dr.zeros(mi.UInt32, tables * table_room(size))
     rank = dr.scatter_inc(counts, slot, active)
     dr.eval(counts, rank, slot)
     start = dr.prefix_sum(counts)
