@@ -8,9 +8,8 @@ import math
 import drjit as dr
 import mitsuba as mi
 
-from ..photons.grid import table_size
 from ..photons.photon import power_layout
-from ..photons.spread import LAYERS, QUANTA, LightAround, flux_of
+from ..photons.spread import QUANTA, LightAround, flux_of
 from ..pilot.run import MOST_ITERATIONS, PILOT_INDEX
 
 PASS_SHARE = 1 / 16
@@ -54,11 +53,11 @@ class CausticSpread:
         for number in range(FIRST_INDEX, FIRST_INDEX + passes):
             surface, power, count = session.trace_photons(number)[:3]
             if self._around is None:
-                self._around = LightAround(
-                    dr.opaque(mi.Float, session.radii["caustic"]),
-                    dr.opaque(mi.Float, mean_flux(power, count) / QUANTA),
-                    dr.opaque(mi.Float, self.iterations / passes),
-                    dr.zeros(mi.UInt32, LAYERS * table_size(session.photon_capacity)),
+                self._around = LightAround.none(
+                    session.radii["caustic"],
+                    mean_flux(power, count) / QUANTA,
+                    self.iterations / passes,
+                    session.photon_capacity,
                 )
             self._around.add(surface, power, count)
 

@@ -17,6 +17,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.spectra import channel_mean
+from .grid import table_size
 from .photon import power_layout, surface_layout
 
 LAYERS = 5
@@ -39,9 +40,10 @@ def layer_radius(radius, layer):
 class LightAround:
     """The light of photons on surfaces, in cells of a grid for each of the `LAYERS`.
 
-    The cells are as wide as the layer's radius. They share a table by a hash of their coordinates:
-    where two share a place, photons are spread less than they might be. The light around a point is
-    that in the eight cells nearest to it, a cube as wide as the disk.
+    The cells are as wide as the layer's radius. A hash of their coordinates says where each is in a
+    table, and another hash, its name there, which cell it is. Where cells share a place, the one
+    whose name is larger has the light of all, and the others none. The light around a point is that
+    in the eight cells nearest to it, a cube as wide as the disk.
     """
 
     radius: mi.Float
@@ -50,13 +52,20 @@ class LightAround:
     """Flux of a quantum, see `QUANTA`."""
     times: mi.Float
     """The light of the whole render, in units of what is counted here."""
-    light: mi.UInt32
-    """Quanta by layer and place in the table."""
+    cells: mi.UInt32
+    """By layer and place in the table: quanta, and the cell's name (two numbers each)."""
+
+    @classmethod
+    def none(cls, radius, quantum, times, capacity):
+        """No light yet. The first three are numbers, see the fields; `capacity`: photons of a
+        pass."""
+        numbers = (dr.opaque(mi.Float, number) for number in (radius, quantum, times))
+        return cls(*numbers, dr.zeros(mi.UInt32, 2 * LAYERS * table_size(capacity)))
 
     @property
     def size(self):
         """Places in the table of a layer (a power of two)."""
-        return dr.width(self.light) // LAYERS
+        return dr.width(self.cells) // (2 * LAYERS)
 
     def add(self, surface, power, count):
         """Adds the photons of a light pass (as of `trace_light_paths`)."""
@@ -66,18 +75,27 @@ class LightAround:
         quanta = self._quanta(flux_of(power_layout().read(power, index, active)))
         for layer in range(LAYERS):
             cell = mi.Vector3i(dr.floor(self._local(p, layer)))
-            dr.scatter_add(self.light, quanta, self._place(cell, layer), active)
-        dr.eval(self.light)
+            place, name = self._place(cell, layer)
+            for operation, value, slot in (
+                (dr.ReduceOp.Add, quanta, 2 * place),
+                (dr.ReduceOp.Max, name, 2 * place + 1),
+            ):
+                dr.scatter_reduce(operation, self.cells, value, slot, active, dr.ReduceMode.Direct)
+        dr.eval(self.cells)
 
     def layer(self, p, flux, active):
         """The layer, from 0, of photons at `p`: the first on whose disks they bring no more than
         `MOST_OF_DISK` of the light; else the last."""
-        quanta = mi.Float(self._quanta(flux))
-        found = mi.UInt32(LAYERS - 1)
-        for layer in range(LAYERS - 2, -1, -1):
-            enough = quanta <= MOST_OF_DISK * self.times * self._around(p, layer, active)
-            found = dr.select(enough, mi.UInt32(layer), found)
-        return found
+        wanted = mi.Float(self._quanta(flux)) * dr.rcp(MOST_OF_DISK * self.times)
+
+        def look(layer, searching):
+            searching &= self._around(p, layer, searching) < wanted
+            layer = dr.select(searching, layer + 1, layer)
+            return layer, searching & (layer < LAYERS - 1)
+
+        state = mi.UInt32(0), mi.Bool(active)
+        layer, _ = dr.while_loop(state, lambda layer, searching: searching, look, label="layer")
+        return layer
 
     def _around(self, p, layer, active):
         """Quanta in the cube around `p`."""
@@ -85,7 +103,9 @@ class LightAround:
         total = mi.UInt32(0)
         for number in range(8):
             cell = corner + mi.Vector3i(number & 1, number >> 1 & 1, number >> 2)
-            total += dr.gather(mi.UInt32, self.light, self._place(cell, layer), active)
+            place, name = self._place(cell, layer)
+            light, found = dr.gather(mi.Vector2u, self.cells, place, active)
+            total += dr.select(found == name, light, 0)
         return mi.Float(total)
 
     def _local(self, p, layer):
@@ -93,11 +113,10 @@ class LightAround:
         return p * dr.rcp(layer_radius(self.radius, layer))
 
     def _place(self, cell, layer):
-        """Where the table has the light of a cell."""
+        """Where the table has a cell, and its name."""
         x, y, z = (mi.UInt32(axis) for axis in cell)
-        mixed = x * 0x9E3779B1 ^ y * 0x85EBCA77 ^ z * 0xC2B2AE3D
-        mixed ^= mixed >> 15
-        return (mixed & (self.size - 1)) + layer * self.size
+        place, name = mi.sample_tea_32(x + z * 0x9E3779B1, y)
+        return (place & (self.size - 1)) + layer * self.size, name
 
     def _quanta(self, flux):
         return mi.UInt32(dr.minimum(flux / self.quantum, BRIGHTEST) + 0.5)
