@@ -49,6 +49,7 @@ BEAMS = "tests/photons/test_beams.py"
 OPTIMAL = "tests/integrators/test_weights_in_renders.py"
 ANALYTIC = "tests/integrators/test_analytic.py"
 LONG = "tests/app/test_long_renders.py"
+SPREAD = "tests/photons/test_spread.py"
 LOBES = "tests/integrators/test_narrow_lobes.py"
 
 MUTATIONS = [
@@ -267,6 +268,20 @@ MUTATIONS = [
         "& (dr.abs(dr.dot(offset, normal)) < radius)",
         "surfaces far below a disk count as covering it",
         "tests/photons",
+    ),
+    Mutation(
+        "photons/layered.py",
+        "photon_map, there, [radius], light_path_count",
+        "photon_map, there, [layered.radius], light_path_count",
+        "photons of all layers have the radius of the first",
+        SPREAD,
+    ),
+    Mutation(
+        "photons/spread.py",
+        "dr.select(found == name, light, 0)",
+        "light",
+        "the light of other cells counts as light around",
+        SPREAD,
     ),
     # ------------------------------------------------------------------ pilot
     Mutation(

@@ -37,6 +37,10 @@ from .direct_light import DirectLight
 from .piloted import PilotedSession
 from .schedule import read_radius
 
+LIGHT, CAMERA = 0, 1
+"""Purposes of an iteration's random seeds, besides `IterativeSession.WAVELENGTH`,
+`bdpm_opt.FROZEN`, `direct_light.PURPOSE` and
+`caustic_spread.PURPOSE`."""
 SPARE_PHOTONS = 1 << 20
 """Unused room beyond half of a photon buffer that is worth the time to record the passes anew."""
 CAMERA_CHUNK, CHUNK_IN_MEDIA = 1 << 21, 1 << 19
@@ -304,12 +308,12 @@ class BDPMSession(PilotedSession):
     def photons_of_a_path(self):
         """How many photons a light sub-path leaves, on average: by the light pass of a pilot."""
         self._use_light_paths(pilot_light_paths(self.iteration_light_paths))
-        self.trace_photons(PILOT_INDEX)
+        self.trace_photons(PILOT_INDEX, LIGHT)
         return self.photons_a_path
 
-    def trace_photons(self, iteration):
-        """The photons of the light pass of an iteration."""
-        return self._photons(iteration, self._spectral(iteration))
+    def trace_photons(self, iteration, purpose):
+        """The photons of a light pass, as those of an iteration, but for another purpose."""
+        return self._photons(iteration, self._spectral(iteration), purpose)
 
     def _use_light_paths(self, count):
         """Traces so many in each light pass from now on."""
@@ -583,7 +587,7 @@ class BDPMSession(PilotedSession):
 
     # ------------------------------------------------------------------ iterations
 
-    def _photons(self, iteration, spectral):
+    def _photons(self, iteration, spectral, purpose=LIGHT):
         """An iteration's photons. Where they overflow the buffers, these grow and the pass runs
         again; after a first pass that needs less than half of them, they shrink to what was needed,
         with some room."""
@@ -592,7 +596,7 @@ class BDPMSession(PilotedSession):
                 self.scene,
                 self.sensor,
                 self._tables,
-                self._sequence(iteration, LIGHT, self.light_path_count),
+                self._sequence(iteration, purpose, self.light_path_count),
                 spectral,
             )
             dr.eval(photons)
@@ -801,8 +805,3 @@ class SubsetIteration(NamedTuple):
 
     def direct(self):
         return self.passes.by_pixel(channel_mean(self.radiance))
-
-
-LIGHT, CAMERA = 0, 1
-"""Purposes of an iteration's random seeds, besides `IterativeSession.WAVELENGTH`,
-`bdpm_opt.FROZEN` and `direct_light.PURPOSE`."""

@@ -10,13 +10,12 @@ import mitsuba as mi
 
 from ..photons.photon import power_layout
 from ..photons.spread import QUANTA, LightAround, flux_of
-from ..pilot.run import MOST_ITERATIONS, PILOT_INDEX
 
 PASS_SHARE = 1 / 16
 """Tuned: light passes that tell of the light around, for each iteration of the render (one at
 least)."""
-FIRST_INDEX = PILOT_INDEX + MOST_ITERATIONS + 1
-"""Iteration numbers of these passes start here, so that their random numbers are their own."""
+PURPOSE = 5
+"""Of the random seed, see `bdpm`."""
 MOST_PASSES = 1024
 """More of them would tell little more."""
 MOST_ITERATIONS_SPREAD = 1e15
@@ -50,8 +49,8 @@ class CausticSpread:
     def _find(self):
         session = self.session
         passes = min(max(round(PASS_SHARE * self.iterations), 1), MOST_PASSES)
-        for number in range(FIRST_INDEX, FIRST_INDEX + passes):
-            surface, power, count = session.trace_photons(number)[:3]
+        for number in range(passes):
+            surface, power, count = session.trace_photons(number, PURPOSE)[:3]
             if self._around is None:
                 self._around = LightAround.none(
                     session.radii["caustic"],

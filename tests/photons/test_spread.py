@@ -207,7 +207,7 @@ def test_long_renders_spread_less(rgb):
     for iterations in (1.0, 1e6):
         session = caustic_images(scene, iterations, 0.4, 1)[1]
         maps = session._map_pass(
-            session.trace_photons(0), session.radii_at(0), session.caustic_spread.around
+            session.trace_photons(0, 0), session.radii_at(0), session.caustic_spread.around
         )
         layers.append(np.array(maps["caustic"]["layer_count"]))
         if iterations > 1:
