@@ -49,7 +49,7 @@ BEAMS = "tests/photons/test_beams.py"
 OPTIMAL = "tests/integrators/test_weights_in_renders.py"
 ANALYTIC = "tests/integrators/test_analytic.py"
 LONG = "tests/app/test_long_renders.py"
-SPREAD = "tests/photons/test_spread.py"
+TIERS = "tests/photons/test_tiers.py"
 LOBES = "tests/integrators/test_narrow_lobes.py"
 
 MUTATIONS = [
@@ -270,18 +270,18 @@ MUTATIONS = [
         "tests/photons",
     ),
     Mutation(
-        "photons/layered.py",
+        "photons/tiers.py",
         "photon_map, there, [radius], light_path_count",
-        "photon_map, there, [layered.radius], light_path_count",
-        "photons of all layers have the radius of the first",
-        SPREAD,
+        "photon_map, there, [tiered.radius], light_path_count",
+        "photons of all tiers have the radius of the first",
+        TIERS,
     ),
     Mutation(
-        "photons/spread.py",
-        "dr.select(found == name, light, 0)",
+        "photons/light_around.py",
+        "dr.select(found == fingerprint, light, 0)",
         "light",
         "the light of other cells counts as light around",
-        SPREAD,
+        TIERS,
     ),
     # ------------------------------------------------------------------ pilot
     Mutation(

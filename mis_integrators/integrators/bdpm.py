@@ -24,14 +24,14 @@ from ..photons.beams import Beams, gather_along, mean_count_along, read_beams
 from ..photons.coverage import covered_share
 from ..photons.gather import QueryVertices, gather_photons, mean_photon_count
 from ..photons.grid import PhotonMap, build_photon_map, smallest_cell
-from ..photons.layered import LayeredMap, build_layered_map, gather_layers
 from ..photons.queries import Queries, read_queries, trace_camera_paths
+from ..photons.tiers import TieredMap, build_tiered_map, gather_tiers
 from ..photons.trace import trace_light_paths
 from ..photons.volume import VolumeMap, build_volume_map
 from ..pilot.direct_paths import MOST_PATHS
 from ..pilot.run import PILOT_INDEX
 from ..pilot.setting import LIGHT_SHARES, PilotSetting, pilot_light_paths
-from .caustic_spread import MOST_ITERATIONS_SPREAD, CausticSpread
+from .caustic_radii import CausticRadii
 from .common import MOST_LIGHT_PATHS, IterativeIntegrator
 from .direct_light import DirectLight
 from .piloted import PilotedSession
@@ -39,8 +39,7 @@ from .schedule import read_radius
 
 LIGHT, CAMERA = 0, 1
 """Purposes of an iteration's random seeds, besides `IterativeSession.WAVELENGTH`,
-`bdpm_opt.FROZEN`, `direct_light.PURPOSE` and
-`caustic_spread.PURPOSE`."""
+`bdpm_opt.FROZEN`, `direct_light.PURPOSE` and `caustic_radii.PURPOSE`."""
 SPARE_PHOTONS = 1 << 20
 """Unused room beyond half of a photon buffer that is worth the time to record the passes anew."""
 CAMERA_CHUNK, CHUNK_IN_MEDIA = 1 << 21, 1 << 19
@@ -193,7 +192,7 @@ class BDPMSession(PilotedSession):
     chooses_light_paths = True
     """Whether the pilot chooses how many light sub-paths an iteration has. (Weights would have to
     know of it before they are made.)"""
-    spreads_caustics = True
+    widens_caustics = True
     """Whether caustic photons have radii of their own where the radius is automatic."""
 
     def __init__(self, integrator, scene, sensor, seed, iterations):
@@ -234,7 +233,7 @@ class BDPMSession(PilotedSession):
         self.photons_a_path = 0.0  # those that a light sub-path left, in the last light pass
         self.recorded = recorder()
         self.direct_light = DirectLight(self)
-        self.caustic_spread = CausticSpread(self)
+        self.caustic_radii = CausticRadii(self)
         self._freeze()
 
     @property
@@ -328,16 +327,19 @@ class BDPMSession(PilotedSession):
     def start(self):
         super().start()
         if self.direct_light.mean_paths is None:
-            self.direct_light.spread()
+            self.direct_light.choose_paths()
 
     def _take(self, choice):
         super()._take(choice)
-        if choice.prediction is not None:
-            self.caustic_spread.plan(choice.prediction.iterations)
+        if choice.prediction is not None and not self.kept:  # those that are kept have their radii
+            self.caustic_radii.plan(max(choice.prediction.iterations, 1))
         if self.prediction is None:
-            self.direct_light.spread()
+            self.direct_light.choose_paths()
         else:
             self.prediction = self.direct_light.beside(self.prediction, anew=not self.kept)
+
+    def _prepare(self):
+        self.caustic_radii.find()
 
     @property
     def learned(self):
@@ -345,11 +347,15 @@ class BDPMSession(PilotedSession):
         return learned and {
             **learned,
             "direct_light": self.direct_light.learned,
-            "caustic_spread": self.caustic_spread.iterations,
+            "caustic_radii": {"iterations": self.caustic_radii.iterations},
         }
 
     def recall_more(self, fields):
-        self.caustic_spread.recall(fields.number("caustic_spread", MOST_ITERATIONS_SPREAD))
+        of_caustics = fields.object("caustic_radii")
+        self.caustic_radii.plan(
+            of_caustics.number("iterations", self.caustic_radii.most_iterations)
+        )
+        of_caustics.finish()
         of_direct_light = fields.object("direct_light")
         self.direct_light.recall(of_direct_light)
         of_direct_light.finish()
@@ -446,8 +452,8 @@ class BDPMSession(PilotedSession):
         )
         light_paths, max_depth = self._light_paths, self.integrator.max_depth
         marked = self.integrator.splits_light
-        if isinstance(photon_map, LayeredMap):
-            return gather_layers(photon_map, vertices, light_paths, max_depth, weigh, marked)
+        if isinstance(photon_map, TieredMap):
+            return gather_tiers(photon_map, vertices, light_paths, max_depth, weigh, marked)
         return gather_photons(
             photon_map, vertices, radii, light_paths, max_depth, weigh, grey, marked
         )
@@ -507,8 +513,8 @@ class BDPMSession(PilotedSession):
         """The map of the arrays of one."""
         if kind == "volume":
             return VolumeMap.with_grid(arrays, radius, self.volume_capacity)
-        if LayeredMap.has_made(arrays):
-            return LayeredMap(arrays, self.traits.bounds, self.photon_capacity)
+        if TieredMap.has_made(arrays):
+            return TieredMap(arrays, self.traits.bounds, self.photon_capacity)
         return PhotonMap.with_grid(
             arrays, self.traits.bounds, self._cell(radius), self.photon_capacity
         )
@@ -520,15 +526,15 @@ class BDPMSession(PilotedSession):
         maps = {}
         for kind, radius in radii.items():
             if kind == "caustic" and around is not None:
-                photon_map = self._layered_map(photons, radius, around)
+                photon_map = self._tiered_map(photons, radius, around)
             else:
                 photon_map = self._map(photons, kind, radius)
             maps[kind] = photon_map.arrays()
         return maps
 
-    def _layered_map(self, photons, radius, around):
-        """The map of caustic photons, which are spread by the light around them."""
-        return build_layered_map(
+    def _tiered_map(self, photons, radius, around):
+        """The map of caustic photons, with radii by the light around them."""
+        return build_tiered_map(
             *photons[:3], self.traits.bounds, radius, self.photon_capacity, around
         )
 
@@ -618,10 +624,10 @@ class BDPMSession(PilotedSession):
     def _render(self, iteration):
         radii = self.radii_at(iteration)
         spectral = self._spectral(iteration)
-        photons = (
-            self._photons(iteration, spectral) if radii else None
-        )  # before any pass is looked up: they may have to be recorded anew
-        maps = self._map_pass(photons, radii, self.caustic_spread.around) if radii else None
+        # Before any pass is looked up: they may have to be recorded anew.
+        around = self.caustic_radii.find()
+        photons = self._photons(iteration, spectral) if radii else None
+        maps = self._map_pass(photons, radii, around) if radii else None
 
         def render(chunk, first):
             while True:

@@ -75,7 +75,7 @@ class DirectLight:
         if fields.names():
             self._beside = Beside(**{name: fields.number(name, LARGEST) for name in Beside._fields})
 
-    def spread(self):
+    def choose_paths(self):
         """Chooses the paths by what is known of those that gather. Where nothing is gathered there
         are none: they would be no cheaper than all others."""
         session, gathering = self.session, self.session.camera_paths
@@ -100,7 +100,7 @@ class DirectLight:
                 error = prediction.errors["relmse"]
                 error = error.variance + error.squared_bias * iterations
                 self._beside = Beside(light, float(error), float(iterations))
-            self.spread()
+            self.choose_paths()
         found, errors = self.measured(), {}
         for name, weigh in MEASURES.items():
             weights, error = weigh(found.mean + light), prediction.errors[name]

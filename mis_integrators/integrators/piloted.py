@@ -141,6 +141,8 @@ class PilotedSession(IterativeSession):
         left = max(begun + self.seconds - time.perf_counter(), guess)
         first = pilot.choose(left / guess)
         self._take(first)
+        self._prepare()
+        left = max(begun + self.seconds - time.perf_counter(), guess)
         seconds, spent = self._time_first_iterations(guess, left)
         count = max(left / seconds * pilot.cost(first), 1)
         self._take(pilot.choose(count, first, reluctance=min(spent / left, 1)))
@@ -157,6 +159,9 @@ class PilotedSession(IterativeSession):
         self._use_light_share()
         if changed:
             self._record_camera_pass()
+
+    def _prepare(self):
+        """Finds what all iterations need, before the first is timed."""
 
     def _time_first_iterations(self, guess, left):
         """Renders the first iteration, and the second where the first took longer than it should

@@ -38,7 +38,7 @@ class PublishedSession(BDPMSession):
     The pilot of an automatic radius merges at the first strategy's vertex, unweighted.
     """
 
-    chooses_light_paths = spreads_caustics = False
+    chooses_light_paths = widens_caustics = False
 
     def __init__(self, integrator, scene, sensor, seed, iterations):
         super().__init__(integrator, scene, sensor, seed, iterations)

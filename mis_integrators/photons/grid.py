@@ -41,7 +41,7 @@ def smallest_cell(bbox, capacity):
 class Grid:
     """Cells of edge `cell` (width one) over a bounding box, with two cells of margin.
 
-    Odd numbers of columns and rows keep layers apart when numbers wrap around a table whose size is
+    Odd numbers of columns and rows keep slices apart when numbers wrap around a table whose size is
     a power of two. The table may be a part of a larger one, from entry `first` on.
     """
 
@@ -108,7 +108,7 @@ def table_room(size):
 def sort_by_cell(grid, p, active, tables=1):
     """Sorts photons at `p` by the grid's cells: `(start, target)`, the first photon of each table
     entry, and the place of each photon. Three passes: count, prefix sum, scatter (the last one is
-    left to the caller). There may be more than one of the grid's `tables`, one after the other."""
+    left to the caller). `tables`: how many there are, one for each value of the grid's `first`."""
     size = grid.size
     coordinates = grid.coordinates(p)
     slot = grid.row(coordinates.y, coordinates.z) + dr.minimum(
@@ -128,24 +128,38 @@ def build_photon_map(surface, power, count, bbox, cell, capacity: int, kind: str
     `kind`: "all", "caustic" or "indirect" selects the photons; `mis_words` (None: there are none)
     stay unsorted.
     """
-    size = table_size(capacity)
-    grid = Grid(bbox, cell, size)
-    index = dr.arange(mi.UInt32, capacity)
-    active = index < dr.gather(mi.UInt32, count, 0)
-    record = surface_layout().read(surface, index, active)
+    grid = Grid(bbox, cell, table_size(capacity))
+    record, active = read_photons(surface, count, capacity)
     landing = landing_of(record)
     if kind != "all":
         active &= landing.caustic == (kind == "caustic")
-    start, target = sort_by_cell(grid, landing.p, active)
-    sorted_surface = surface_layout().room(capacity)
-    surface_layout().write(sorted_surface, record, target, active)
-    sorted_power = power_layout().move(power, index, target, active)
+    start, surface, power, target = sorted_photons(grid, record, power, active)
     place = None
     if mis_words is not None:
         place = dr.empty(mi.UInt32, capacity)
-        dr.scatter(place, index, target, active)
-    dr.eval(sorted_surface, sorted_power, place)
-    return PhotonMap(grid, start, sorted_surface, sorted_power, mis_words, place)
+        dr.scatter(place, dr.arange(mi.UInt32, capacity), target, active)
+        dr.eval(place)
+    return PhotonMap(grid, start, surface, power, mis_words, place)
+
+
+def read_photons(surface, count, capacity):
+    """Records of `surface_layout`, and which of them are photons."""
+    index = dr.arange(mi.UInt32, capacity)
+    active = index < dr.gather(mi.UInt32, count, 0)
+    return surface_layout().read(surface, index, active), active
+
+
+def sorted_photons(grid, record, power, active, tables=1):
+    """Photons with the `record` of `surface_layout`, sorted: `start` as of `sort_by_cell`, both
+    records, and where each photon has gone."""
+    capacity = power_layout().capacity(power)
+    index = dr.arange(mi.UInt32, capacity)
+    start, target = sort_by_cell(grid, record["p"], active, tables)
+    sorted_surface = surface_layout().room(capacity)
+    surface_layout().write(sorted_surface, record, target, active)
+    sorted_power = power_layout().move(power, index, target, active)
+    dr.eval(sorted_surface, sorted_power)
+    return start, sorted_surface, sorted_power, target
 
 
 def for_each_photon(photon_map, p, radius, active, visit, state):

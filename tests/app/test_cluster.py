@@ -139,7 +139,7 @@ def test_workers_are_told_what_a_pilot_found(scene, client):
         "radii": dict.fromkeys(opened.session.kinds(), 0.31),
         "corrected": dict.fromkeys(opened.session.kinds(), False),
         "light_share": 1.0,
-        "caustic_spread": 0.0,
+        "caustic_radii": {"iterations": 0.0},
         "direct_light": {},
     }
     identity = opened.identity()

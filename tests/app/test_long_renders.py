@@ -169,7 +169,7 @@ def test_learned_radii_are_not_learned_again(scene):
         "radii": dict.fromkeys(session.kinds(), 0.123),
         "corrected": dict.fromkeys(session.kinds(), False),
         "light_share": 0.25,
-        "caustic_spread": 0.0,
+        "caustic_radii": {"iterations": 0.0},
         "direct_light": {},
     }
     session.recall(learned)

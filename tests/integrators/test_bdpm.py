@@ -220,7 +220,7 @@ def test_same_seed_same_edges(rgb):
                 "radii": dict.fromkeys(session.kinds(), 0.3),
                 "corrected": {"caustic": False, "indirect": True},
                 "light_share": 1.0,
-                "caustic_spread": 0.0,
+                "caustic_radii": {"iterations": 0.0},
                 "direct_light": {},
             }
         )

@@ -118,14 +118,14 @@ def test_sessions_of_a_render_send_the_same_paths(rgb):
 
 def test_purposes_differ(rgb):
     """What paths that gather draw, and others, and light, and what only weights learn from."""
-    from mis_integrators.integrators import bdpm, bdpm_opt, caustic_spread, direct_light
+    from mis_integrators.integrators import bdpm, bdpm_opt, caustic_radii, direct_light
     from mis_integrators.integrators.common import IterativeSession
 
     purposes = [
         bdpm.LIGHT,
         bdpm.CAMERA,
         direct_light.PURPOSE,
-        caustic_spread.PURPOSE,
+        caustic_radii.PURPOSE,
         bdpm_opt.FROZEN,
         IterativeSession.WAVELENGTH,
     ]

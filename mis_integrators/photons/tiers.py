@@ -1,0 +1,108 @@
+"""Photon maps whose photons have different merge radii (see `light_around`): a grid for each.
+
+A query goes from tier to tier, and visits in each the photons within that tier's radius. So few
+photons with large radii cost little among many with small ones.
+"""
+
+from __future__ import annotations
+
+import copy
+
+import drjit as dr
+import mitsuba as mi
+
+from ..paths.light_classes import CLASSES
+from .gather import gather_photons
+from .grid import (
+    Grid,
+    PhotonMap,
+    read_photons,
+    smallest_cell,
+    sorted_photons,
+    table_room,
+    table_size,
+)
+from .light_around import TIERS, flux_of, tier_radius
+from .photon import landing_of, power_layout
+
+
+class TieredMap:
+    """Sorted photons (see `PhotonMap`), tier by tier. `radius`: of the first tier; `count`: the
+    photons of each."""
+
+    def __init__(self, arrays, bbox, capacity):
+        self._arrays = arrays
+        self.start, self.surface, self.power = (
+            arrays[name] for name in ("start", "surface", "power")
+        )
+        self.radius, self.count = arrays["tier_radius"], arrays["tier_count"]
+        self.bbox, self.capacity = bbox, capacity
+
+    def arrays(self):
+        """What a recorded function can take; the map can be made of it again."""
+        return self._arrays
+
+    @staticmethod
+    def has_made(arrays):
+        """Whether the arrays are those of such a map, not of a `PhotonMap`."""
+        return "tier_radius" in arrays
+
+    def tier(self, number):
+        """The `PhotonMap` of a tier, its radius, and how many photons it has."""
+        grid = tier_grid(self.bbox, self.radius, self.capacity, number)
+        return (
+            PhotonMap(grid, self.start, self.surface, self.power),
+            tier_radius(self.radius, number),
+            dr.gather(mi.UInt32, self.count, number),
+        )
+
+
+def tier_grid(bbox, radius, capacity, number):
+    """The grid of a tier; `radius`: of the first. Few photons are caustic ones: a quarter of the
+    usual table does."""
+    places = table_size(capacity // 4)
+    cell = dr.maximum(tier_radius(radius, number), smallest_cell(bbox, capacity // 4))
+    return Grid(bbox, cell, places, number * table_room(places))
+
+
+def build_tiered_map(surface, power, count, bbox, radius, capacity, around):
+    """The `TieredMap` of the caustic photons, which lie in the tiers that the light `around` them
+    says (a `LightAround`); other arguments as of `build_photon_map`."""
+    record, active = read_photons(surface, count, capacity)
+    landing = landing_of(record)
+    active &= landing.caustic
+    index = dr.arange(mi.UInt32, capacity)
+    flux = flux_of(power_layout().read(power, index, active))
+    number = around.tier(landing.p, flux, radius, active)
+    in_tiers = dr.zeros(mi.UInt32, TIERS)
+    dr.scatter_reduce(dr.ReduceOp.Add, in_tiers, mi.UInt32(1), number, active, dr.ReduceMode.Direct)
+    grid = tier_grid(bbox, radius, capacity, number)
+    start, surface, power, _ = sorted_photons(grid, record, power, active, TIERS)
+    dr.eval(in_tiers)
+    arrays = {
+        "start": start,
+        "surface": surface,
+        "power": power,
+        "tier_radius": radius,
+        "tier_count": in_tiers,
+    }
+    return TieredMap(arrays, bbox, capacity)
+
+
+def gather_tiers(tiered, vertices, light_path_count, max_depth, weigh=None, marked=False):
+    """`gather_photons` of all tiers, each with its radius. Arguments and result as there, but that
+    there is one estimate, not one for each radius."""
+
+    def step(number, totals):
+        photon_map, radius, count = tiered.tier(number)
+        there = copy.copy(vertices)
+        there.active = vertices.active & (count > 0)
+        parts = gather_photons(
+            photon_map, there, [radius], light_path_count, max_depth, weigh, marked=marked
+        )
+        return number + 1, [total + part for total, part in zip(totals, parts)]
+
+    totals = [mi.Spectrum(0) for _ in range(len(CLASSES) if marked else 1)]
+    return dr.while_loop(
+        (mi.UInt32(0), totals), lambda number, totals: number < TIERS, step, label="tiers"
+    )[1]
