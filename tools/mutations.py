@@ -508,6 +508,13 @@ MUTATIONS = [
         f"{DENOISING}::test_windows_that_bright_samples_missed_are_not_dark",
     ),
     Mutation(
+        "app/denoising.py",
+        "- window_max(differences, WINDOW) / WINDOW**2",
+        "- 0 * window_max(differences, WINDOW)",
+        "one bright pixel makes a square",
+        f"{DENOISING}::test_one_bright_pixel_does_not_make_a_square",
+    ),
+    Mutation(
         "pilot/direct_paths.py",
         "nearest = (np.arange(height) // step)[:, None] * len(columns)",
         "nearest = (np.arange(height) // step)[:, None] * width",

@@ -14,7 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.film import WINDOW, direct_channels
-from ..core.windows import window_mean
+from ..core.windows import window_max, window_mean
 from ..paths.guides import albedo_and_normal
 from .output import picture_channels
 
@@ -50,10 +50,13 @@ def shrunk(raw: np.ndarray, clean: np.ndarray, variance: np.ndarray) -> np.ndarr
 
     Both estimates are noisy, and where a few bright samples make them they differ by chance: raw
     noise would come back as dots, and as dark squares where all bright samples have missed. So the
-    variance counts `DOUBT` times, and is not below that of the surroundings.
+    variance counts `DOUBT` times, and is not below that of the surroundings. In each window the
+    pixel that differs most does not count: it may be all that differs, by one bright sample.
     """
     variance = np.maximum(variance, window_mean(variance, AROUND))
-    apart = window_mean(np.square((raw - clean).mean(axis=-1)), WINDOW)
+    differences = np.square((raw - clean).mean(axis=-1))
+    others = window_mean(differences, WINDOW) - window_max(differences, WINDOW) / WINDOW**2
+    apart = others * (WINDOW**2 / (WINDOW**2 - 1))
     weight = np.maximum(1 - DOUBT * variance / np.maximum(apart, 1e-30), 0)
     return clean + weight[..., None] * (raw - clean)
 

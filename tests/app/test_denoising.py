@@ -207,6 +207,17 @@ def test_windows_that_bright_samples_missed_are_not_dark():
     assert np.mean(left < 0.5) < 1e-3
 
 
+def test_one_bright_pixel_does_not_make_a_square():
+    """Its window differs by that alone. Where all pixels of a window differ, they come back."""
+    clean = np.ones((64, 64, 3))
+    raw = clean.copy()
+    raw[20, 20] = 50
+    raw[40:50, 40:50] = 2
+    left = shrunk(raw, clean, np.full((64, 64), 0.01))
+    np.testing.assert_allclose(left[10:30, 10:30], 1, atol=1e-9)
+    np.testing.assert_allclose(left[42:48, 42:48], 2, atol=2 * DOUBT * 0.01)
+
+
 def lamp_in_a_box(rgb, **film):
     scene = mi.cornell_box()
     scene["sensor"]["film"] = {"type": "hdrfilm", "width": 48, "height": 48} | film
