@@ -22,7 +22,7 @@ from .photon import power_layout, surface_layout
 
 TIERS = 5
 """Radii that photons may have."""
-MOST_OF_LIGHT = 1 / 16
+MOST_OF_LIGHT = 1 / 64
 """Tuned: what a photon may bring of the light around it in the whole render."""
 QUANTA = 16
 """Light is counted in whole numbers, so that the order of photons does not matter: so many for a

@@ -52,12 +52,12 @@ def on_floor(rng, count, half=FLOOR):
 @pytest.mark.parametrize("times, flux", [(1, 1), (8, 1), (1, 4)])
 def test_radius_by_the_light_around(rgb, tier, times, flux):
     """The cube around a point is 2 r wide and holds D (2 r)^2 photons of an even density D, which
-    stand for `times` as many. A photon `flux` times as bright as these wants 16 `flux` of them: it
+    stand for `times` as many. A photon `flux` times as bright as these wants 64 `flux` of them: it
     is in the tier where there are twice as many as that, the last one whatever there is."""
     from mis_integrators.photons.light_around import MOST_OF_LIGHT, TIERS
 
-    assert TIERS == 5 and MOST_OF_LIGHT == 1 / 16
-    wanted = 2 * 16 * flux / times
+    assert TIERS == 5 and MOST_OF_LIGHT == 1 / 64
+    wanted = 2 * 64 * flux / times
     step = 2 * RADIUS * 2**tier / np.sqrt(wanted)
     reach = 2 * RADIUS * 2**TIERS
     axis = np.arange(-reach, reach, step) + 0.3 * step
@@ -142,8 +142,8 @@ def test_tiers_bring_what_brute_force_finds(rgb):
 def test_smaller_disks_hold_less_light(rgb):
     """Where progressive radii have shrunk by half, photons want four times the light."""
     rng = np.random.default_rng(4)
-    points = on_floor(rng, 4000)
-    around = light_around(points, np.ones(4000))
+    points = on_floor(rng, 16000)
+    around = light_around(points, np.ones(16000))
     inside = on_floor(rng, 200, 0.5)
     of_bright = tiers_of(around, inside, np.full(200, 4.0))
     shrunk = tiers_of(around, inside, np.ones(200), RADIUS / 2)
