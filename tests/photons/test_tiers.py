@@ -140,15 +140,15 @@ def test_tiers_bring_what_brute_force_finds(rgb):
 
 
 def test_smaller_disks_hold_less_light(rgb):
-    """Where progressive radii have shrunk by half, photons want four times the light."""
+    """Where the area of progressive disks has shrunk to 2 / 5, photons want 5 / 2 of the light."""
     rng = np.random.default_rng(4)
     points = on_floor(rng, 16000)
     around = light_around(points, np.ones(16000))
     inside = on_floor(rng, 200, 0.5)
-    of_bright = tiers_of(around, inside, np.full(200, 4.0))
-    shrunk = tiers_of(around, inside, np.ones(200), RADIUS / 2)
-    assert len(np.unique(of_bright)) > 1
-    np.testing.assert_array_equal(shrunk, of_bright)
+    of_bright = tiers_of(around, inside, np.full(200, 2.5))
+    shrunk = tiers_of(around, inside, np.ones(200), RADIUS * 0.4**0.5)
+    assert len(np.unique(of_bright)) > 1 and np.any(of_bright != tiers_of(around, inside, [1.0]))
+    assert np.mean(shrunk == of_bright) > 0.98  # but for rounding
 
 
 def mirror_beside_floor(floor="diffuse"):
