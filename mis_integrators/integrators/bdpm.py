@@ -74,8 +74,8 @@ class BDPM(IterativeIntegrator):
        - |float|
        - Merge radius of the first iteration, in scene units; 0 balances noise against blur in a
          short pilot, apart for caustic and for other photons, and corrects the estimate near edges
-         where that pays. Caustic photons that are few around then have larger radii of their own.
-         (Default: 0)
+         where that pays. Caustic photons with little light around have larger radii of their own
+         then. (Default: 0)
      * - alpha
        - |float|
        - Radius reduction of progressive photon mapping, in (0, 1]: iteration i uses R_i^2 = R_0^2

@@ -66,8 +66,7 @@ class CausticRadii:
 def mean_flux(power, count):
     """Of photons (as of `trace_light_paths`), to the next lower power of two: a sum of floats
     depends on their order a little. 1 where there are none."""
-    layout = power_layout()
-    index = dr.arange(mi.UInt32, layout.capacity(power))
-    total = float(dr.sum(flux_of(layout.read(power, index, index < count)))[0])
+    index = dr.arange(mi.UInt32, power_layout().capacity(power))
+    total = float(dr.sum(flux_of(power, index < count))[0])
     mean = total / max(int(count[0]), 1)
     return 2.0 ** math.floor(math.log2(mean)) if 0 < mean < math.inf else 1.0

@@ -17,7 +17,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.spectra import channel_mean
-from .grid import table_size
+from .grid import read_photons, table_size
 from .photon import power_layout, surface_layout
 
 TIERS = 5
@@ -75,10 +75,8 @@ class LightAround:
 
     def add(self, surface, power, count):
         """Adds the photons of a light pass (as of `trace_light_paths`)."""
-        index = dr.arange(mi.UInt32, surface_layout().capacity(surface))
-        active = index < count
-        p = surface_layout().read(surface, index, active)["p"]
-        quanta = self._quanta(flux_of(power_layout().read(power, index, active)))
+        record, active = read_photons(surface, count, surface_layout().capacity(surface))
+        p, quanta = record["p"], self._quanta(flux_of(power, active))
         for tier in range(TIERS - 1):
             place, fingerprint = self._place(mi.Vector3i(dr.floor(self._local(p, tier))), tier)
             for operation, value, word in (
@@ -133,6 +131,8 @@ class LightAround:
         return mi.UInt32(dr.clip(flux / self.quantum, 1, BRIGHTEST) + 0.5)
 
 
-def flux_of(record):
-    """Mean over the channels of the flux in records of `power_layout`."""
+def flux_of(power, active):
+    """Mean over the channels of the flux of all `active` photons."""
+    layout = power_layout()
+    record = layout.read(power, dr.arange(mi.UInt32, layout.capacity(power)), active)
     return channel_mean(dr.abs(record["flux"]))  # a mark is a sign

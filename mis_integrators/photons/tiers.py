@@ -23,20 +23,15 @@ from .grid import (
     table_size,
 )
 from .light_around import TIERS, flux_of, tier_radius
-from .photon import landing_of, power_layout
+from .photon import landing_of
 
 
 class TieredMap:
-    """Sorted photons (see `PhotonMap`), tier by tier. `radius`: of the first tier; `count`: the
-    photons of each."""
+    """Sorted photons, tier by tier. `arrays`: `start`, `surface` and `power` as of a `PhotonMap`,
+    and `tier_radius`, that of the first tier."""
 
     def __init__(self, arrays, bbox, capacity):
-        self._arrays = arrays
-        self.start, self.surface, self.power = (
-            arrays[name] for name in ("start", "surface", "power")
-        )
-        self.radius, self.count = arrays["tier_radius"], arrays["tier_count"]
-        self.bbox, self.capacity = bbox, capacity
+        self._arrays, self.bbox, self.capacity = arrays, bbox, capacity
 
     def arrays(self):
         """What a recorded function can take; the map can be made of it again."""
@@ -49,12 +44,13 @@ class TieredMap:
 
     def tier(self, number):
         """The `PhotonMap` of a tier, its radius, and how many photons it has."""
-        grid = tier_grid(self.bbox, self.radius, self.capacity, number)
-        return (
-            PhotonMap(grid, self.start, self.surface, self.power),
-            tier_radius(self.radius, number),
-            dr.gather(mi.UInt32, self.count, number),
+        start, surface, power, radius = (
+            self._arrays[name] for name in ("start", "surface", "power", "tier_radius")
         )
+        grid = tier_grid(self.bbox, radius, self.capacity, number)
+        last = grid.first + table_room(grid.size) - 1  # where no photon is
+        count = dr.gather(mi.UInt32, start, last) - dr.gather(mi.UInt32, start, grid.first)
+        return PhotonMap(grid, start, surface, power), tier_radius(radius, number), count
 
 
 def tier_grid(bbox, radius, capacity, number):
@@ -71,21 +67,10 @@ def build_tiered_map(surface, power, count, bbox, radius, capacity, around):
     record, active = read_photons(surface, count, capacity)
     landing = landing_of(record)
     active &= landing.caustic
-    index = dr.arange(mi.UInt32, capacity)
-    flux = flux_of(power_layout().read(power, index, active))
-    number = around.tier(landing.p, flux, radius, active)
-    in_tiers = dr.zeros(mi.UInt32, TIERS)
-    dr.scatter_reduce(dr.ReduceOp.Add, in_tiers, mi.UInt32(1), number, active, dr.ReduceMode.Direct)
+    number = around.tier(landing.p, flux_of(power, active), radius, active)
     grid = tier_grid(bbox, radius, capacity, number)
     start, surface, power, _ = sorted_photons(grid, record, power, active, TIERS)
-    dr.eval(in_tiers)
-    arrays = {
-        "start": start,
-        "surface": surface,
-        "power": power,
-        "tier_radius": radius,
-        "tier_count": in_tiers,
-    }
+    arrays = {"start": start, "surface": surface, "power": power, "tier_radius": radius}
     return TieredMap(arrays, bbox, capacity)
 
 
