@@ -14,7 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.film import WINDOW, direct_channels
-from ..core.windows import window_max, window_mean
+from ..core.windows import mean_without_largest, window_mean
 from ..paths.guides import albedo_and_normal
 from .output import picture_channels
 
@@ -54,9 +54,7 @@ def shrunk(raw: np.ndarray, clean: np.ndarray, variance: np.ndarray) -> np.ndarr
     pixel that differs most does not count: it may be all that differs, by one bright sample.
     """
     variance = np.maximum(variance, window_mean(variance, AROUND))
-    differences = np.square((raw - clean).mean(axis=-1))
-    others = window_mean(differences, WINDOW) - window_max(differences, WINDOW) / WINDOW**2
-    apart = others * (WINDOW**2 / (WINDOW**2 - 1))
+    apart = mean_without_largest(np.square((raw - clean).mean(axis=-1)), WINDOW)
     weight = np.maximum(1 - DOUBT * variance / np.maximum(apart, 1e-30), 0)
     return clean + weight[..., None] * (raw - clean)
 

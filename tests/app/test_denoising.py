@@ -208,13 +208,16 @@ def test_windows_that_bright_samples_missed_are_not_dark():
 
 
 def test_one_bright_pixel_does_not_make_a_square():
-    """Its window differs by that alone. Where all pixels of a window differ, they come back."""
+    """Its window differs by that alone, at the image's border, too. Where all pixels of a window
+    differ, they come back."""
     clean = np.ones((64, 64, 3))
     raw = clean.copy()
-    raw[20, 20] = 50
+    raw[20, 20] = raw[0, 0] = raw[63, 20] = 50
     raw[40:50, 40:50] = 2
     left = shrunk(raw, clean, np.full((64, 64), 0.01))
     np.testing.assert_allclose(left[10:30, 10:30], 1, atol=1e-9)
+    np.testing.assert_allclose(left[:3, :3], 1, atol=1e-9)
+    np.testing.assert_allclose(left[61:, 10:30], 1, atol=1e-9)
     np.testing.assert_allclose(left[42:48, 42:48], 2, atol=2 * DOUBT * 0.01)
 
 
