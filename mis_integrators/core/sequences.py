@@ -28,6 +28,9 @@ BLOCK_BITS = 16
 more, coordinates from the third on are no longer stratified with those before. (Half the
 instructions.)"""
 
+OWN = 0x6F776E21
+"""Tells the hash by which a path has a sequence of its own from all others."""
+
 
 def hash_bits(x):
     """A bijection of 32-bit words in which each bit in decides all bits out (the finaliser of
@@ -116,21 +119,31 @@ def unit(bits):
 class SampleSequence:
     """The random numbers of a pass, whose paths form groups of `group_size`. `seed`: of a render's
     low-discrepancy numbers, or of this pass alone; `first`: the index of each group's first path,
-    modulo 2^32; both uint32 of width one."""
+    modulo 2^32. With `low_discrepancy` numbers a group shares a sequence; else each path has one of
+    its own, and all numbers are independent. Uint32 of width one, or what Python has instead: one
+    kernel serves them all."""
 
     seed: Array
     first: Array
-    group_size: int
-    low_discrepancy: bool
+    group_size: Array
+    low_discrepancy: Array
+
+    def __post_init__(self):
+        self.group_size, self.low_discrepancy = (
+            dr.opaque(mi.UInt32, int(value)) if isinstance(value, int) else value
+            for value in (self.group_size, self.low_discrepancy)
+        )
 
     def of_paths(self, number) -> PathNumbers:
         """Those of the paths `number` of the pass (a uint32 array)."""
-        return self.of_members(number // self.group_size, number % self.group_size)
+        group = mi.UInt32(number) // self.group_size
+        return self.of_members(group, number - group * self.group_size)
 
     def of_members(self, group, member) -> PathNumbers:
         """Those of the paths that come `member`-th in their `group` (uint32 arrays)."""
-        key = hash_bits(hash_bits(group) + self.seed)
-        return PathNumbers(self.first + member, key, self.low_discrepancy)
+        index = self.first + member
+        own = dr.select(self.low_discrepancy != 0, mi.UInt32(0), hash_bits(index + OWN))
+        return PathNumbers(index, hash_bits(hash_bits(group) + self.seed + own))
 
     def own_seed(self):
         """A seed of this pass alone."""
@@ -138,11 +151,11 @@ class SampleSequence:
 
 
 class PathNumbers:
-    """The random numbers of paths: the `index` of each in the sequence of its group, whose is the
-    `key`. (No dataclass, which Dr.Jit's loops would carry with them.)"""
+    """The random numbers of paths: the `index` of each in its sequence, and the sequence's `key`.
+    (No dataclass, which Dr.Jit's loops would carry with them.)"""
 
-    def __init__(self, index, key, low_discrepancy):
-        self.index, self.key, self.low_discrepancy = index, key, low_discrepancy
+    def __init__(self, index, key):
+        self.index, self.key = index, key
 
     def at(self, vertex) -> VertexNumbers:
         """Those of one vertex (an integer, or an array)."""
@@ -163,15 +176,7 @@ class VertexNumbers:
         """`dimensions` numbers in [0, 1), stratified together."""
         self._draws += 1
         seed = hash_bits(self._key + mi.UInt32(self._draws * 0x632BE5AB % 2**32))
-        if self._path.low_discrepancy:
-            return sobol(self._path.index, seed, dimensions)
-        # Of indices that differ in their lowest bits alone, TEA would make similar numbers.
-        word, found = hash_bits(mi.UInt32(self._path.index)), []
-        for _ in range(-(-dimensions // 2)):
-            pair = mi.sample_tea_32(word, seed)
-            found += [unit(word) for word in pair]
-            seed += mi.UInt32(0x2545F491)
-        return found[:dimensions]
+        return sobol(self._path.index, seed, dimensions)
 
     def next_float32(self, active=True):
         """One number; `active` changes nothing (the interface of `mi.PCG32`)."""

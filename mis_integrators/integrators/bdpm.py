@@ -23,7 +23,7 @@ from ..paths.setting import World
 from ..photons.beams import Beams, gather_along, mean_count_along, read_beams
 from ..photons.coverage import covered_share
 from ..photons.gather import QueryVertices, gather_photons, mean_photon_count
-from ..photons.grid import PhotonMap, build_photon_map, smallest_cell
+from ..photons.grid import PhotonMap, build_photon_map, cell_edge
 from ..photons.queries import Queries, read_queries, trace_camera_paths
 from ..photons.tiers import TieredMap, build_tiered_map, gather_tiers
 from ..photons.trace import trace_light_paths
@@ -520,7 +520,7 @@ class BDPMSession(PilotedSession):
         )
 
     def _cell(self, radius):
-        return dr.maximum(radius, smallest_cell(self.traits.bounds, self.photon_capacity))
+        return cell_edge(radius, self.traits.bounds, self.photon_capacity)
 
     def _build_maps(self, photons, radii, around):
         maps = {}

@@ -105,11 +105,19 @@ def choose(integrator, scene, sensor, seed, iterations, seconds):
     if not photons.kinds():
         return Decision(*alone, [f"{alone[0]}: {no_photons(integrator, photons)}"])
     photons.plan_time(seconds)
-    photons.start()
+    photons.predict()
     prediction = photons.prediction
     if prediction is None:
         reason = "no camera path meets a surface that scatters smoothly"
         return Decision(*alone, [f"{alone[0]}: {reason}"])
+
+    planned = prediction.iterations if seconds else iterations or UNPLANNED_ITERATIONS
+    if integrator.kept_classes:
+        excluded = f"not {CAMERA}: it does not split the light"
+    else:
+        excluded = why_not_camera_paths(CAMERA, photons, prediction)
+    if excluded:
+        return decide([trial_of_photons(PHOTONS, photons, 1.0)], [excluded], planned, 1.0)
 
     pixels = prediction.pixels
     segments = mean_segments(
@@ -121,18 +129,10 @@ def choose(integrator, scene, sensor, seed, iterations, seconds):
         integrator.max_depth,
         integrator.rr_depth,
     )
-    trials, reasons = [_try_photons(photons, segments)], []
-    usual = trials[0].cost
-    budget = (prediction.iterations if seconds else iterations or UNPLANNED_ITERATIONS) * usual
-    if integrator.kept_classes:
-        excluded = f"not {CAMERA}: it does not split the light"
-    else:
-        excluded = why_not_camera_paths(CAMERA, photons, prediction)
-    if excluded:
-        reasons.append(excluded)
-    else:
-        trials.insert(0, _try_path(path, segments, pixels, prediction.mean, budget))
-    return decide(trials, reasons, budget, usual)
+    mapper = _try_photons(photons, segments)
+    budget = planned * mapper.cost
+    trials = [_try_path(path, segments, pixels, prediction.mean, budget), mapper]
+    return decide(trials, [], budget, mapper.cost)
 
 
 def decide(trials, reasons, budget, usual):

@@ -50,7 +50,7 @@ def choose(integrator, scene, sensor, seed, iterations, seconds):
     photons, reason = _photons(render)
     if photons is not None:
         photons.plan_time(seconds)
-        photons.start()
+        photons.predict()
         if photons.prediction is not None:
             return _judged(camera, photons, iterations, seconds)
         reason = "no camera path meets anything that scatters smoothly"

@@ -37,6 +37,7 @@ class PilotedSession(IterativeSession):
         self.corrected = {}  # whether estimates are corrected at edges, by kind of photons
         self.light_share = 1.0  # of the light sub-paths, those that an iteration has
         self.prediction = None  # a `Prediction`, where a pilot has chosen
+        self._untimed = None  # arguments of `_choose_by_clock`, until it is called
         self.kept = {}  # iterations that were rendered to measure their time, by number
 
     def kinds(self):
@@ -112,6 +113,14 @@ class PilotedSession(IterativeSession):
     # ------------------------------------------------------------------ choice
 
     def start(self):
+        self.predict()
+        if self._untimed is not None:
+            untimed, self._untimed = self._untimed, None
+            self._choose_by_clock(*untimed)
+
+    def predict(self):
+        """Runs the pilot, if one is needed, and makes the first choice: that is all which the
+        `prediction` takes. (`start` does this, too, and what is left.)"""
         begun = time.perf_counter()
         pilot = self._run_pilot()
         if pilot is None:
@@ -119,7 +128,10 @@ class PilotedSession(IterativeSession):
         elif self.seconds is None:
             self._take(pilot.choose(pilot.setting.planned_iterations))
         else:
-            self._choose_by_clock(pilot, begun)
+            guess = LIKE_A_PILOT * pilot.seconds * pilot.setting.light_paths
+            first = pilot.choose(self._left(begun, guess) / guess)
+            self._take(first)
+            self._untimed = pilot, first, guess, begun
 
     @property
     def needs_pilot(self):
@@ -134,15 +146,15 @@ class PilotedSession(IterativeSession):
         pixels = pilot_pixels(setting)
         return run_pilot(setting, pixels, self.pilot_passes(setting, pixels))
 
-    def _choose_by_clock(self, pilot, begun):
-        """Chooses for a guess of how many iterations there is time for since `begun`, measures what
-        one takes with that choice, and chooses again."""
-        guess = LIKE_A_PILOT * pilot.seconds * pilot.setting.light_paths
-        left = max(begun + self.seconds - time.perf_counter(), guess)
-        first = pilot.choose(left / guess)
-        self._take(first)
+    def _left(self, begun, least):
+        """Seconds that are left of a render begun then, `least` at least."""
+        return max(begun + self.seconds - time.perf_counter(), least)
+
+    def _choose_by_clock(self, pilot, first, guess, begun):
+        """Measures what an iteration takes with the `first` choice, which was made for a `guess` of
+        that, and chooses again."""
         self._prepare()
-        left = max(begun + self.seconds - time.perf_counter(), guess)
+        left = self._left(begun, guess)
         seconds, spent = self._time_first_iterations(guess, left)
         count = max(left / seconds * pilot.cost(first), 1)
         self._take(pilot.choose(count, first, reluctance=min(spent / left, 1)))

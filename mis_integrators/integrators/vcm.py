@@ -14,7 +14,7 @@ from ..paths.light_classes import CLASSES, LightClasses
 from ..paths.subpaths import on_surfaces, read_vertices
 from ..paths.vertex import in_medium
 from ..photons.gather import KeptVertices, gather_photons
-from ..photons.grid import smallest_cell
+from ..photons.grid import cell_edge
 from ..photons.vertex_map import state_of, vertex_map
 from ..pilot.run import PILOT_INDEX
 from .bdpt import BDPT, CAMERA, BDPTSession
@@ -179,10 +179,7 @@ class VCMSession(BDPTSession):
         vertices, light_count, _ = light
         if self.traits.has_media:
             vertices, light_count = on_surfaces(vertices, light_count, self.capacity["light"])
-        cell = dr.maximum(
-            spectral["radius"],
-            dr.opaque(mi.Float, smallest_cell(self.traits.bounds, self.capacity["light"])),
-        )
+        cell = cell_edge(spectral["radius"], self.traits.bounds, self.capacity["light"])
         photon_map = vertex_map(
             vertices, light_count, self.capacity["light"], self.traits.bounds, cell
         )

@@ -218,7 +218,7 @@ class EnvironmentGuide:
         places = self._places(sensor)
         self._learn_directions(places)
         records = [
-            self._numpy(self._look(index, emitter, place, rng))
+            self._numpy(self._look(index, emitter, place, rng), rng)
             for index, emitter in self.infinite
             for place, rng in places
             for _ in range(TESTS if emitter.is_environment() else 1)
@@ -265,9 +265,10 @@ class EnvironmentGuide:
                     portals(entering & odd),
                     *(x[..., entering & ~odd & (own > 0)] for x in (p, d, light, density, own)),
                 )
-        pmf = smoothed(pmf.reshape(-1, POSITION_CELLS, POSITION_CELLS), LEVEL_SHARES).reshape(
-            self.row_count, cells
-        )
+        total = pmf.sum(axis=1)
+        seen = total > 0
+        found = pmf[seen].reshape(-1, POSITION_CELLS, POSITION_CELLS)
+        pmf[seen] = smoothed(found, LEVEL_SHARES).reshape(-1, cells)
         total = pmf.sum(axis=1)
         pmf /= np.maximum(total, 1e-300)[:, None]
         self._pmf = from_numpy(mi.Float, pmf.ravel())
@@ -303,7 +304,7 @@ class EnvironmentGuide:
             towards = mi.warp.square_to_uniform_sphere(next_2d(rng))
             tested = self._scatters(place, towards)
             reached = _sees_sky(self.scene, place.si.spawn_ray(towards), tested)
-            cell, tested, reached = self._numpy((direction_cell(towards), tested, reached))
+            cell, tested, reached = self._numpy((direction_cell(towards), tested, reached), rng)
             tests += np.bincount(cell[tested], minlength=direction_cells())
             seen += np.bincount(cell[reached], minlength=direction_cells())
         reach = seen / np.maximum(tests, 1)
@@ -333,7 +334,10 @@ class EnvironmentGuide:
         self._direction_cdf = from_numpy(mi.Float, np.cumsum(pmf))
 
     @staticmethod
-    def _numpy(record):
+    def _numpy(record, rng):
+        """The record's arrays, and the random numbers after it, made by one kernel: the same for
+        all places."""
+        dr.eval(record, rng)
         return [np.array(x) for x in record]
 
     @staticmethod
@@ -364,6 +368,8 @@ class EnvironmentGuide:
         active = dr.full(mi.Bool, True, PILOT_PATHS)
         places = []
         for bounce in range(PILOT_BOUNCES):
+            ray.maxt, ray.time = (x + dr.zeros(mi.Float, PILOT_PATHS) for x in (ray.maxt, ray.time))
+            dr.make_opaque(ray, active, throughput, rng)  # so that all have the same kernel
             si = self.scene.ray_intersect(ray, active)
             active &= si.is_valid()
             bsdf = si.bsdf()

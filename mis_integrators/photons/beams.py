@@ -27,7 +27,7 @@ from ..core.records import Layout
 from ..core.spectra import channel_mean
 from ..paths.light_classes import CLASSES, by_class, class_of
 from ..paths.media import point_in
-from .grid import Query, longest_row, visit_hits
+from .grid import Query, visit_hits
 from .photon import read_power
 from .volume import number_of_medium, read_place
 
@@ -207,7 +207,7 @@ class BeamQuery(Query):
         row = first + number
         begin, end = self._near(self.other, row, begin, end)
         first_x, last_x = self._cells(self.x, begin, end)
-        most = longest_row(self.grid.size) - 4
+        most = self.grid.table.longest - 4
         first_x, last_x = dr.clip(first_x + 2, 0, most), dr.clip(last_x + 2, -1, most)
         near = (begin <= end) & (row <= last) & (last_x >= first_x)
         base = self.grid.row(*self._row(slab, row))

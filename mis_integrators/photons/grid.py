@@ -38,15 +38,40 @@ def smallest_cell(bbox, capacity):
     return extent / (longest_row(table_size(capacity)) - 8)
 
 
+def cell_edge(radius, bbox, capacity):
+    """The edge of cells for queries of a `radius` (width one)."""
+    return dr.maximum(radius, dr.opaque(mi.Float, smallest_cell(bbox, capacity)))
+
+
+class Table:
+    """The table of a grid for `capacity` photons: its `size`, and the `longest` row that it may
+    have. Its size is no literal of kernels, which would be compiled anew for each."""
+
+    def __init__(self, capacity):
+        self.size = table_size(capacity)
+        self.mask = dr.opaque(mi.UInt32, self.size - 1)
+        self.longest = dr.opaque(mi.Int32, longest_row(self.size))
+
+    @property
+    def room(self):
+        """Entries that the table takes, with those beyond its end."""
+        return self.size + longest_row(self.size)
+
+    def first(self, number):
+        """The first entry of the `number`-th of several tables (an array)."""
+        return number * (self.mask + 1 + mi.UInt32(self.longest))
+
+
 class Grid:
     """Cells of edge `cell` (width one) over a bounding box, with two cells of margin.
 
-    Odd numbers of columns and rows keep slices apart when numbers wrap around a table whose size is
-    a power of two. The table may be a part of a larger one, from entry `first` on.
+    Odd numbers of columns and rows keep slices apart when numbers wrap around the `table` (a
+    `Table`), whose size is a power of two. That may be a part of a larger one, from entry `first`
+    on.
     """
 
-    def __init__(self, bbox, cell, size, first=0):
-        self.origin, self.cell, self.size = mi.Point3f(bbox.min), cell, size
+    def __init__(self, bbox, cell, table, first=0):
+        self.origin, self.cell, self.table = mi.Point3f(bbox.min), cell, table
         self.first = first
         extent = mi.Vector3f(bbox.max - bbox.min)
         self.columns = (mi.UInt32(dr.floor(extent.x / cell)) + 5) | 1
@@ -63,7 +88,7 @@ class Grid:
 
     def row(self, y, z):
         """Table entry of the cell x = 0 of row (y, z); x counts up from there."""
-        return ((self.row_number(y, z) * self.columns) & (self.size - 1)) + self.first
+        return ((self.row_number(y, z) * self.columns) & self.table.mask) + self.first
 
 
 class PhotonMap:
@@ -97,24 +122,18 @@ class PhotonMap:
     @classmethod
     def with_grid(cls, arrays, bbox, cell, capacity: int):
         """The map of `arrays`, built with the same box, cell size and capacity."""
-        return cls(Grid(bbox, cell, table_size(capacity)), **arrays)
-
-
-def table_room(size):
-    """Entries that a table of this size takes, with those beyond its end."""
-    return size + longest_row(size)
+        return cls(Grid(bbox, cell, Table(capacity)), **arrays)
 
 
 def sort_by_cell(grid, p, active, tables=1):
     """Sorts photons at `p` by the grid's cells: `(start, target)`, the first photon of each table
     entry, and the place of each photon. Three passes: count, prefix sum, scatter (the last one is
     left to the caller). `tables`: how many there are, one for each value of the grid's `first`."""
-    size = grid.size
     coordinates = grid.coordinates(p)
     slot = grid.row(coordinates.y, coordinates.z) + dr.minimum(
-        mi.UInt32(coordinates.x), longest_row(size) - 4
+        mi.UInt32(coordinates.x), mi.UInt32(grid.table.longest - 4)
     )
-    counts = dr.zeros(mi.UInt32, tables * table_room(size))
+    counts = dr.zeros(mi.UInt32, tables * grid.table.room)
     rank = dr.scatter_inc(counts, slot, active)
     dr.eval(counts, rank, slot)
     start = dr.prefix_sum(counts)
@@ -128,7 +147,7 @@ def build_photon_map(surface, power, count, bbox, cell, capacity: int, kind: str
     `kind`: "all", "caustic" or "indirect" selects the photons; `mis_words` (None: there are none)
     stay unsorted.
     """
-    grid = Grid(bbox, cell, table_size(capacity))
+    grid = Grid(bbox, cell, Table(capacity))
     record, active = read_photons(surface, count, capacity)
     landing = landing_of(record)
     if kind != "all":
@@ -333,7 +352,7 @@ def _photons_of_row(photon_map, y, z, local, reach):
     """First photon, and the one after the last, of the cells of row (y, z) within `reach` of
     `local` (both in cells)."""
     grid = photon_map.grid
-    longest = longest_row(grid.size)
+    longest = grid.table.longest
     low_y, low_z = mi.Float(y - 2), mi.Float(z - 2)
     distance_y = dr.maximum(dr.maximum(low_y - local.y, local.y - low_y - 1), 0)
     distance_z = dr.maximum(dr.maximum(low_z - local.z, local.z - low_z - 1), 0)

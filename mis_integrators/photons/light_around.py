@@ -59,6 +59,8 @@ class LightAround:
     """The light of the whole render over that which is counted here."""
     cells: mi.UInt32
     """By tier and place in the table: quanta, and the cell's fingerprint."""
+    mask: mi.UInt32
+    """Places in the table of a tier (a power of two), less one."""
 
     @classmethod
     def empty(cls, radius, quantum, times, photons):
@@ -66,12 +68,8 @@ class LightAround:
         will be, about."""
         numbers = (dr.opaque(mi.Float, number) for number in (radius, quantum, times))
         places = min(table_size(photons), MOST_PLACES)
-        return cls(*numbers, dr.zeros(mi.UInt32, 2 * (TIERS - 1) * places))
-
-    @property
-    def places(self):
-        """Places in the table of a tier (a power of two)."""
-        return dr.width(self.cells) // (2 * (TIERS - 1))
+        cells = dr.zeros(mi.UInt32, 2 * (TIERS - 1) * places)
+        return cls(*numbers, cells, dr.opaque(mi.UInt32, places - 1))
 
     def add(self, surface, power, count):
         """Adds the photons of a light pass (as of `trace_light_paths`)."""
@@ -125,7 +123,7 @@ class LightAround:
         """Where the tables have a cell, and its fingerprint."""
         x, y, z = (mi.UInt32(axis) for axis in cell)
         place, fingerprint = mi.sample_tea_32(x + z * 0x9E3779B1, y)
-        return (place & (self.places - 1)) + tier * self.places, fingerprint
+        return (place & self.mask) + tier * (self.mask + 1), fingerprint
 
     def _quanta(self, flux):
         return mi.UInt32(dr.clip(flux / self.quantum, 1, BRIGHTEST) + 0.5)

@@ -140,6 +140,7 @@ class QueryVisitor:
             vertices=new_vertex_buffer(
                 queries.capacity * self.sections, weights is not None, classes is not None
             ),
+            room=dr.opaque(mi.UInt32, queries.capacity),
             count=dr.zeros(mi.UInt32, self.sections),
         )
         self.flies = self.traits.has_media and self.bdd > 0
@@ -314,8 +315,8 @@ class QueryVisitor:
             if weights is not None:
                 section = dr.select(at.ends, mi.UInt32(self.bdd), vertex)
             slot = dr.scatter_inc(store.count, section, wants)
-            wants &= slot < queries.capacity
-            slot += section * queries.capacity
+            wants &= slot < store.room
+            slot += section * store.room
         if not queries.capacity:
             return
         query_layout().write(store.vertices["words"], query_at(at, last), slot, wants)

@@ -16,11 +16,10 @@ from .gather import gather_photons
 from .grid import (
     Grid,
     PhotonMap,
+    Table,
     read_photons,
     smallest_cell,
     sorted_photons,
-    table_room,
-    table_size,
 )
 from .light_around import TIERS, flux_of, tier_radius
 from .photon import landing_of
@@ -31,7 +30,7 @@ class TieredMap:
     and `tier_radius`, that of the first tier."""
 
     def __init__(self, arrays, bbox, capacity):
-        self._arrays, self.bbox, self.capacity = arrays, bbox, capacity
+        self._arrays, self.tiers = arrays, TierGrids(bbox, capacity)
 
     def arrays(self):
         """What a recorded function can take; the map can be made of it again."""
@@ -47,18 +46,23 @@ class TieredMap:
         start, surface, power, radius = (
             self._arrays[name] for name in ("start", "surface", "power", "tier_radius")
         )
-        grid = tier_grid(self.bbox, radius, self.capacity, number)
-        last = grid.first + table_room(grid.size) - 1  # where no photon is
+        grid = self.tiers.grid(radius, number)
+        last = self.tiers.table.first(number + 1) - 1  # where no photon is
         count = dr.gather(mi.UInt32, start, last) - dr.gather(mi.UInt32, start, grid.first)
         return PhotonMap(grid, start, surface, power), tier_radius(radius, number), count
 
 
-def tier_grid(bbox, radius, capacity, number):
-    """The grid of a tier; `radius`: of the first. Few photons are caustic ones: a quarter of the
-    usual table does."""
-    places = table_size(capacity // 4)
-    cell = dr.maximum(tier_radius(radius, number), smallest_cell(bbox, capacity // 4))
-    return Grid(bbox, cell, places, number * table_room(places))
+class TierGrids:
+    """The grids of the tiers. Few photons are caustic ones: a quarter of the usual table does."""
+
+    def __init__(self, bbox, capacity):
+        self.bbox, self.table = bbox, Table(capacity // 4)
+        self._smallest_cell = dr.opaque(mi.Float, smallest_cell(bbox, capacity // 4))
+
+    def grid(self, radius, number):
+        """That of a tier; `radius`: of the first."""
+        cell = dr.maximum(tier_radius(radius, number), self._smallest_cell)
+        return Grid(self.bbox, cell, self.table, self.table.first(number))
 
 
 def build_tiered_map(surface, power, count, bbox, radius, capacity, around):
@@ -68,7 +72,7 @@ def build_tiered_map(surface, power, count, bbox, radius, capacity, around):
     landing = landing_of(record)
     active &= landing.caustic
     number = around.tier(landing.p, flux_of(power, active), radius, active)
-    grid = tier_grid(bbox, radius, capacity, number)
+    grid = TierGrids(bbox, capacity).grid(radius, number)
     start, surface, power, _ = sorted_photons(grid, record, power, active, TIERS)
     arrays = {"start": start, "surface": surface, "power": power, "tier_radius": radius}
     return TieredMap(arrays, bbox, capacity)

@@ -14,7 +14,7 @@ import mitsuba as mi
 
 from ..core.packing import DEPTH_BITS, MAX_DEPTH, pack_direction, with_mark
 from ..core.records import Layout
-from .grid import Grid, longest_row, sort_by_cell, table_size
+from .grid import Grid, Table, sort_by_cell
 from .photon import power_layout
 
 Array = Any
@@ -123,9 +123,10 @@ class VolumeMap:
 
 def volume_grid(box, radius, capacity):
     """The grid for queries of a radius (width one)."""
-    size = table_size(capacity)
+    table = Table(capacity)
     extent = box.max.x - box.min.x
-    return Grid(box, dr.maximum(CELL * radius, extent / (longest_row(size) - 8)), size)
+    cell = dr.maximum(CELL * radius, extent / mi.Float(table.longest - 8))
+    return Grid(box, cell, table)
 
 
 def build_volume_map(place, power, count, radius, capacity: int, mis_words=None):

@@ -146,6 +146,7 @@ def ladder_on_surfaces(
         radii = radii * min(WIDER, largest / radii[-1])
         photons = count(radii)
     if most > MOST_PHOTONS:
-        radii = radii * (MOST_PHOTONS / most) ** 0.5
-        photons = count(radii)
+        smaller = MOST_PHOTONS / most
+        radii = radii * smaller**0.5
+        photons = {kind: number * smaller for kind, number in photons.items()}
     return dict.fromkeys(kinds, radii), photons

@@ -161,15 +161,28 @@ def test_a_draw_left_out_shifts_nothing(rgb):
     assert (np.array(numbers.at(2).next_float32()) == plain).all()
 
 
-def test_independent_numbers(rgb):
-    """Uniform, pairwise independent over draws, paths and passes."""
+@pytest.mark.parametrize("group_size", [1, 8, 1 << 17])
+def test_independent_numbers(rgb, group_size):
+    """Uniform, pairwise independent over draws, paths and passes, however the paths form groups:
+    those of a group are no more even than by chance (as the Poisson distribution has it, within 5
+    standard errors: false alarms below 1e-6)."""
     paths = dr.arange(mi.UInt32, 1 << 17)
-    at = sequence(low_discrepancy=False).of_paths(paths).at(1)
+
+    def vertex(**given):
+        given = {"low_discrepancy": False, "group_size": group_size, **given}
+        return sequence(**given).of_paths(paths).at(1)
+
+    at = vertex()
     a, b, c = at.next_floats(3)
     (d,) = at.next_floats(1)
-    other = sequence(seed=2, low_discrepancy=False).of_paths(paths).at(1).next_floats(1)[0]
-    for x, y in ((a, b), (b, c), (c, d), (a, other), (a, np.roll(np.array(a), 1))):
+    (other,), (later,) = (
+        vertex(**given).next_floats(1) for given in ({"seed": 2}, {"first": group_size})
+    )
+    near, far = (np.roll(np.array(a), shift) for shift in (1, 4))
+    for x, y in ((a, b), (b, c), (c, d), (a, other), (a, later), (a, near), (a, far)):
         assert_uniform(cells_of(x, y), 256)
+    counts = np.bincount((np.array(a) * (1 << 14)).astype(int), minlength=1 << 14)
+    assert abs(counts.var() / counts.mean() - 1) < 5 * math.sqrt(2 / (1 << 14))
 
 
 def test_variance_falls_faster(rgb):

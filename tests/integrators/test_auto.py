@@ -8,6 +8,7 @@ the image and of 3 or 8 % in a block is seen with a probability of 0.95.
 import json
 
 from mis_integrators.integrators import costs
+from mis_integrators.integrators.bdpm import BDPMSession
 from mis_integrators.paths.path_length_statistics import mean_segments
 
 import drjit as dr
@@ -296,6 +297,18 @@ def test_a_path_of_given_time_keeps_the_processor_busy(rgb, monkeypatch, seconds
     single = next(trial for trial in one.decision.trials if trial.plugin == "path")
     for measure, (_, variance) in trial.parts.items():
         assert variance * samples == pytest.approx(single.parts[measure][1], rel=0.3)
+
+
+def test_a_photon_mapper_that_loses_renders_nothing(rgb, monkeypatch):
+    """What an iteration of photons takes is measured only where photons have been chosen: else
+    that time is the image's."""
+    set_price_of_path(monkeypatch, 1e-4)
+    rendered = []
+    monkeypatch.setattr(BDPMSession, "_render", lambda *given: rendered.append(given))
+    session = auto().session(tray("lambertian", "rectangle"))
+    session.plan_time(1.0)
+    session.iterate()
+    assert session.decision.plugin == "path" and not rendered
 
 
 def test_a_photon_mapper_learns_once(rgb, monkeypatch):

@@ -1310,3 +1310,37 @@ def test_no_seed_has_kernels_of_its_own(rgb, plugin):
     scene, integrator = glossy_box(), mi.load_dict({"type": plugin, "photon_count": 3000})
     first, second, third = (kernels(integrator, scene, seed) for seed in (1, 2, 3))
     assert first and second <= first and third <= first
+
+
+@pytest.mark.parametrize("plugin", ["bdpm", *extended("bdpm_opt2", "bdpt")])
+def test_kinds_of_numbers_share_kernels(rgb, plugin):
+    """Independent and low-discrepancy numbers come from the same kernels: of a render with a pilot,
+    whose numbers are independent, half would else be compiled twice."""
+    gc.collect()  # kernels know all the scenes that there are
+    scene, of_sampler = glossy_box(), {}
+    for sampler in ("sobol", "independent"):
+        integrator = mi.load_dict({"type": plugin, "sampler": sampler})
+        of_sampler[sampler] = kernels(integrator, scene, 1)
+    assert of_sampler["independent"] == of_sampler["sobol"]
+
+
+def test_buffers_that_grow_keep_their_kernels(rgb):
+    """How much room there is for photons and vertices is no literal of the passes that find them,
+    which take longest to compile."""
+    gc.collect()
+    scene, passes = glossy_box(), []
+    for room in (2000, 3000):
+        session = bdpm(bdd=1).session(scene, seed=1, spp=2)
+        session.photon_capacity = session.vertex_capacity = room
+        session._freeze()
+        spectral = session._spectral(0)
+        sequence = session._sequence(0, 0, 100)
+
+        def traced(session=session, spectral=spectral, sequence=sequence):
+            seen = session.describe_camera_pass(session.sensor, sequence, mi.UInt32(0), spectral)
+            light = session._trace_light(session.scene, session.sensor, [], sequence, spectral)
+            dr.eval(light)
+            dr.eval(session._trace_camera(seen, session.vertex_capacity, spectral))
+
+        passes.append(kernels_of(traced, 500))
+    assert passes[0] and passes[0] == passes[1]

@@ -602,6 +602,14 @@ def test_direction_cells():
     )
 
 
+def test_places_of_a_guide_share_kernels(rgb):
+    """A guide looks for the sky from four vertices of camera paths with three kernels that take
+    long to compile: one goes from vertex to vertex, two look from each."""
+    scene = tray("lambertian", "constant")
+    made = kernels_of(lambda: EnvironmentGuide(scene, scene.sensors()[0]), 800)
+    assert 0 < len(made) <= 3
+
+
 @pytest.mark.parametrize("emitter", ["envmap rotated", "sunsky", *extended("constant")])
 def test_environment_directions(emitter):
     """Densities over the sphere integrate to one and are those of the samples."""
