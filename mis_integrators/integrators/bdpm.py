@@ -18,7 +18,7 @@ from ..lights.lights import Lights
 from ..paths.camera import film_sample_count, film_size
 from ..paths.layers import CHANNELS, SPLIT
 from ..paths.light_classes import LightClasses
-from ..paths.lobes import narrow_bsdfs
+from ..paths.lobes import is_narrow, narrow_bsdfs
 from ..paths.setting import World
 from ..photons.beams import Beams, gather_along, mean_count_along, read_beams
 from ..photons.coverage import covered_share
@@ -453,7 +453,10 @@ class BDPMSession(PilotedSession):
         light_paths, max_depth = self._light_paths, self.integrator.max_depth
         marked = self.integrator.splits_light
         if isinstance(photon_map, TieredMap):
-            return gather_tiers(photon_map, vertices, light_paths, max_depth, weigh, marked)
+            narrow = False
+            if self.narrow is not None:
+                narrow = is_narrow(self.narrow, vertices.bsdf, vertices.si, vertices.active)
+            return gather_tiers(photon_map, vertices, light_paths, max_depth, weigh, marked, narrow)
         return gather_photons(
             photon_map, vertices, radii, light_paths, max_depth, weigh, grey, marked
         )

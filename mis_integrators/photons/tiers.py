@@ -24,6 +24,10 @@ from .grid import (
 from .light_around import TIERS, flux_of, tier_radius
 from .photon import landing_of
 
+WIDER = 4.0
+"""Tuned: how many times larger disks are at surfaces with narrow lobes, where one photon in the
+lobe brings as much as many elsewhere."""
+
 
 class TieredMap:
     """Sorted photons, tier by tier. `arrays`: `start`, `surface` and `power` as of a `PhotonMap`,
@@ -78,14 +82,19 @@ def build_tiered_map(surface, power, count, bbox, radius, capacity, around):
     return TieredMap(arrays, bbox, capacity)
 
 
-def gather_tiers(tiered, vertices, light_path_count, max_depth, weigh=None, marked=False):
-    """`gather_photons` of all tiers, each with its radius. Arguments and result as there, but that
-    there is one estimate, not one for each radius."""
+def gather_tiers(
+    tiered, vertices, light_path_count, max_depth, weigh=None, marked=False, narrow=False
+):
+    """`gather_photons` of all tiers, each with its radius, which in all but the first is `WIDER` at
+    vertices with `narrow` lobes. Other arguments and result as there, but that there is one
+    estimate, not one for each radius."""
+    wider = dr.select(narrow, mi.Float(WIDER), 1)
 
     def step(number, totals):
         photon_map, radius, count = tiered.tier(number)
         there = copy.copy(vertices)
         there.active = vertices.active & (count > 0)
+        radius *= dr.select(number > 0, wider, 1)
         parts = gather_photons(
             photon_map, there, [radius], light_path_count, max_depth, weigh, marked=marked
         )
