@@ -271,8 +271,15 @@ MUTATIONS = [
     ),
     Mutation(
         "photons/tiers.py",
+        "dr.select(number > 0, wider, 1)",
+        "wider",
+        "well lit photons, too, have wide disks at narrow lobes",
+        TIERS,
+    ),
+    Mutation(
+        "photons/tiers.py",
         "photon_map, there, [radius], light_path_count",
-        "photon_map, there, [tiered.radius], light_path_count",
+        'photon_map, there, [tiered.arrays()["tier_radius"]], light_path_count',
         "photons of all tiers have the radius of the first",
         TIERS,
     ),
@@ -457,6 +464,13 @@ MUTATIONS = [
         f"{BALANCE_MEDIA}::test_weights_of_a_path_sum_to_one",
     ),
     # ------------------------------------------------------------------ core
+    Mutation(
+        "core/sequences.py",
+        "hash_bits(index + OWN)",
+        "hash_bits(self.first + OWN)",
+        "independent numbers of a group are stratified",
+        f"{SEQUENCES}::test_independent_numbers",
+    ),
     Mutation(
         "core/sequences.py",
         "(2, 0x33333333),",
