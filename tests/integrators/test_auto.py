@@ -8,7 +8,6 @@ the image and of 3 or 8 % in a block is seen with a probability of 0.95.
 import json
 
 from mis_integrators.integrators import costs
-from mis_integrators.integrators.bdpm import BDPMSession
 from mis_integrators.paths.path_length_statistics import mean_segments
 
 import drjit as dr
@@ -302,6 +301,8 @@ def test_a_path_of_given_time_keeps_the_processor_busy(rgb, monkeypatch, seconds
 def test_a_photon_mapper_that_loses_renders_nothing(rgb, monkeypatch):
     """What an iteration of photons takes is measured only where photons have been chosen: else
     that time is the image's."""
+    from mis_integrators.integrators.bdpm import BDPMSession
+
     set_price_of_path(monkeypatch, 1e-4)
     rendered = []
     monkeypatch.setattr(BDPMSession, "_render", lambda *given: rendered.append(given))
