@@ -270,16 +270,23 @@ MUTATIONS = [
         "tests/photons",
     ),
     Mutation(
+        "photons/grid.py",
+        " & (mi.UInt32(y) < grid.lines)",
+        "",
+        "wide disks at the edge of a flat scene count photons twice",
+        TIERS,
+    ),
+    Mutation(
         "photons/tiers.py",
-        "dr.select(number > 0, wider, 1)",
-        "wider",
+        "[radius * dr.select(number > 0, wider, 1)]",
+        "[radius * wider]",
         "well lit photons, too, have wide disks at narrow lobes",
         TIERS,
     ),
     Mutation(
         "photons/tiers.py",
-        "photon_map, there, [radius], light_path_count",
-        'photon_map, there, [tiered.arrays()["tier_radius"]], light_path_count',
+        "PhotonMap(grid, start, surface, power), tier_radius(radius, number), count",
+        "PhotonMap(grid, start, surface, power), radius, count",
         "photons of all tiers have the radius of the first",
         TIERS,
     ),
@@ -466,8 +473,8 @@ MUTATIONS = [
     # ------------------------------------------------------------------ core
     Mutation(
         "core/sequences.py",
-        "hash_bits(index + OWN)",
-        "hash_bits(self.first + OWN)",
+        "hash_bits(index + ALONE)",
+        "hash_bits(self.first + ALONE)",
         "independent numbers of a group are stratified",
         f"{SEQUENCES}::test_independent_numbers",
     ),

@@ -1,4 +1,5 @@
-"""Low-discrepancy numbers: Sobol' points of up to four dimensions, scrambled as Owen does it.
+"""Random numbers, low-discrepancy or independent: Sobol' points of up to four dimensions, scrambled
+as Owen does it.
 
 A *group* of paths (those of a pixel, or all light sub-paths) shares one sequence; the number of a
 path in it, over all iterations, is its index. Every draw at every vertex is a point of a sequence
@@ -28,7 +29,7 @@ BLOCK_BITS = 16
 more, coordinates from the third on are no longer stratified with those before. (Half the
 instructions.)"""
 
-OWN = 0x6F776E21
+ALONE = 0x6F776E21
 """Tells the hash by which a path has a sequence of its own from all others."""
 
 
@@ -119,9 +120,9 @@ def unit(bits):
 class SampleSequence:
     """The random numbers of a pass, whose paths form groups of `group_size`. `seed`: of a render's
     low-discrepancy numbers, or of this pass alone; `first`: the index of each group's first path,
-    modulo 2^32. With `low_discrepancy` numbers a group shares a sequence; else each path has one of
-    its own, and all numbers are independent. Uint32 of width one, or what Python has instead: one
-    kernel serves them all."""
+    modulo 2^32; both uint32 arrays. With `low_discrepancy` numbers a group shares a sequence; else
+    each path has one of its own, and all numbers are independent. An integer and a flag: both
+    become arrays, so that one kernel serves all."""
 
     seed: Array
     first: Array
@@ -142,7 +143,7 @@ class SampleSequence:
     def of_members(self, group, member) -> PathNumbers:
         """Those of the paths that come `member`-th in their `group` (uint32 arrays)."""
         index = self.first + member
-        own = dr.select(self.low_discrepancy != 0, mi.UInt32(0), hash_bits(index + OWN))
+        own = dr.select(self.low_discrepancy != 0, mi.UInt32(0), hash_bits(index + ALONE))
         return PathNumbers(index, hash_bits(hash_bits(group) + self.seed + own))
 
     def own_seed(self):

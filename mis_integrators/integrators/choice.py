@@ -54,7 +54,7 @@ class Decision:
     """Predicted, by measure and candidate: "relmse.path"."""
     trials: list[Trial] = field(default_factory=list)
     usual_cost: float = 0.0
-    """Of an iteration of the photon mapper, a pixel; the time planned for is counted in those."""
+    """`Trial.cost` of the photon mapper; the time planned for is counted in those."""
 
 
 @dataclass
@@ -67,7 +67,7 @@ class Trial:
     parts: dict[str, tuple[float, float]]
     """By measure: squared bias, and variance of one iteration."""
     cost: float
-    """Of one iteration, a pixel."""
+    """Of one iteration, a pixel; 1 where nothing else is tried."""
 
     def errors(self, budget):
         """Mean squared errors, by measure, when the cost a pixel is `budget`."""

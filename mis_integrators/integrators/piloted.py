@@ -65,8 +65,8 @@ class PilotedSession(IterativeSession):
         raise TypeError(f"{type(self).__name__} does not define _use_light_share")
 
     def plan_time(self, seconds):
-        """Rendering will last `seconds`, from `start` on: the automatic radius is chosen for as
-        many iterations as fit."""
+        """Rendering will last `seconds`, from `start` or `predict` on: the automatic radius is
+        chosen for as many iterations as fit."""
         self.seconds = seconds
 
     @property
@@ -119,8 +119,8 @@ class PilotedSession(IterativeSession):
             self._choose_by_clock(*untimed)
 
     def predict(self):
-        """Runs the pilot, if one is needed, and makes the first choice: that is all which the
-        `prediction` takes. (`start` does this, too, and what is left.)"""
+        """Runs the pilot, if one is needed, and makes the first choice: enough for a `prediction`.
+        `start` does this, too, and times an iteration where there is a time limit."""
         begun = time.perf_counter()
         pilot = self._run_pilot()
         if pilot is None:

@@ -150,10 +150,11 @@ def same_surface(landing, n):
     return (alike > 0) & (dr.square(alike) > SAME_SURFACE_COSINE**2 * dr.squared_norm(landing.n))
 
 
-def within_disk(offset, distance_squared, n, radius):
-    """Whether photons, `offset` from vertices, lie within a radius and close to their plane."""
-    height = dr.abs(dr.dot(offset, n))
-    return (distance_squared < dr.square(radius)) & (height < SAME_SURFACE_OFFSET * radius)
+def within_disk(offset, distance_squared, n, radius, height=None):
+    """Whether photons, `offset` from vertices, lie within a radius and close to their plane:
+    relative to the radius `height` (None: the same)."""
+    most = SAME_SURFACE_OFFSET * (radius if height is None else height)
+    return (distance_squared < dr.square(radius)) & (dr.abs(dr.dot(offset, n)) < most)
 
 
 def landing_cosine(normal, scattering, plane):
@@ -180,6 +181,7 @@ def gather_photons(
     weigh=None,
     grey: bool = False,
     marked: bool = False,
+    height=None,
 ):
     """Radiance that photons bring to camera paths, for each radius of a list, from one visit of
     those within the largest.
@@ -199,6 +201,7 @@ def gather_photons(
         number: its index in the map, and what its `Scattering` says
     grey : sums the mean over channels only (fewer sums to keep for many radii)
     marked : the photons are (`photon.write_photon`)
+    height : the radius by which photons are close to a vertex' plane (None: that of the disk)
 
     Returns
     -------
@@ -223,7 +226,7 @@ def gather_photons(
             smooth = dr.select(alone, mi.UInt32(1), mi.UInt32(2))
             values = by_class(class_of(smooth, delta_at_light), value)
         # The largest radius is tested again, too: without, kernels are slower by some per cent.
-        inside = [hit & within_disk(offset, distance_squared, vertices.n, r) for r in radii]
+        inside = [hit & within_disk(offset, distance_squared, vertices.n, r, height) for r in radii]
         found = [dr.select(i, value, 0) for i in inside for value in values]
         return tuple(total + value for total, value in zip(totals, found))
 

@@ -57,7 +57,7 @@ class Table:
         """Entries that the table takes, with those beyond its end."""
         return self.size + longest_row(self.size)
 
-    def first(self, number):
+    def first_entry(self, number):
         """The first entry of the `number`-th of several tables (an array)."""
         return number * (self.mask + 1 + mi.UInt32(self.longest))
 
@@ -361,7 +361,8 @@ def _photons_of_row(photon_map, y, z, local, reach):
     first_x = dr.clip(mi.Int32(dr.floor(local.x - half)) + 2, 0, longest - 4)
     last_x = dr.clip(mi.Int32(dr.floor(local.x + half)) + 2, -1, longest - 4)
     base = grid.row(y, z)
-    near = (left > -1e-3) & (last_x >= first_x)
+    # Rows outside of the box hold nothing, and would have the numbers of others inside.
+    near = (left > -1e-3) & (last_x >= first_x) & (mi.UInt32(y) < grid.lines)
     return (
         dr.gather(mi.UInt32, photon_map.start, base + mi.UInt32(first_x), near),
         dr.gather(mi.UInt32, photon_map.start, base + mi.UInt32(last_x) + 1, near),

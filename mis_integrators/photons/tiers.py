@@ -24,7 +24,7 @@ from .grid import (
 from .light_around import TIERS, flux_of, tier_radius
 from .photon import landing_of
 
-WIDER = 4.0
+AT_NARROW_LOBES = 4.0
 """Tuned: how many times larger disks are at surfaces with narrow lobes, where one photon in the
 lobe brings as much as many elsewhere."""
 
@@ -34,7 +34,7 @@ class TieredMap:
     and `tier_radius`, that of the first tier."""
 
     def __init__(self, arrays, bbox, capacity):
-        self._arrays, self.tiers = arrays, TierGrids(bbox, capacity)
+        self._arrays, self.grids = arrays, TierGrids(bbox, capacity)
 
     def arrays(self):
         """What a recorded function can take; the map can be made of it again."""
@@ -50,8 +50,8 @@ class TieredMap:
         start, surface, power, radius = (
             self._arrays[name] for name in ("start", "surface", "power", "tier_radius")
         )
-        grid = self.tiers.grid(radius, number)
-        last = self.tiers.table.first(number + 1) - 1  # where no photon is
+        grid = self.grids.grid(radius, number)
+        last = self.grids.table.first_entry(number + 1) - 1  # where no photon is
         count = dr.gather(mi.UInt32, start, last) - dr.gather(mi.UInt32, start, grid.first)
         return PhotonMap(grid, start, surface, power), tier_radius(radius, number), count
 
@@ -66,7 +66,7 @@ class TierGrids:
     def grid(self, radius, number):
         """That of a tier; `radius`: of the first."""
         cell = dr.maximum(tier_radius(radius, number), self._smallest_cell)
-        return Grid(self.bbox, cell, self.table, self.table.first(number))
+        return Grid(self.bbox, cell, self.table, self.table.first_entry(number))
 
 
 def build_tiered_map(surface, power, count, bbox, radius, capacity, around):
@@ -85,18 +85,24 @@ def build_tiered_map(surface, power, count, bbox, radius, capacity, around):
 def gather_tiers(
     tiered, vertices, light_path_count, max_depth, weigh=None, marked=False, narrow=False
 ):
-    """`gather_photons` of all tiers, each with its radius, which in all but the first is `WIDER` at
-    vertices with `narrow` lobes. Other arguments and result as there, but that there is one
-    estimate, not one for each radius."""
-    wider = dr.select(narrow, mi.Float(WIDER), 1)
+    """`gather_photons` of all tiers, each with its radius, which at vertices with `narrow` lobes is
+    `AT_NARROW_LOBES` times as large in all but the first. Other arguments and result as there, but
+    that there is one estimate, not one for each radius."""
+    wider = dr.select(narrow, mi.Float(AT_NARROW_LOBES), 1)
 
     def step(number, totals):
         photon_map, radius, count = tiered.tier(number)
         there = copy.copy(vertices)
         there.active = vertices.active & (count > 0)
-        radius *= dr.select(number > 0, wider, 1)
         parts = gather_photons(
-            photon_map, there, [radius], light_path_count, max_depth, weigh, marked=marked
+            photon_map,
+            there,
+            [radius * dr.select(number > 0, wider, 1)],
+            light_path_count,
+            max_depth,
+            weigh,
+            marked=marked,
+            height=radius,
         )
         return number + 1, [total + part for total, part in zip(totals, parts)]
 

@@ -146,7 +146,6 @@ def ladder_on_surfaces(
         radii = radii * min(WIDER, largest / radii[-1])
         photons = count(radii)
     if most > MOST_PHOTONS:
-        smaller = MOST_PHOTONS / most
-        radii = radii * smaller**0.5
-        photons = {kind: number * smaller for kind, number in photons.items()}
+        radii = radii * (MOST_PHOTONS / most) ** 0.5
+        photons = count(radii)
     return dict.fromkeys(kinds, radii), photons

@@ -13,13 +13,13 @@ FLOOR = 1.0
 """Half the edge of a floor at z = 0."""
 
 
-def photons_of(points, flux):
+def photons_of(points, flux, up=(0, 0, 1)):
     """Caustic photons on the floor, straight from above: `(surface, power, count)`."""
     from mis_integrators.photons.photon import new_photons, power_layout, surface_layout
 
     points, flux = np.asarray(points, np.float32), np.asarray(flux, np.float32)
     surface, power = new_photons(len(points))
-    index, up = dr.arange(mi.UInt32, len(points)), mi.Vector3f(0, 0, 1)
+    index, up = dr.arange(mi.UInt32, len(points)), mi.Vector3f(*up)
     p = mi.Point3f(points.T.copy())
     word = dr.zeros(mi.UInt32, len(points)) + pack_surface(up, mi.UInt32(2), mi.Bool(True))
     surface_layout().write(surface, {"p": p, "surface": word}, index)
@@ -98,12 +98,19 @@ def test_order_of_photons_does_not_matter(rgb):
     )
 
 
-def test_tiers_bring_what_brute_force_finds(rgb):
+@pytest.mark.parametrize("up", [(0, 0, 1), (0, 1, 0)], ids="zy")
+def test_tiers_bring_what_brute_force_finds(rgb, up):
     """Sum over the photons within their own radii, of BSDF x flux over the area of their disks.
-    Where lobes are narrow, at every second vertex, disks are wider, but for the first tier."""
+    Where lobes are narrow, at every second vertex, disks are wider, but for the first tier. The
+    scene is a floor: flat along one axis or another, where wide disks reach beyond the grid."""
     from mis_integrators.core.traits import SceneTraits
     from mis_integrators.photons.gather import QueryVertices
-    from mis_integrators.photons.tiers import WIDER, TieredMap, build_tiered_map, gather_tiers
+    from mis_integrators.photons.tiers import (
+        AT_NARROW_LOBES,
+        TieredMap,
+        build_tiered_map,
+        gather_tiers,
+    )
 
     rng, n, m = np.random.default_rng(7), 3000, 700
     scene = mi.load_dict(
@@ -111,23 +118,27 @@ def test_tiers_bring_what_brute_force_finds(rgb):
             "type": "scene",
             "floor": {
                 "type": "rectangle",
+                "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], -90 * up[1]),
                 "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}},
             },
         }
     )
-    points = np.concatenate([on_floor(rng, n // 2, 0.2), on_floor(rng, n - n // 2)])
+    axes = [0, 1, 2] if up[2] else [0, 2, 1]
+    points = np.concatenate([on_floor(rng, n // 2, 0.2), on_floor(rng, n - n // 2)])[:, axes]
     flux = rng.exponential(1, n)
     around = light_around(points, flux)
     tiers = tiers_of(around, points, flux)
     assert len(np.unique(tiers)) >= 4
-    surface, power, count = photons_of(points, flux)
-    box = scene.bbox()
+    surface, power, count = photons_of(points, flux, up)
+    box = mi.ScalarBoundingBox3f(
+        *(mi.ScalarPoint3f(edge) for edge in (points.min(0), points.max(0)))
+    )
     radius = dr.opaque(mi.Float, RADIUS)
     built = build_tiered_map(surface, power, count, box, radius, n, around)
     np.testing.assert_array_equal(counts(built), np.bincount(tiers, minlength=5))
     assert TieredMap.has_made(built.arrays())
-    queries = on_floor(rng, m)
-    ray = mi.Ray3f(mi.Point3f((queries + [0, 0, 1]).T.copy()), mi.Vector3f(0, 0, -1))
+    queries = on_floor(rng, m)[:, axes]
+    ray = mi.Ray3f(mi.Point3f((queries + up).T.copy()), -mi.Vector3f(*up))
     record = {
         "ray_o": ray.o,
         "ray_d": ray.d,
@@ -142,7 +153,7 @@ def test_tiers_bring_what_brute_force_finds(rgb):
         TieredMap(built.arrays(), box, n), vertices, 10.0, -1, narrow=mi.Bool(narrow)
     )
     distance = np.linalg.norm(queries[:, None] - points[None], axis=-1)
-    radii = RADIUS * 2.0**tiers * np.where(narrow[:, None] & (tiers > 0), WIDER, 1)
+    radii = RADIUS * 2.0**tiers * np.where(narrow[:, None] & (tiers > 0), AT_NARROW_LOBES, 1)
     assert np.abs(distance / radii - 1).min() > 1e-6  # what single precision tells apart
     lit = (distance < radii) * flux / (np.pi * radii**2)
     expected = lit.sum(axis=1) * 0.5 / np.pi / 10
