@@ -24,7 +24,7 @@ from .grid import (
 from .light_around import TIERS, flux_of, tier_radius
 from .photon import landing_of
 
-AT_NARROW_LOBES = 4.0
+AT_NARROW_LOBES = 2.0
 """Tuned: how many times larger disks are at surfaces with narrow lobes, where one photon in the
 lobe brings as much as many elsewhere."""
 
