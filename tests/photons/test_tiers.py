@@ -99,18 +99,16 @@ def test_order_of_photons_does_not_matter(rgb):
 
 
 @pytest.mark.parametrize("up", [(0, 0, 1), (0, 1, 0)], ids="zy")
-def test_tiers_bring_what_brute_force_finds(rgb, up):
+def test_tiers_bring_what_brute_force_finds(rgb, up, monkeypatch):
     """Sum over the photons within their own radii, of BSDF x flux over the area of their disks.
     Where lobes are narrow, at every second vertex, disks are wider, but for the first tier. The
     scene is a floor: flat along one axis or another, where wide disks reach beyond the grid."""
     from mis_integrators.core.traits import SceneTraits
+    from mis_integrators.photons import tiers as module
     from mis_integrators.photons.gather import QueryVertices
-    from mis_integrators.photons.tiers import (
-        AT_NARROW_LOBES,
-        TieredMap,
-        build_tiered_map,
-        gather_tiers,
-    )
+    from mis_integrators.photons.tiers import TieredMap, build_tiered_map, gather_tiers
+
+    monkeypatch.setattr(module, "AT_NARROW_LOBES", 4.0)  # far beyond the grid's margin
 
     rng, n, m = np.random.default_rng(7), 3000, 700
     scene = mi.load_dict(
@@ -153,7 +151,7 @@ def test_tiers_bring_what_brute_force_finds(rgb, up):
         TieredMap(built.arrays(), box, n), vertices, 10.0, -1, narrow=mi.Bool(narrow)
     )
     distance = np.linalg.norm(queries[:, None] - points[None], axis=-1)
-    radii = RADIUS * 2.0**tiers * np.where(narrow[:, None] & (tiers > 0), AT_NARROW_LOBES, 1)
+    radii = RADIUS * 2.0**tiers * np.where(narrow[:, None] & (tiers > 0), 4.0, 1)
     assert np.abs(distance / radii - 1).min() > 1e-6  # what single precision tells apart
     lit = (distance < radii) * flux / (np.pi * radii**2)
     expected = lit.sum(axis=1) * 0.5 / np.pi / 10
