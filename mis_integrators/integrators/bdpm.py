@@ -23,7 +23,7 @@ from ..paths.setting import World
 from ..photons.beams import Beams, gather_along, mean_count_along, read_beams
 from ..photons.coverage import covered_share
 from ..photons.gather import QueryVertices, gather_photons, mean_photon_count
-from ..photons.grid import PhotonMap, build_photon_map, cell_edge
+from ..photons.grid import PhotonMap, build_photon_map
 from ..photons.queries import Queries, read_queries, trace_camera_paths
 from ..photons.tiers import TieredMap, build_tiered_map, gather_tiers
 from ..photons.trace import trace_light_paths
@@ -506,7 +506,7 @@ class BDPMSession(PilotedSession):
         return build_photon_map(
             *photons[:3],
             self.traits.bounds,
-            self._cell(radius),
+            radius,
             self.photon_capacity,
             kind,
             mis_words,
@@ -518,12 +518,7 @@ class BDPMSession(PilotedSession):
             return VolumeMap.with_grid(arrays, radius, self.volume_capacity)
         if TieredMap.has_made(arrays):
             return TieredMap(arrays, self.traits.bounds, self.photon_capacity)
-        return PhotonMap.with_grid(
-            arrays, self.traits.bounds, self._cell(radius), self.photon_capacity
-        )
-
-    def _cell(self, radius):
-        return cell_edge(radius, self.traits.bounds, self.photon_capacity)
+        return PhotonMap.with_grid(arrays, self.traits.bounds, radius, self.photon_capacity)
 
     def _build_maps(self, photons, radii, around):
         maps = {}

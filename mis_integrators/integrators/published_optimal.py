@@ -15,7 +15,7 @@ from ..core.packing import rounded_up
 from ..core.recording import no_garbage_collection
 from ..mis.published_optimal import FrozenMap, Limits, ThreeStrategies, TwoStrategies, typical_flux
 from ..photons.chains import NONE, PhotonChains, trace_camera_chains, trace_photon_chains
-from ..photons.grid import build_photon_map, cell_edge
+from ..photons.grid import build_photon_map
 from ..photons.pairs import list_pairs, meeting_of, parts, take
 from ..photons.photon import surface_layout
 from ..photons.queries import LAST_VERTEX
@@ -167,13 +167,12 @@ class LightOfIteration:
     def _map(self, kind, radius):
         chains, traits = self.chains, self.session.traits
         capacity = surface_layout().capacity(chains.surface)
-        cell = cell_edge(radius, traits.bounds, capacity)
         return build_photon_map(
             chains.surface,
             chains.power,
             chains.count,
             traits.bounds,
-            cell,
+            radius,
             capacity,
             kind,
             chains.words,

@@ -14,7 +14,6 @@ from ..paths.light_classes import CLASSES, LightClasses
 from ..paths.subpaths import on_surfaces, read_vertices
 from ..paths.vertex import in_medium
 from ..photons.gather import KeptVertices, gather_photons
-from ..photons.grid import cell_edge
 from ..photons.vertex_map import state_of, vertex_map
 from ..pilot.run import PILOT_INDEX
 from .bdpt import BDPT, CAMERA, BDPTSession
@@ -179,9 +178,8 @@ class VCMSession(BDPTSession):
         vertices, light_count, _ = light
         if self.traits.has_media:
             vertices, light_count = on_surfaces(vertices, light_count, self.capacity["light"])
-        cell = cell_edge(spectral["radius"], self.traits.bounds, self.capacity["light"])
         photon_map = vertex_map(
-            vertices, light_count, self.capacity["light"], self.traits.bounds, cell
+            vertices, light_count, self.capacity["light"], self.traits.bounds, spectral["radius"]
         )
         index = lanes(self.capacity["camera"])
         active = index < dr.gather(mi.UInt32, count, 0)

@@ -265,8 +265,7 @@ class EnvironmentGuide:
                     portals(entering & odd),
                     *(x[..., entering & ~odd & (own > 0)] for x in (p, d, light, density, own)),
                 )
-        total = pmf.sum(axis=1)
-        seen = total > 0
+        seen = pmf.any(axis=1)
         found = pmf[seen].reshape(-1, POSITION_CELLS, POSITION_CELLS)
         pmf[seen] = smoothed(found, LEVEL_SHARES).reshape(-1, cells)
         total = pmf.sum(axis=1)

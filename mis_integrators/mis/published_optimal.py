@@ -26,7 +26,7 @@ from ..core.records import Layout
 from ..core.spectra import channel_mean
 from ..photons.chains import NONE
 from ..photons.gather import QueryVertices
-from ..photons.grid import build_photon_map, cell_edge
+from ..photons.grid import build_photon_map
 from ..photons.pairs import list_pairs, meeting_of, parts, sum_photons, take
 from ..photons.photon import read_landing, read_power, surface_layout
 from ..weights import mis2, mis3
@@ -80,13 +80,12 @@ class FrozenMap:
         )
         self.paths = dr.opaque(mi.Float, paths)
         self.limits, self.strategies = limits, strategies
-        cell = cell_edge(radius, traits.bounds, capacity)
         self.photon_map = build_photon_map(
             chains.surface,
             chains.power,
             chains.count,
             traits.bounds,
-            cell,
+            radius,
             capacity,
             "all",
             chains.words,

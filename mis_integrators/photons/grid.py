@@ -32,17 +32,6 @@ def longest_row(size):
     return size // 4
 
 
-def smallest_cell(bbox, capacity):
-    """The smallest cell size with which a row of cells still fits into the table."""
-    extent = float(bbox.max.x - bbox.min.x)
-    return extent / (longest_row(table_size(capacity)) - 8)
-
-
-def cell_edge(radius, bbox, capacity):
-    """The edge of cells for queries of a `radius` (width one)."""
-    return dr.maximum(radius, dr.opaque(mi.Float, smallest_cell(bbox, capacity)))
-
-
 class Table:
     """The table of a grid for `capacity` photons: its `size`, and the `longest` row that it may
     have. Its size is no literal of kernels, which would be compiled anew for each."""
@@ -63,19 +52,19 @@ class Table:
 
 
 class Grid:
-    """Cells of edge `cell` (width one) over a bounding box, with two cells of margin.
+    """Cells of edge `cell` (width one) or, where rows of such cells would not fit into the `table`
+    (a `Table`), of the next larger one, over a bounding box, with two cells of margin.
 
-    Odd numbers of columns and rows keep slices apart when numbers wrap around the `table` (a
-    `Table`), whose size is a power of two. That may be a part of a larger one, from entry `first`
-    on.
+    Odd numbers of columns and rows keep slices apart when numbers wrap around the table, whose size
+    is a power of two. It may be a part of a larger one, from entry `first` on.
     """
 
     def __init__(self, bbox, cell, table, first=0):
-        self.origin, self.cell, self.table = mi.Point3f(bbox.min), cell, table
-        self.first = first
+        self.origin, self.table, self.first = mi.Point3f(bbox.min), table, first
         extent = mi.Vector3f(bbox.max - bbox.min)
-        self.columns = (mi.UInt32(dr.floor(extent.x / cell)) + 5) | 1
-        self.lines = (mi.UInt32(dr.floor(extent.y / cell)) + 5) | 1
+        self.cell = dr.maximum(cell, extent.x / mi.Float(table.longest - 8))
+        self.columns = (mi.UInt32(dr.floor(extent.x / self.cell)) + 5) | 1
+        self.lines = (mi.UInt32(dr.floor(extent.y / self.cell)) + 5) | 1
 
     def coordinates(self, p):
         """Integer cell coordinates of points `p`."""

@@ -21,7 +21,7 @@ from ..core.packing import (
 from ..core.random import streams
 from ..core.spectra import channel_mean
 from .gather import SAME_SURFACE_COSINE
-from .grid import build_photon_map, cell_edge, for_each_photon
+from .grid import build_photon_map, for_each_photon
 from .photon import read_landing, read_power, surface_layout
 
 PHOTONS_A_CELL = 32
@@ -110,7 +110,7 @@ class IrradianceCache:
         self.table = dr.zeros(mi.Float, self.words * (dr.width(self.center) + 1))
         self.mean, self.level = 0.0, dr.opaque(mi.Float, 0)
         if dr.width(self.center):
-            reach = cell_edge(GATHER_RADIUS * self.cell, bounds, capacity)
+            reach = GATHER_RADIUS * self.cell
             self._gather(
                 scene,
                 lights,

@@ -18,7 +18,6 @@ from .grid import (
     PhotonMap,
     Table,
     read_photons,
-    smallest_cell,
     sorted_photons,
 )
 from .light_around import TIERS, flux_of, tier_radius
@@ -34,7 +33,7 @@ class TieredMap:
     and `tier_radius`, that of the first tier."""
 
     def __init__(self, arrays, bbox, capacity):
-        self._arrays, self.grids = arrays, TierGrids(bbox, capacity)
+        self._arrays, self.bbox, self.table = arrays, bbox, tier_table(capacity)
 
     def arrays(self):
         """What a recorded function can take; the map can be made of it again."""
@@ -50,23 +49,20 @@ class TieredMap:
         start, surface, power, radius = (
             self._arrays[name] for name in ("start", "surface", "power", "tier_radius")
         )
-        grid = self.grids.grid(radius, number)
-        last = self.grids.table.first_entry(number + 1) - 1  # where no photon is
+        grid = tier_grid(self.bbox, self.table, radius, number)
+        last = self.table.first_entry(number + 1) - 1  # where no photon is
         count = dr.gather(mi.UInt32, start, last) - dr.gather(mi.UInt32, start, grid.first)
         return PhotonMap(grid, start, surface, power), tier_radius(radius, number), count
 
 
-class TierGrids:
-    """The grids of the tiers. Few photons are caustic ones: a quarter of the usual table does."""
+def tier_table(capacity):
+    """The `Table` of each tier. Few photons are caustic ones: a quarter of the usual one does."""
+    return Table(capacity // 4)
 
-    def __init__(self, bbox, capacity):
-        self.bbox, self.table = bbox, Table(capacity // 4)
-        self._smallest_cell = dr.opaque(mi.Float, smallest_cell(bbox, capacity // 4))
 
-    def grid(self, radius, number):
-        """That of a tier; `radius`: of the first."""
-        cell = dr.maximum(tier_radius(radius, number), self._smallest_cell)
-        return Grid(self.bbox, cell, self.table, self.table.first_entry(number))
+def tier_grid(bbox, table, radius, number):
+    """The grid of a tier; `radius`: of the first."""
+    return Grid(bbox, tier_radius(radius, number), table, table.first_entry(number))
 
 
 def build_tiered_map(surface, power, count, bbox, radius, capacity, around):
@@ -76,7 +72,7 @@ def build_tiered_map(surface, power, count, bbox, radius, capacity, around):
     landing = landing_of(record)
     active &= landing.caustic
     number = around.tier(landing.p, flux_of(power, active), radius, active)
-    grid = TierGrids(bbox, capacity).grid(radius, number)
+    grid = tier_grid(bbox, tier_table(capacity), radius, number)
     start, surface, power, _ = sorted_photons(grid, record, power, active, TIERS)
     arrays = {"start": start, "surface": surface, "power": power, "tier_radius": radius}
     return TieredMap(arrays, bbox, capacity)

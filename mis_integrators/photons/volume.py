@@ -123,10 +123,7 @@ class VolumeMap:
 
 def volume_grid(box, radius, capacity):
     """The grid for queries of a radius (width one)."""
-    table = Table(capacity)
-    extent = box.max.x - box.min.x
-    cell = dr.maximum(CELL * radius, extent / mi.Float(table.longest - 8))
-    return Grid(box, cell, table)
+    return Grid(box, CELL * radius, Table(capacity))
 
 
 def build_volume_map(place, power, count, radius, capacity: int, mis_words=None):

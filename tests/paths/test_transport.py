@@ -83,7 +83,7 @@ def query_counts(photons, queries, radii, cell, capacity=None, low=None, high=No
         mi.UInt32(power.view(np.uint32).ravel()),
         mi.UInt32([n]),
         box,
-        mi.Float(max(cell, photon_map.smallest_cell(box, capacity))),
+        mi.Float(cell),
         capacity,
         "all",
     )
