@@ -400,6 +400,9 @@ class DistributedSession:
     itself but finds out what must be known before.
     """
 
+    seconds_of_next = math.inf
+    """That of the session tells of one process, not of many."""
+
     def __init__(self, client: Any, opened: Opened, keep_variance: bool, threads: int | None):
         self._client, self._opened, self._threads, self._keep_variance = (
             client,

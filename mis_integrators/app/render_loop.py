@@ -120,6 +120,13 @@ def fewest_iterations(session: Session) -> int:
     return getattr(session, "fewest_iterations", 1)
 
 
+def seconds_of_next(session: Session, clock: Clock) -> float:
+    """What the next iteration of a session that has some will take: by what it has measured, or by
+    the mean of those done, with all that went before them, whichever is less."""
+    mean = clock.rendering / session.iterations
+    return min(mean, getattr(session, "seconds_of_next", math.inf))
+
+
 def iterate(
     session: Session,
     planned: int | None,
@@ -133,28 +140,27 @@ def iterate(
     """Iterate until there are as many iterations as ``planned``, ``seconds`` of rendering have
     passed, or the error reaches its target, whichever is first of those that are given, or the user
     interrupts; but at least as many as an image needs. An iteration of which more than half would
-    lie beyond the ``seconds``, by the shortest so far, is not begun. A session that has enough
+    lie beyond the ``seconds``, by ``seconds_of_next``, is not begun. A session that has enough
     already is left as it is. Its remarks, if it has some, are said once. A session that only waits
     for others may return from ``iterate`` with nothing new.
     """
-    half = 0.0  # of the shortest iteration, without the first, which holds what goes before it
+
+    def late(limit: float) -> bool:
+        next_takes = seconds_of_next(session, clock)
+        return next_takes > 0 and clock.rendering + next_takes / 2 >= limit
 
     def enough() -> bool:
         return (
             (planned is not None and session.iterations >= planned)
-            or (seconds is not None and clock.rendering + half >= seconds)
+            or (seconds is not None and late(seconds))
             or (target is not None and target.reached(session))
         )
 
     remarked = False
     interrupt.have_result = session.iterations > 0
     while session.iterations < fewest_iterations(session) or not (enough() or interrupt.requested):
-        first, before = session.iterations == 0, clock.rendering
         with clock:
             session.iterate()
-        if not first:
-            spent = clock.rendering - before
-            half = min(half or spent, spent / 2)
         interrupt.have_result = (
             session.iterations > 0
         )  # before a chore shows that there is something

@@ -32,8 +32,9 @@ class Session(Protocol):
 
     A session may have a method ``plan_time(seconds: float) -> None``. It is called once, before the
     first iteration, when the render has a time limit instead of a number of samples. It may have
-    ``remarks``, a list of lines that the user should read, complete once an iteration is done, and
-    ``fewest_iterations``, how many its image needs (else one).
+    ``remarks``, a list of lines that the user should read, complete once an iteration is done,
+    ``fewest_iterations``, how many its image needs (else one), and ``seconds_of_next``, what
+    its next iteration will take: infinite where it does not know, 0 where it is rendered already.
     """
 
     iterations_planned: int | None

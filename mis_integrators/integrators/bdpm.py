@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -367,6 +368,16 @@ class BDPMSession(PilotedSession):
 
     def _beam_room(self, paths):
         return 2 * paths if self.has_volume else 0
+
+    def expect(self, vertices, beams, paths):
+        """Makes room for the vertices and beams of an iteration, of which so many `paths` had so
+        many: an iteration that has to make it traces its camera paths twice."""
+        self.vertex_capacity = max(self.vertex_capacity, self._room_for(vertices, paths))
+        self.beam_capacity = max(self.beam_capacity, self._room_for(beams, paths))
+
+    def _room_for(self, found, paths):
+        """Room in a chunk for what so many `paths` had, and an eighth more."""
+        return rounded_up(math.ceil(found / paths * self.chunk * 9 / 8))
 
     # ------------------------------------------------------------------ passes
 
@@ -735,6 +746,7 @@ class SubsetPasses:
             )
             counts = {"vertices": count, "beams": vertices.get("beam_count")}
             found, beams = session._wanted(counts)
+            session.expect(found, beams, self.pixels.paths)
             if found <= self.capacity and beams <= self.beam_capacity:
                 return radiance, vertices
             self._record_camera(

@@ -3,6 +3,8 @@ package or Mitsuba's `path` renders it."""
 
 from __future__ import annotations
 
+import math
+
 from ..core.traits import UnsupportedScene, check_scene, has_media
 from ..core.untrusted import Fields
 from ..paths.layers import CHANNELS, SPLIT, written
@@ -113,6 +115,12 @@ class AutoSession(IterativeSession):
         """Why what renders was chosen, and what else the user should know, line by line."""
         reasons = self.decision.reasons if self.decision else []
         return [*(f"{self.integrator.plugin}: {reason}" for reason in reasons), *super().remarks]
+
+    @property
+    def seconds_of_next(self):
+        """As of `core.session.Session`."""
+        session = self.decision and self.decision.session
+        return getattr(session, "seconds_of_next", math.inf)
 
     @property
     def _render(self):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 
 import drjit as dr
@@ -37,6 +38,7 @@ class PilotedSession(IterativeSession):
         self.corrected = {}  # whether estimates are corrected at edges, by kind of photons
         self.light_share = 1.0  # of the light sub-paths, those that an iteration has
         self.prediction = None  # a `Prediction`, where a pilot has chosen
+        self.iteration_seconds = math.inf  # what one takes, where that is measured
         self._untimed = None  # arguments of `_choose_by_clock`, until it is called
         self.kept = {}  # iterations that were rendered to measure their time, by number
 
@@ -157,7 +159,9 @@ class PilotedSession(IterativeSession):
         left = self._left(begun, guess)
         seconds, spent = self._time_first_iterations(guess, left)
         count = max(left / seconds * pilot.cost(first), 1)
-        self._take(pilot.choose(count, first, reluctance=min(spent / left, 1)))
+        second = pilot.choose(count, first, reluctance=min(spent / left, 1))
+        self._take(second)
+        self.iteration_seconds = seconds * pilot.cost(second) / pilot.cost(first)
 
     def _take(self, choice: Choice):
         """Renders with this choice from now on. What was rendered with another is no longer
@@ -191,6 +195,11 @@ class PilotedSession(IterativeSession):
             if seconds < TOO_SLOW * guess or spent > left / 2:
                 break
         return seconds, spent
+
+    @property
+    def seconds_of_next(self):
+        """As of `core.session.Session`."""
+        return 0.0 if self.iterations in self.kept else self.iteration_seconds
 
     def _iteration(self, iteration):
         if iteration in self.kept:

@@ -688,6 +688,17 @@ def test_vertices_that_overflow_in_the_pilot_are_not_lost(rgb, monkeypatch):
         assert radii[1][kind] == pytest.approx(radius, rel=0.05)
 
 
+def test_pilots_find_the_room_that_vertices_need(rgb):
+    """No iteration after one has to trace its camera paths twice."""
+    session = bdpm(bdd=1, initial_radius=0.0).session(glossy_box(), seed=1, spp=32)
+    session.vertex_capacity = 11
+    session.start()
+    room = session.vertex_capacity
+    for _ in range(4):
+        session.iterate()
+    assert session.vertex_capacity == room > 11
+
+
 @pytest.mark.parametrize("chunk", [333, *extended(1024)])
 def test_camera_pass_in_parts(rgb, monkeypatch, chunk):
     scene = glossy_box()
