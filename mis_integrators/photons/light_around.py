@@ -20,7 +20,7 @@ from ..core.spectra import channel_mean
 from .grid import read_photons, table_size
 from .photon import power_layout, surface_layout
 
-TIERS = 5
+TIERS = 7
 """Radii that photons may have."""
 MOST_OF_LIGHT = 1 / 64
 """Tuned: what a photon may bring of the light around it in the whole render."""
