@@ -11,6 +11,7 @@ Radii are R, 2 R, 4 R and so on: photons lie in tiers, one for each.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import drjit as dr
@@ -21,7 +22,7 @@ from .grid import read_photons, table_size
 from .photon import power_layout, surface_layout
 
 TIERS = 7
-"""Radii that photons may have."""
+"""Radii that photons may have, at most."""
 MOST_OF_LIGHT = 1 / 64
 """Tuned: what a photon may bring of the light around it in the whole render."""
 QUANTA = 16
@@ -36,6 +37,11 @@ MOST_PLACES = 1 << 22
 def tier_radius(radius, tier):
     """The merge radius of photons of a tier, from that of the first one."""
     return radius * mi.Float(mi.UInt32(1) << tier)
+
+
+def last_tier(radius, largest):
+    """The last tier whose radius is not above the `largest`, by that of the first one."""
+    return int(math.log2(min(max(largest / radius, 1), 1 << (TIERS - 1))))
 
 
 @dataclass
@@ -61,15 +67,22 @@ class LightAround:
     """By tier and place in the table: quanta, and the cell's fingerprint."""
     mask: mi.UInt32
     """Places in the table of a tier (a power of two), less one."""
+    last: mi.UInt32
+    """The last tier that photons may have."""
 
     @classmethod
-    def empty(cls, radius, quantum, times, photons):
+    def empty(cls, radius, quantum, times, photons, largest):
         """Without light. The first three are numbers, see the fields; `photons`: how many there
-        will be, about."""
+        will be, about; `largest`: no photon has a larger radius."""
         numbers = (dr.opaque(mi.Float, number) for number in (radius, quantum, times))
         places = min(table_size(photons), MOST_PLACES)
         cells = dr.zeros(mi.UInt32, 2 * (TIERS - 1) * places)
-        return cls(*numbers, cells, dr.opaque(mi.UInt32, places - 1))
+        return cls(
+            *numbers,
+            cells,
+            dr.opaque(mi.UInt32, places - 1),
+            dr.opaque(mi.UInt32, last_tier(radius, largest)),
+        )
 
     def add(self, surface, power, count):
         """Adds the photons of a light pass (as of `trace_light_paths`)."""
@@ -88,17 +101,17 @@ class LightAround:
 
     def tier(self, p, flux, radius, active):
         """The tier, from 0, of photons at `p`: the first on whose disks they bring no more than
-        `MOST_OF_LIGHT` of the light; else the last. `radius`: of the first tier in this iteration;
-        smaller disks hold less light."""
+        `MOST_OF_LIGHT` of the light; else the `last`. `radius`: of the first tier in this
+        iteration; smaller disks hold less light."""
         shrunk = dr.square(radius / self.radius)
         wanted = mi.Float(self._quanta(flux)) * dr.rcp(MOST_OF_LIGHT * self.times * shrunk)
 
         def look_further(tier, searching):
             searching &= self._around(p, tier, searching) < wanted
             tier = dr.select(searching, tier + 1, tier)
-            return tier, searching & (tier < TIERS - 1)
+            return tier, searching & (tier < self.last)
 
-        state = mi.UInt32(0), mi.Bool(active)
+        state = mi.UInt32(0), mi.Bool(active) & (self.last > 0)
         tier, _ = dr.while_loop(
             state, lambda tier, searching: searching, look_further, label="tier of a photon"
         )

@@ -1,6 +1,8 @@
 """Caustic photons with radii of their own: which they have, what they bring, and that no light is
 lost."""
 
+import math
+
 from mis_integrators.core.packing import pack_direction, pack_surface
 
 import drjit as dr
@@ -8,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-RADIUS = 0.05
+RADIUS, TIERS = 0.05, 7
 FLOOR = 1.0
 """Half the edge of a floor at z = 0."""
 
@@ -28,10 +30,10 @@ def photons_of(points, flux, up=(0, 0, 1)):
     return surface, power, mi.UInt32([len(points)])
 
 
-def light_around(points, flux, times=1.0, quantum=1 / 16):
+def light_around(points, flux, times=1.0, quantum=1 / 16, largest=math.inf):
     from mis_integrators.photons.light_around import LightAround
 
-    around = LightAround.empty(RADIUS, quantum, times, len(points))
+    around = LightAround.empty(RADIUS, quantum, times, len(points), largest)
     around.add(*photons_of(points, flux))
     return around
 
@@ -44,7 +46,7 @@ def tiers_of(around, points, flux, radius=RADIUS):
 
 def counts(tiered):
     """How many photons each tier has."""
-    return np.array(tiered.tier(dr.arange(mi.UInt32, 5))[2])
+    return np.array(tiered.tier(dr.arange(mi.UInt32, TIERS))[2])
 
 
 def on_floor(rng, count, half=FLOOR):
@@ -53,18 +55,18 @@ def on_floor(rng, count, half=FLOOR):
     return points
 
 
-@pytest.mark.parametrize("tier", range(5))
+@pytest.mark.parametrize("tier", range(TIERS))
 @pytest.mark.parametrize("times, flux", [(1, 1), (8, 1), (1, 4)])
 def test_radius_by_the_light_around(rgb, tier, times, flux):
     """The cube around a point is 2 r wide and holds D (2 r)^2 photons of an even density D, which
     stand for `times` as many. A photon `flux` times as bright as these wants 64 `flux` of them: it
     is in the tier where there are twice as many as that, the last one whatever there is."""
-    from mis_integrators.photons.light_around import MOST_OF_LIGHT, TIERS
+    from mis_integrators.photons import light_around as module
 
-    assert TIERS == 5 and MOST_OF_LIGHT == 1 / 64
+    assert module.TIERS == TIERS and module.MOST_OF_LIGHT == 1 / 64
     wanted = 2 * 64 * flux / times
     step = 2 * RADIUS * 2**tier / np.sqrt(wanted)
-    reach = 2 * RADIUS * 2**TIERS
+    reach = 4 * RADIUS * 2**tier
     axis = np.arange(-reach, reach, step) + 0.3 * step
     grid = np.stack([*np.meshgrid(axis, axis), np.zeros((len(axis),) * 2)], -1).reshape(-1, 3)
     found = tiers_of(
@@ -81,7 +83,16 @@ def test_single_photons_have_the_largest_radius(rgb):
     around = light_around(crowd, np.ones(5000))
     assert np.all(tiers_of(around, crowd, np.ones(5000)) == 0)
     alone = on_floor(rng, 20, RADIUS) - [10, 10, 0]
-    assert np.all(tiers_of(around, alone, np.ones(20)) == 4)
+    assert np.all(tiers_of(around, alone, np.ones(20)) == TIERS - 1)
+
+
+@pytest.mark.parametrize(
+    "largest, last", [(0.5, 0), (1, 0), (1.9, 0), (2, 1), (5, 2), (63, 5), (1e9, 6)]
+)
+def test_no_radius_is_larger_than_the_largest(rgb, largest, last):
+    """But the first, which is all photons'. `largest` is in units of it."""
+    around = light_around(np.zeros((1, 3)), [1.0], largest=largest * RADIUS)
+    assert np.all(tiers_of(around, np.full((3, 3), 50.0), np.ones(3)) == last)
 
 
 def test_order_of_photons_does_not_matter(rgb):
@@ -92,7 +103,7 @@ def test_order_of_photons_does_not_matter(rgb):
     one, other = light_around(points, flux), light_around(points[order], flux[order])
     np.testing.assert_array_equal(one.cells, other.cells)
     np.testing.assert_allclose(
-        np.array(one.cells).reshape(4, -1, 2)[..., 0].sum(axis=1),
+        np.array(one.cells).reshape(TIERS - 1, -1, 2)[..., 0].sum(axis=1),
         np.maximum(16 * flux, 1).sum(),
         rtol=0.01,
     )
@@ -133,7 +144,7 @@ def test_tiers_bring_what_brute_force_finds(rgb, up, monkeypatch):
     )
     radius = dr.opaque(mi.Float, RADIUS)
     built = build_tiered_map(surface, power, count, box, radius, n, around)
-    np.testing.assert_array_equal(counts(built), np.bincount(tiers, minlength=5))
+    np.testing.assert_array_equal(counts(built), np.bincount(tiers, minlength=TIERS))
     assert TieredMap.has_made(built.arrays())
     queries = on_floor(rng, m)[:, axes]
     ray = mi.Ray3f(mi.Point3f((queries + up).T.copy()), -mi.Vector3f(*up))
