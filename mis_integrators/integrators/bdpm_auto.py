@@ -5,14 +5,15 @@ from __future__ import annotations
 
 import math
 
-from ..core.traits import UnsupportedScene, check_scene, has_media
+from ..core.traits import check_scene, has_media
 from ..core.untrusted import Fields
-from ..paths.layers import CHANNELS, SPLIT, written
+from ..paths.layers import CHANNELS, SPLIT
 from ..volume.traits import check_volume_scene
 from ..volume.views import Views
 from . import choice, media_choice
 from .choice import Decision
 from .common import IterativeIntegrator, IterativeSession
+from .volpath_multiview import check_layers
 
 
 class BDPMAuto(IterativeIntegrator):
@@ -69,11 +70,7 @@ class BDPMAuto(IterativeIntegrator):
         if has_media(scene, sensor):
             check_volume_scene(scene, self.plugin)
             Views.check_sensor(sensor, self.plugin)
-            if self.layers:
-                raise UnsupportedScene(
-                    f'{self.plugin}: parameter "aovs" = {written(self.layers)!r}: of scenes with '
-                    "media, which volpath_multiview may render, there are no layers; use bdpm"
-                )
+            check_layers(self, [sensor])
         else:
             check_scene(scene, sensor, self.plugin)
 
@@ -151,7 +148,10 @@ class AutoSession(IterativeSession):
 
     def recall(self, learned):
         fields = Fields(learned, "learned")
-        plugin = fields.choice("plugin", list(self._choice.CANDIDATES))
+        candidates = list(self._choice.CANDIDATES)
+        if self.integrator.splits_light:
+            candidates = [self._choice.PHOTONS]
+        plugin = fields.choice("plugin", candidates)
         expected = fields.object("errors")
         errors = {name: expected.number(name) for name in expected.names()}
         reasons, inner = fields.texts("reasons"), fields.any("session")

@@ -14,6 +14,7 @@ import numpy as np
 
 from ..core.spectra import channel_mean
 from ..core.traits import UnsupportedScene
+from ..paths.layers import written
 from ..pilot.denoiser import LEFT
 from ..pilot.setting import UNPLANNED_ITERATIONS
 from ..volume.views import views_of
@@ -46,6 +47,9 @@ def choose(integrator, scene, sensor, seed, iterations, seconds):
     """The `Decision` for a render of so many iterations, or of so many seconds (either may be
     `None`)."""
     render = integrator, scene, sensor, seed, iterations
+    if integrator.splits_light:
+        reason = f"{PHOTONS}: {CAMERA} does not split the light"
+        return Decision(PHOTONS, new_session(PHOTONS, *render), [reason])
     camera = new_session(CAMERA, *render)
     photons, reason = _photons(render)
     if photons is not None:
@@ -59,7 +63,12 @@ def choose(integrator, scene, sensor, seed, iterations, seconds):
 
 def new_session(plugin, integrator, scene, sensor, seed, iterations):
     """A session of a candidate, with the parameters of `integrator` that both share."""
-    parameters = {"type": plugin, **handed_on(integrator), **CANDIDATES[plugin]}
+    parameters = {
+        "type": plugin,
+        **handed_on(integrator),
+        "aovs": written(integrator.layers),
+        **CANDIDATES[plugin],
+    }
     if iterations or plugin == PHOTONS:
         parameters["camera_paths"] = integrator.initial_camera_paths
     if plugin == PHOTONS:

@@ -15,6 +15,7 @@ from ..core.recording import recorder
 from ..core.render_lock import under_render_lock
 from ..core.traits import UnsupportedScene, check_film, check_variant
 from ..lights.lights import Lights
+from ..paths.layers import written
 from ..volume.films import OWN, SHARED, ViewAccumulator, own_values, splat, write_film
 from ..volume.lines import common_nulls, connect, follow_nulls, sight
 from ..volume.pivots import NOWHERE, ON_SURFACE, of_paths, pivot_surface, trace_first_segments
@@ -22,7 +23,7 @@ from ..volume.pivots import OWN as OWN_BRANCH
 from ..volume.shifts import SHIFTS
 from ..volume.suffixes import continue_paths, scattered_to
 from ..volume.traits import VolumeTraits, check_volume_scene
-from ..volume.views import Views
+from ..volume.views import Views, views_of
 from ..weights.multiview import HEURISTICS, gain, summand
 from .common import IterativeIntegrator, IterativeSession, scalar_seed
 
@@ -75,6 +76,10 @@ class VolpathMultiview(IterativeIntegrator):
        - Adds the channels ``var.R``, ``var.G``, ``var.B`` (mono: ``var.Y``): the estimated variance
          of the pixel mean over the iterations, of which there must be two at least. (Default: no,
          i.e. |false|)
+     * - aovs
+       - |string|
+       - As of :monosp:`bdpm`, but for the types that split the light; of one view only. (Default:
+         ``none``)
      * - max_depth
        - |int|
        - Longest path in segments (-1: unlimited). A value of 1 shows only directly visible
@@ -126,15 +131,9 @@ class VolpathMultiview(IterativeIntegrator):
             parameters.refuse("beta", 'only weights = "power" have an exponent')
         self.add_nulls = parameters.boolean("add_nulls", True)
 
-    def read_layers(self, parameters):
-        parameters.refuse("aovs", "of media and of several views there are no layers")
-        return ()
-
     def settings(self):
-        settings = super().settings()
-        del settings["aovs"]
         return {
-            **settings,
+            **super().settings(),
             "shift": self.shift,
             "weights": self.weights,
             "beta": self.beta,
@@ -157,6 +156,7 @@ class VolpathMultiview(IterativeIntegrator):
         for sensor in sensors:
             check_film(sensor, self.plugin)
             Views.check_sensor(sensor, self.plugin)
+        check_layers(self, sensors)
         self.check_path_number(sensors)
         camera_paths = self.camera_paths or self._automatic(sensors, spp)
         iterations = self.planned_iterations(spp, camera_paths)
@@ -169,6 +169,15 @@ class VolpathMultiview(IterativeIntegrator):
         pixels = sum(int(w) * int(h) for w, h in (sensor.film().crop_size() for sensor in sensors))
         most = max(1, min(LAUNCH // max(pixels, 1), spp // 8 if spp else 16))
         return max(n for n in range(1, most + 1) if spp % n == 0)
+
+
+def check_layers(integrator, sensors):
+    """Raises `UnsupportedScene` where the sensors have several views, and layers are asked for."""
+    if integrator.layers and sum(len(views_of(sensor)) for sensor in sensors) > 1:
+        raise UnsupportedScene(
+            f'{integrator.plugin}: parameter "aovs" = {written(integrator.layers)!r}: of several '
+            "views there are no layers"
+        )
 
 
 class MultiViewSession(IterativeSession):
@@ -510,10 +519,14 @@ class MultiViewSession(IterativeSession):
         return images
 
     def _fill(self, film, pictures):
-        """Writes pictures side by side into a film."""
-        write_film(
-            self._emptied(film), pictures[0] if len(pictures) == 1 else dr.concat(pictures, axis=1)
-        )
+        """Writes pictures side by side into a film; where there is one view, its layers, too."""
+        picture = pictures[0] if len(pictures) == 1 else dr.concat(pictures, axis=1)
+        border = film.rfilter().border_size()
+        for layer in self.integrator.layers:
+            height, width = picture.shape[:2]
+            inside = slice(border, border + height), slice(border, border + width)
+            picture = dr.concat([picture, self._layers[layer.name][inside]], axis=2)
+        write_film(self._emptied(film), picture)
         return film
 
     def fill_film(self):

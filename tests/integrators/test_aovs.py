@@ -26,7 +26,7 @@ from comparing import (
 )
 from light_by_class import traced
 from selection import extended, one_in_each_row
-from worlds import bdpm, film, look, path, ptracer, tray
+from worlds import T, bdpm, film, look, path, ptracer, tray
 
 SURFACE_PLUGINS = [plugin for plugin in _plugins.PLUGINS if plugin != "volpath_multiview"]
 ALL = ",".join(f"{kind}_1:{kind}" for kind in CHANNELS)
@@ -512,25 +512,57 @@ def test_other_wrong_values(rgb):
         assert mi.load_dict({"type": "bdpm", "aovs": nothing}).aov_names() == []
 
 
-def test_media_have_none(rgb):
-    with pytest.raises(RuntimeError) as error:
-        mi.load_dict({"type": "volpath_multiview", "aovs": "a:albedo"})
-    assert 'volpath_multiview: parameter "aovs" is not supported' in last_line(error)
-    fog = {
-        "type": "cube",
-        "bsdf": {"type": "null"},
-        "interior": {"type": "homogeneous", "albedo": 0.5, "sigma_t": 1.0},
-    }
-    scene = mi.load_dict(
+def foggy(sensor):
+    """A cube of fog before a wall, under a sky."""
+    return mi.load_dict(
         {
             "type": "scene",
-            "fog": fog,
+            "fog": {
+                "type": "cube",
+                "bsdf": {"type": "null"},
+                "interior": {"type": "homogeneous", "albedo": 0.5, "sigma_t": 1.0},
+            },
+            "wall": {"type": "rectangle", "to_world": T().translate([0.5, 0, -2]).scale(2)},
             "light": {"type": "constant"},
-            "sensor": {"type": "perspective", "film": film(8)},
+            "sensor": sensor,
         }
     )
-    integrator = mi.load_dict({"type": "bdpm_auto", "aovs": "a:albedo"})
-    with pytest.raises(Exception, match="of scenes with media"):
+
+
+def before_fog(**more):
+    look = T().look_at([0, 0, 6], [0, 0, 0], [0, 1, 0])
+    return {"type": "perspective", "to_world": look, "film": film(12, "gaussian"), **more}
+
+
+@pytest.mark.parametrize("plugin", ["volpath_multiview", "bdpm_auto"])
+def test_layers_of_scenes_with_media_are_those_of_bdpm(rgb, plugin):
+    scene, images = foggy(before_fog()), []
+    for name in ("bdpm", plugin):
+        integrator = mi.load_dict({"type": name, "aovs": "a:albedo,d:depth", "max_depth": 3})
+        session = integrator.session(scene, seed=7, spp=2)
+        session.iterate()
+        assert session.channels[-4:] == ["a.R", "a.G", "a.B", "d.T"]
+        images.append(session.image()[..., -4:])
+    assert session.settings.get("choice", plugin) == "volpath_multiview"
+    np.testing.assert_allclose(images[1], images[0], rtol=1e-4, atol=1e-4)
+    assert len(np.unique(images[0][..., 3])) > 4
+
+
+def test_light_in_media_is_split_by_photons(rgb):
+    integrator = mi.load_dict({"type": "bdpm_auto", "aovs": SPLIT_ALL, "max_depth": 3})
+    session = integrator.session(foggy(before_fog()), seed=7, spp=2)
+    session.iterate()
+    assert session.settings["choice"] == "bdpm"
+    with pytest.raises(RuntimeError, match='no type "direct"'):
+        mi.load_dict({"type": "volpath_multiview", "aovs": "d:direct"})
+
+
+@pytest.mark.parametrize("plugin", ["volpath_multiview", "bdpm_auto"])
+def test_several_views_have_no_layers(rgb, plugin):
+    views = {f"view{number}": before_fog() for number in range(2)}
+    scene = foggy({"type": "batch", "film": film(12), **views})
+    integrator = mi.load_dict({"type": plugin, "aovs": "a:albedo"})
+    with pytest.raises(Exception, match="of several views there are no layers"):
         integrator.session(scene, spp=4)
 
 

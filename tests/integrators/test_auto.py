@@ -6,6 +6,7 @@ the image and of 3 or 8 % in a block is seen with a probability of 0.95.
 """
 
 import json
+import math
 
 from mis_integrators.integrators import costs
 from mis_integrators.paths.path_length_statistics import mean_segments
@@ -313,6 +314,24 @@ def test_a_photon_mapper_that_loses_renders_nothing(rgb, monkeypatch):
     session.plan_time(1.0)
     session.iterate()
     assert session.decision.plugin == "path" and not rendered
+
+
+def test_a_photon_mapper_that_wins_is_timed(rgb, monkeypatch):
+    """What it has rendered for that is the image's, too; then it knows what an iteration takes, and
+    how many there will be."""
+    set_price_of_path(monkeypatch, 1e4)
+    session = auto().session(tray("lambertian", "rectangle"))
+    assert session.seconds_of_next == math.inf
+    session.plan_time(5.0)
+    session.start()
+    assert session.decision.plugin == "bdpm" and session.seconds_of_next == 0
+    photons = session.decision.session
+    ready = len(photons.kept)
+    for _ in range(ready):
+        session.iterate()
+    each = session.seconds_of_next
+    assert 0 < each < 5.0 and ready in (1, 2)
+    assert 0 < photons.prediction.iterations * each < 5.0
 
 
 def test_a_photon_mapper_learns_once(rgb, monkeypatch):

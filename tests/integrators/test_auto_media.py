@@ -145,11 +145,6 @@ def test_what_photons_are_not_for(rgb, scene, parameters, why):
     assert np.isfinite(session.image()).all()
 
 
-def test_layers_are_refused_by_name(rgb):
-    with pytest.raises(Exception, match="there are no layers; use bdpm"):
-        auto(aovs="a:albedo").session(plain(), spp=4)
-
-
 # --- The image ------------------------------------------------------------------------------------
 
 
