@@ -121,10 +121,13 @@ def fewest_iterations(session: Session) -> int:
 
 
 def seconds_of_next(session: Session, clock: Clock) -> float:
-    """What the next iteration of a session that has some will take: by what it has measured, or by
-    the mean of those done, with all that went before them, whichever is less."""
-    mean = clock.rendering / session.iterations
-    return min(mean, getattr(session, "seconds_of_next", math.inf))
+    """What the next iteration of a session that has some will take: what it has measured, but no
+    more than the mean of those done, with all that went before them. If it has measured nothing,
+    what went before counts as one more iteration."""
+    measured = getattr(session, "seconds_of_next", math.inf)
+    if measured == math.inf:
+        return clock.rendering / (session.iterations + 1)
+    return min(measured, clock.rendering / session.iterations)
 
 
 def iterate(

@@ -30,7 +30,7 @@ class Slow(contextlib.AbstractContextManager):
         (0, 1, 10, 10),
         (0, 4, 11, 3),  # a quarter of the third one lies beyond
         (0, 4, 9, 2),  # three quarters of it would
-        (3, 4, 10, 1),  # the second could take as long as all until then
+        (3, 4, 10, 2),  # what goes before counts as one more
         (3, 4, 12, 2),
         (3, 4, 14, 3),
         (0, 20, 10, 1),
@@ -67,8 +67,10 @@ class Timed(Slow):
         (13, 6, 1, 20, 2),
         (18, 6, 1, 20, 1),
         (21, 6, 2, 20, 2),  # it is too late, but the second is there
-        (13, math.inf, 1, 20, 2),  # what it cannot tell, the mean does
-        (14, math.inf, 1, 20, 1),
+        (9, 60, 1, 20, 2),  # measured with something else in it: the mean knows better
+        (14, 60, 1, 20, 1),
+        (15, math.inf, 1, 20, 2),
+        (17, math.inf, 1, 20, 1),
     ],
 )
 def test_sessions_that_know_what_an_iteration_takes(before, each, ready, seconds, iterations):
