@@ -48,7 +48,8 @@ def test_equal_time_and_both_images(scene, capfd, monkeypatch):
     monkeypatch.setattr(cli, "_render", spy)
     assert render(scene, "--spp", 8, "-P", "bdd=0", "--compare", "path") == 0
     (_, samples, first), (asked, no_samples, second) = seen
-    assert (samples, no_samples) == (8, None) and asked == first and second >= first
+    assert (samples, no_samples) == (8, None) and asked == first
+    assert second >= 0.8 * first  # an iteration more would be late by more than its half
     said = capfd.readouterr().err.splitlines()
     one, other, where = said[-3:]  # before, progress: more of it where kernels are compiled
     assert one.startswith("bdpm bdd=0: 8 samples per pixel in ") and other.startswith("path: ")
