@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
-from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from ..core.film import splat_samples
 from ..core.packing import rounded_up
-from ..core.recording import lanes, recorder
-from ..core.spectra import channel_mean
+from ..core.recording import recorder
 from ..core.traits import SceneTraits, lookup
 from ..lights.lights import Lights
 from ..paths.camera import film_sample_count, film_size
@@ -21,9 +17,9 @@ from ..paths.layers import CHANNELS, SPLIT
 from ..paths.light_classes import LightClasses
 from ..paths.lobes import is_narrow, narrow_bsdfs
 from ..paths.setting import World
-from ..photons.beams import Beams, gather_along, mean_count_along, read_beams
+from ..photons.beams import Beams, gather_along, read_beams
 from ..photons.coverage import covered_share
-from ..photons.gather import QueryVertices, gather_photons, mean_photon_count
+from ..photons.gather import QueryVertices, gather_photons
 from ..photons.grid import PhotonMap, build_photon_map
 from ..photons.queries import Queries, read_queries, trace_camera_paths
 from ..photons.tiers import TieredMap, build_tiered_map, gather_tiers
@@ -35,6 +31,7 @@ from ..pilot.setting import LIGHT_SHARES, PilotSetting, pilot_light_paths
 from .caustic_radii import CausticRadii
 from .common import MOST_LIGHT_PATHS, IterativeIntegrator
 from .direct_light import DirectLight
+from .pilot_passes import SubsetPasses
 from .piloted import PilotedSession
 from .schedule import read_radius
 
@@ -294,7 +291,7 @@ class BDPMSession(PilotedSession):
         )
 
     def pilot_passes(self, setting, pixels):
-        return SubsetPasses(self, setting, pixels)
+        return SubsetPasses(self, setting, pixels, CAMERA)
 
     def _run_pilot(self):
         """With a pilot's light sub-paths."""
@@ -667,157 +664,3 @@ class BDPMSession(PilotedSession):
         """How many vertices and beams a camera pass would have kept."""
         vertices = 0 if self.one_vertex else int(dr.max(counts["vertices"])[0])
         return vertices, 0 if counts["beams"] is None else int(counts["beams"][0])
-
-
-class SubsetPasses:
-    """The passes of a `BDPMSession` on the pixels of its pilot (`pilot.run.PilotPasses`)."""
-
-    def __init__(self, session, setting, pixels):
-        self.session, self.setting, self.pixels = session, setting, pixels
-        room = session._vertex_room(pixels.paths) * (1 if session.one_vertex else 4)
-        self._record_camera(room, 4 * session._beam_room(pixels.paths))
-        self._record_gather()
-        self._covered = session.recorded(session._covered)
-
-    def _record_camera(self, capacity, beams):
-        session, pixels = self.session, self.pixels
-        self.capacity, self.beam_capacity = capacity, beams
-        stride = pixels.stride * pixels.camera_paths
-        back = (
-            1 - pixels.count * stride
-        ) % 2**32  # from a path of the last pixel to the next one of the first
-        self._camera = session.recorded(
-            lambda scene, sensor, tables, sequence, spectral: session._trace_camera(
-                replace(
-                    session.describe_camera_pass(
-                        sensor, sequence, lanes(pixels.paths) // pixels.count * back, spectral
-                    ),
-                    count=pixels.paths,
-                    camera_paths=pixels.camera_paths,
-                    stride=stride,
-                ),
-                capacity,
-                spectral,
-                0.0,
-                mi.Float(1),
-                beams=beams,
-            )
-        )
-
-    def seen(self):
-        """As of `pilot.run.PilotPasses`: what the paths for direct light see."""
-        pixels = self.pixels
-        return self.session.direct_light.measured().mean[np.arange(pixels.count) * pixels.stride]
-
-    def _record_gather(self):
-        session = self.session
-        self.photon_capacity = session.photon_capacity, session.volume_capacity
-        self._gather = session.recorded(
-            lambda scene, tables, photons, vertices, radii, spectral: {
-                kind: session._gather(
-                    session._map(photons, kind, radii[kind][-1]),
-                    vertices,
-                    kind,
-                    radii[kind],
-                    spectral,
-                    grey=True,
-                )
-                for kind in radii
-            }
-        )
-
-    def trace(self, number):
-        session = self.session
-        spectral = session._spectral(number)
-        photons = session._photons(number, spectral)
-        if self.photon_capacity != (session.photon_capacity, session.volume_capacity):
-            self._record_gather()
-        sequence = session._sequence(number, CAMERA, self.pixels.camera_paths)
-        radiance, vertices = self._trace_camera(sequence, spectral)
-        return SubsetIteration(self, photons, vertices, radiance, sequence.own_seed(), spectral)
-
-    def _trace_camera(self, sequence, spectral):
-        """Radiance and vertices of the camera paths. Where the vertices overflow their buffer, it
-        grows and the pass runs again."""
-        session = self.session
-        while True:
-            radiance, _, _, vertices, count = self._camera(
-                session.scene, session.sensor, session._tables, sequence, spectral
-            )
-            counts = {"vertices": count, "beams": vertices.get("beam_count")}
-            found, beams = session._wanted(counts)
-            session.expect(found, beams, self.pixels.paths)
-            if found <= self.capacity and beams <= self.beam_capacity:
-                return radiance, vertices
-            self._record_camera(
-                max(self.capacity, found + found // 8), max(self.beam_capacity, beams + beams // 8)
-            )
-
-    def gather(self, photons, vertices, radii, seed, spectral):
-        """What photons bring to the camera paths, for the radii of each kind, by kind and whether
-        it is corrected at edges: (radii, groups, pixels)."""
-        session, estimates = self.session, {}
-        radii = {
-            kind: [dr.opaque(mi.Float, float(radius)) for radius in ladder]
-            for kind, ladder in radii.items()
-        }
-        gathered = self._gather(session.scene, session._tables, photons, vertices, radii, spectral)
-        for kind, values in gathered.items():
-            for corrected in self.setting.corrections(kind):
-                if corrected:
-                    values = [
-                        value
-                        * dr.rcp(
-                            self._covered(session.scene, session._tables, vertices, radius, seed)
-                        )
-                        for value, radius in zip(values, radii[kind])
-                    ]
-                estimates[kind, corrected] = np.array(
-                    [
-                        self.by_pixel(session._per_path(value, vertices, kind, self.pixels.paths))
-                        for value in values
-                    ]
-                )
-        return estimates
-
-    def mean_photon_count(self, photons, vertices, kind, radius):
-        """Photons of a kind within `radius` of a vertex, or of a path's beams, on average."""
-        radius = dr.opaque(mi.Float, radius)
-        photon_map = self.session._map(photons, kind, radius)
-        if kind == "volume":
-            beams = Beams.read(vertices["beams"], self.session._spectral(0)["wavelengths"])
-            return mean_count_along(photon_map, beams, radius, self.pixels.paths)
-        return mean_photon_count(photon_map, read_queries(vertices), radius)
-
-    def by_pixel(self, values):
-        """Means (groups, pixels) of values of the camera paths; those that are not finite count as
-        none."""
-        pixels = self.pixels
-        values = np.broadcast_to(np.array(values), pixels.paths)
-        values = np.where(np.isfinite(values), values, 0)
-        return values.reshape(pixels.groups, -1, pixels.count).mean(axis=1)
-
-
-class SubsetIteration(NamedTuple):
-    """Photons and camera paths of one iteration of `SubsetPasses` (`pilot.run.PilotIteration`)."""
-
-    passes: SubsetPasses
-    photons: tuple
-    vertices: dict
-    radiance: mi.Spectrum
-    seed: mi.UInt32
-    spectral: dict
-
-    def points(self):
-        vertices = read_queries(self.vertices)
-        points = vertices["ray_o"] + vertices["ray_d"] * vertices["hit"].t
-        return np.array(points), np.array(dr.max(vertices["throughput"]))
-
-    def mean_photon_count(self, kind, radius):
-        return self.passes.mean_photon_count(self.photons, self.vertices, kind, radius)
-
-    def gather(self, radii):
-        return self.passes.gather(self.photons, self.vertices, radii, self.seed, self.spectral)
-
-    def direct(self):
-        return self.passes.by_pixel(channel_mean(self.radiance))
