@@ -13,7 +13,6 @@ from ..volume.views import Views
 from . import choice, media_choice
 from .choice import Decision
 from .common import IterativeIntegrator, IterativeSession
-from .volpath_multiview import check_layers
 
 
 class BDPMAuto(IterativeIntegrator):
@@ -70,7 +69,7 @@ class BDPMAuto(IterativeIntegrator):
         if has_media(scene, sensor):
             check_volume_scene(scene, self.plugin)
             Views.check_sensor(sensor, self.plugin)
-            check_layers(self, [sensor])
+            Views.check_layers([sensor], self.layers, self.plugin)
         else:
             check_scene(scene, sensor, self.plugin)
 

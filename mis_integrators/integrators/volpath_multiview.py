@@ -15,7 +15,6 @@ from ..core.recording import recorder
 from ..core.render_lock import under_render_lock
 from ..core.traits import UnsupportedScene, check_film, check_variant
 from ..lights.lights import Lights
-from ..paths.layers import written
 from ..volume.films import OWN, SHARED, ViewAccumulator, own_values, splat, write_film
 from ..volume.lines import common_nulls, connect, follow_nulls, sight
 from ..volume.pivots import NOWHERE, ON_SURFACE, of_paths, pivot_surface, trace_first_segments
@@ -23,7 +22,7 @@ from ..volume.pivots import OWN as OWN_BRANCH
 from ..volume.shifts import SHIFTS
 from ..volume.suffixes import continue_paths, scattered_to
 from ..volume.traits import VolumeTraits, check_volume_scene
-from ..volume.views import Views, views_of
+from ..volume.views import Views
 from ..weights.multiview import HEURISTICS, gain, summand
 from .common import IterativeIntegrator, IterativeSession, scalar_seed
 
@@ -156,7 +155,7 @@ class VolpathMultiview(IterativeIntegrator):
         for sensor in sensors:
             check_film(sensor, self.plugin)
             Views.check_sensor(sensor, self.plugin)
-        check_layers(self, sensors)
+        Views.check_layers(sensors, self.layers, self.plugin)
         self.check_path_number(sensors)
         camera_paths = self.camera_paths or self._automatic(sensors, spp)
         iterations = self.planned_iterations(spp, camera_paths)
@@ -169,15 +168,6 @@ class VolpathMultiview(IterativeIntegrator):
         pixels = sum(int(w) * int(h) for w, h in (sensor.film().crop_size() for sensor in sensors))
         most = max(1, min(LAUNCH // max(pixels, 1), spp // 8 if spp else 16))
         return max(n for n in range(1, most + 1) if spp % n == 0)
-
-
-def check_layers(integrator, sensors):
-    """Raises `UnsupportedScene` where the sensors have several views, and layers are asked for."""
-    if integrator.layers and sum(len(views_of(sensor)) for sensor in sensors) > 1:
-        raise UnsupportedScene(
-            f'{integrator.plugin}: parameter "aovs" = {written(integrator.layers)!r}: of several '
-            "views there are no layers"
-        )
 
 
 class MultiViewSession(IterativeSession):

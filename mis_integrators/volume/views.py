@@ -11,6 +11,7 @@ import numpy as np
 
 from ..core.random import next_2d
 from ..core.traits import UnsupportedScene
+from ..paths.layers import written
 
 PARALLEL = "OrthographicCamera"
 SENSORS = {
@@ -234,6 +235,16 @@ class Views:
             raise UnsupportedScene(f'{plugin}: film "specfilm" is not supported; use "hdrfilm"')
         if len(views_of(group)) > 1 and tuple(film.size()) != tuple(film.crop_size()):
             raise UnsupportedScene(f"{plugin}: the film of a batch cannot be cropped")
+
+    @staticmethod
+    def check_layers(groups, layers, plugin):
+        """Raises `UnsupportedScene` where `layers` (of `paths.layers`) are asked for, and there are
+        several views."""
+        if layers and sum(len(views_of(group)) for group in groups) > 1:
+            raise UnsupportedScene(
+                f'{plugin}: parameter "aovs" = {written(layers)!r}: of several views there are no '
+                "layers"
+            )
 
     def _check(self, films, plugin):
         if self.count > MAX_VIEWS:
