@@ -65,6 +65,8 @@ CHOSEN_FROM = (
 """What `bdpm_auto` is judged by unless said otherwise."""
 BASE = "path"
 """What ratios are to, if it is among the methods; else the first of them."""
+PATH_TRACERS = "path", "volpath"
+"""What a user would pick instead: the plugins whose best sampler's error others are compared to."""
 MITSUBAS = ("path", "ptracer", "volpath", "volpathmis", "direct", "prb")
 """Mitsuba's own integrators that defaults may name."""
 

@@ -20,6 +20,7 @@ from mis_integrators.app import denoising
 import numpy as np
 
 from common.measuring import Measured, Measurement, measure
+from common.methods import PATH_TRACERS
 from common.references import find_references
 from common.rows import Row, console, save, show, tell
 from common.scene_files import open_scene, scaled_size
@@ -64,7 +65,8 @@ TO_BETTER_PATH = {
     name: f"{name} / best path"
     for name in ("relMSE", "MSE", "denoised relMSE", "denoised MSE", "denoised FLIP")
 }
-"""Columns of ratios to the least error of `path` under any of its samplers, by the error's."""
+"""Columns of ratios to the least error of `path`, or `volpath`, under any of its samplers, by the
+error's."""
 
 
 def run(options: argparse.Namespace) -> None:
@@ -146,7 +148,7 @@ def compare(measurement: Measurement) -> list[Row]:
         | _denoised_errors(measured, pictures, measurement)
         for measured, pictures in zip(measurement.methods, denoised)
     ]
-    of_path = [measured.method.plugin == "path" for measured in measurement.methods]
+    of_path = [measured.method.plugin in PATH_TRACERS for measured in measurement.methods]
     paths = [row for row, is_path in zip(rows, of_path) if is_path]
     for name, column, images in (
         ("relMSE", "artefacts", [measured.images for measured in measurement.methods]),

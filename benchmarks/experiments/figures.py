@@ -21,6 +21,7 @@ from report import results
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "results.md"
 FIGURES = PAGE.with_suffix(".json")
+MEDIA = tuple(sorted((BUNDLED / "media").glob("*.xml")))
 EVERYWHERE = ("room",)
 """What a part without scenes has its figures under."""
 
@@ -37,6 +38,8 @@ class Part:
     """What is kept of each row."""
     bundled: tuple[str, ...] | None = None
     """Those of the bundled scenes that it is about; ``None``: all of them."""
+    own: tuple[Path, ...] = ()
+    """Scenes that it is about in place of these."""
     elsewhere: bool = True
     """Whether it is about scenes from elsewhere, too."""
     pictures: Mapping[str, str] | None = None
@@ -46,16 +49,18 @@ class Part:
         """Those of the scenes given that it measures; ``None`` stands for one of its own."""
         if self.bundled == EVERYWHERE:
             return [None]
-        if self.command.startswith("multiview"):
-            return list(multiview.SCENES)
+        bundled = () if self.own else self.bundled
         return [
-            path
-            for path in given
-            if (
-                self.bundled is None or name_of(path) in self.bundled
-                if path.resolve().parent == BUNDLED
-                else self.elsewhere
-            )
+            *self.own,
+            *(
+                path
+                for path in given
+                if (
+                    bundled is None or name_of(path) in bundled
+                    if path.resolve().parent == BUNDLED
+                    else self.elsewhere
+                )
+            ),
         ]
 
 
@@ -158,10 +163,30 @@ PARTS = {
         "parsimony",
         ("left out", "iteration with it / without", "all left out"),
     ),
+    "media20": Part(
+        "compare --time 20 --seeds 1 --reference-method bdpt --integrators volpath"
+        " volpath:sampler=multijitter bdpt bdpm:bdd=0 bdpm_auto",
+        "compare",
+        (*_EFFORT, "relMSE", "MSE", "FLIP", "artefacts", "relMSE / best path", "MSE / best path"),
+        own=MEDIA,
+    ),
+    "media_charts": Part(
+        "converge --time 5 --seeds 1 --snapshots 5 --reference-method bdpt --integrators volpath"
+        " volpath:sampler=multijitter bdpt bdpm:bdd=0 bdpm_auto",
+        "converge",
+        ("method", "seconds", "relMSE", "relMSE trimmed", "on the front"),
+        own=MEDIA,
+        elsewhere=False,
+        pictures={
+            f"{scene.stem}_time.png": f"images/charts/{scene.stem}_time.png" for scene in MEDIA
+        },
+    ),
     "multiview": Part(
         "multiview --time 3 --seeds 3 --weights mis --no-lost-shares",
         "multiview",
         ("weights", "views", "ratio", "best view", "worst view"),
+        own=tuple(multiview.SCENES),
+        elsewhere=False,
     ),
 }
 """By name. The order is that in which they are measured: what matters most comes first. Together

@@ -20,6 +20,8 @@ TITLES = {
 """Names for scenes that are not in this repository."""
 NOT_YET = "Not measured yet: `make figures` does it."
 PLAIN, STRATIFIED = "path", "path:sampler=multijitter"
+IN_MEDIA = "volpath", "volpath:sampler=multijitter"
+"""The same in scenes with media."""
 
 
 def page(text: str, figures: Figures) -> str:
@@ -83,25 +85,39 @@ def denoised(entries: Mapping[str, Entry]) -> str:
     return _over_path(entries, *columns, "10 s, denoised")
 
 
-def _over_path(entries: Mapping[str, Entry], first: str, second: str, corner: str) -> str:
-    """A row a scene: the stratified sampler over the plain one, then each method's two ratios."""
-    labels = [label for label in _labels(entries) if label not in (PLAIN, STRATIFIED)]
+def in_media(entries: Mapping[str, Entry]) -> str:
+    """relMSE and MSE over those of the better `volpath`."""
+    columns = "relMSE / best path", "MSE / best path"
+    return _over_path(entries, *columns, "20 s, in media", IN_MEDIA)
+
+
+def _over_path(
+    entries: Mapping[str, Entry],
+    first: str,
+    second: str,
+    corner: str,
+    path: tuple[str, str] = (PLAIN, STRATIFIED),
+) -> str:
+    """A row a scene: the `path` with the stratified sampler over the plain one, then each method's
+    two ratios."""
+    plain, stratified = path
+    labels = [label for label in _labels(entries) if label not in path]
     lines, pairs = [], {}
     for scene, entry in sorted(entries.items()):
         rows = _by_method(entry)
         cells = []
-        for label in (STRATIFIED, *labels):
+        for label in (stratified, *labels):
             if label not in rows:
                 cells.append("-")
                 continue
-            base = rows[PLAIN] if label == STRATIFIED else {first: 1.0, second: 1.0}
+            base = rows[plain] if label == stratified else {first: 1.0, second: 1.0}
             pair = [_ratio(rows[label][name], base[name]) for name in (first, second)]
             pairs.setdefault(label, []).append(pair)
             cells.append(_two(pair))
         lines.append([title(scene), *cells])
     means = [
         _two([geometric_mean(column) for column in zip(*pairs[label])])
-        for label in (STRATIFIED, *labels)
+        for label in (stratified, *labels)
     ]
     head = [corner, "`multijitter` over `independent`", *map(method_title, labels)]
     return markdown(head, [*lines, [f"geometric mean of {len(lines)}", *means]])
@@ -258,6 +274,8 @@ TABLES: dict[str, Callable[[Mapping[str, Entry]], str]] = {
     "variance": variance,
     "throughput": throughput,
     "parsimony": parsimony,
+    "media20": in_media,
+    "media_charts": charts,
     "multiview": multiview,
 }
 """What makes each table, by the part that it is of."""

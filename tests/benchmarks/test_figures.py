@@ -77,6 +77,15 @@ def test_ratios_and_means_of_the_table(results):
     assert table[5] == "| geometric mean of 3 | 1.04 (1.04) | 0.40 (0.40) |"
 
 
+def test_ratios_in_media_are_to_volpath(results):
+    rows = compared(2.0, 1.0, 0.04)
+    for row in rows[:2]:
+        row["method"] = f"vol{row['method']}"
+    table = results.in_media({"fog": entry("compare", rows)}).splitlines()
+    assert table[0].startswith("| 20 s, in media | `multijitter` over `independent` | `bdpm`")
+    assert table[2] == "| `fog` | 0.50 (0.50) | 0.040 (0.040) |"
+
+
 def test_how_far_the_choice_is_behind(results):
     """A row for each time; a room is behind from a twentieth on."""
     ratios = {1: [(1.2, 0.25), (0.3, 1.0)], 20: [(1.04, 1.06)]}
@@ -118,9 +127,10 @@ def test_every_part_is_a_command(figures, module):
         options = parse(part.command.split())
         assert len(part.scenes(bundled)) in (1, 2, 5, 9), name
         assert (elsewhere[0] in part.scenes([*bundled, *elsewhere])) == (
-            name in ("compare10", "denoised10", "parsimony", "throughput")
+            name in ("compare10", "denoised10", "parsimony", "throughput", "media20")
         )
-        for label in ("path", "bdpm_auto") if hasattr(options, "denoise") else ():
+        path = "volpath" if part.own else "path"
+        for label in (path, "bdpm_auto") if hasattr(options, "denoise") else ():
             assert label in [method.label for method in options.integrators]
     assert [path.stem for path in figures.PARTS["charts"].scenes(bundled)] == ["caustics", "door"]
 
