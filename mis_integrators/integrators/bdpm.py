@@ -27,7 +27,7 @@ from ..photons.trace import trace_light_paths
 from ..photons.volume import VolumeMap, build_volume_map
 from ..pilot.direct_paths import MOST_PATHS
 from ..pilot.run import PILOT_INDEX
-from ..pilot.setting import LIGHT_SHARES, PilotSetting, pilot_light_paths
+from ..pilot.setting import PilotSetting, light_shares, pilot_light_paths
 from .caustic_radii import CausticRadii
 from .common import MOST_LIGHT_PATHS, IterativeIntegrator
 from .direct_light import DirectLight
@@ -287,7 +287,9 @@ class BDPMSession(PilotedSession):
             self.seconds,
             self.iteration_light_paths / self.light_path_count,
             integrator.denoised,
-            LIGHT_SHARES if self.chooses_light_paths and not integrator.photon_count else (1.0,),
+            light_shares(self.iteration_light_paths)
+            if self.chooses_light_paths and not integrator.photon_count
+            else (1.0,),
         )
 
     def pilot_passes(self, setting, pixels):

@@ -21,6 +21,8 @@ NEIGHBOURS = 16
 """Tuned: pilot pixels that are expected to look alike."""
 LIGHT_SHARES = tuple(2.0**-k for k in range(6))
 """Of the light sub-paths, what an iteration may do with. (1/16 and 1/32 differ little in error.)"""
+FEWEST_LIGHT_PATHS = 1 << 12
+"""Tuned: ... but not with fewer than so many: an iteration of fewer takes no less time."""
 UNPLANNED_ITERATIONS = 64
 """Tuned: iterations that a render without a planned end is taken to have."""
 
@@ -70,6 +72,13 @@ class PilotSetting:
 def pilot_light_paths(count: int) -> int:
     """Light sub-paths of a pilot's iteration for a render with so many."""
     return count if count <= 2 * PILOT_LIGHT_PATHS else PILOT_LIGHT_PATHS
+
+
+def light_shares(count: int) -> tuple[float, ...]:
+    """The `LIGHT_SHARES` of so many light sub-paths that an iteration may do with."""
+    return tuple(
+        share for share in LIGHT_SHARES if share == 1 or share * count >= FEWEST_LIGHT_PATHS
+    )
 
 
 @dataclass(frozen=True)

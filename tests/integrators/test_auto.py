@@ -317,20 +317,21 @@ def test_a_photon_mapper_that_loses_renders_nothing(rgb, monkeypatch):
 
 
 def test_a_photon_mapper_that_wins_is_timed(rgb, monkeypatch):
-    """What it has rendered for that is the image's, too; then it knows what an iteration takes, and
-    how many there will be."""
+    """What it has rendered for that is the image's, too, unless another choice has followed. Then
+    it knows what an iteration takes, and how many there will be."""
     set_price_of_path(monkeypatch, 1e4)
     session = auto().session(tray("lambertian", "rectangle"))
     assert session.seconds_of_next == math.inf
     session.plan_time(5.0)
     session.start()
-    assert session.decision.plugin == "bdpm" and session.seconds_of_next == 0
     photons = session.decision.session
     ready = len(photons.kept)
+    assert session.decision.plugin == "bdpm" and ready <= 2
+    assert (session.seconds_of_next == 0) == (ready > 0)
     for _ in range(ready):
         session.iterate()
     each = session.seconds_of_next
-    assert 0 < each < 5.0 and ready in (1, 2)
+    assert 0 < each < 5.0
     assert 0 < photons.prediction.iterations * each < 5.0
 
 

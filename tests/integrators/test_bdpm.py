@@ -1284,10 +1284,11 @@ def test_timed_iterations_are_of_the_radii_rendered_with(rgb, monkeypatch, chang
     assert not timed.kept
 
 
-def test_fewer_light_sub_paths_where_they_pay(rgb):
+def test_fewer_light_sub_paths_where_they_pay(rgb, monkeypatch):
     """Paths that gather at their second vertex make more noise than photons do. What gathers at the
     first has no other noise, weights are made for the photons there are, and a number that is given
     is given. Another session needs no pilot to render the same."""
+    monkeypatch.setattr("mis_integrators.pilot.setting.FEWEST_LIGHT_PATHS", 1)
     scene = box_scene()
     pixels = 32 * 32
     for plugin, parameters in (

@@ -109,3 +109,12 @@ def test_an_iteration_fits_into_the_time():
     assert result.choose(0.01).light_share == LIGHT_SHARES[-1]
     late = result._choose(1.0, 0.01, None, 0.0)
     assert result.choose(0.01, late, reluctance=1.0).light_share == 1
+
+
+def test_few_light_paths_are_not_made_fewer():
+    """An iteration of fewer than `FEWEST_LIGHT_PATHS` takes no less time."""
+    from mis_integrators.pilot.setting import FEWEST_LIGHT_PATHS, light_shares
+
+    assert light_shares(100) == light_shares(FEWEST_LIGHT_PATHS) == (1.0,)
+    assert light_shares(4 * FEWEST_LIGHT_PATHS) == (1.0, 0.5, 0.25)
+    assert light_shares(1280 * 720) == LIGHT_SHARES
