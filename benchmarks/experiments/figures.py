@@ -65,6 +65,11 @@ class Part:
 
 
 _EFFORT = ("method", "size", "seeds", "samples_per_pixel", "seconds", "first", "settings")
+_ERRORS = (
+    *_EFFORT,
+    *("relMSE", "MSE", "FLIP", "artefacts", "relMSE / best path", "MSE / best path"),
+)
+_FRONT = ("method", "seconds", "relMSE", "relMSE trimmed", "on the front")
 _CANDIDATES = "path path:sampler=multijitter bdpm:bdd=0 bdpm_opt2 bdpm_opt3 bdpm_auto"
 _ROOMS = "--rooms 6 --times 1 5 20 --integrators path path:sampler=multijitter bdpm:bdd=0 bdpm_auto"
 
@@ -72,7 +77,7 @@ PARTS = {
     "compare10": Part(
         f"compare --time 10 --seeds 1 --integrators {_CANDIDATES}",
         "compare",
-        (*_EFFORT, "relMSE", "MSE", "FLIP", "artefacts", "relMSE / best path", "MSE / best path"),
+        _ERRORS,
     ),
     "denoised10": Part(
         "compare --denoise --time 10 --seeds 1 --integrators path path:sampler=multijitter"
@@ -122,7 +127,7 @@ PARTS = {
         "converge --time 1.5 --seeds 2 --snapshots 5 --integrators path path:sampler=multijitter"
         " ptracer bdpm:bdd=0 bdpm_opt3 bdpm_auto bdpt vcm",
         "converge",
-        ("method", "seconds", "relMSE", "relMSE trimmed", "on the front"),
+        _FRONT,
         bundled=("caustics", "door"),
         elsewhere=False,
         pictures={
@@ -167,14 +172,14 @@ PARTS = {
         "compare --time 20 --seeds 1 --reference-method bdpt --integrators volpath"
         " volpath:sampler=multijitter bdpt bdpm:bdd=0 bdpm_auto",
         "compare",
-        (*_EFFORT, "relMSE", "MSE", "FLIP", "artefacts", "relMSE / best path", "MSE / best path"),
+        _ERRORS,
         own=MEDIA,
     ),
     "media_charts": Part(
         "converge --time 5 --seeds 1 --snapshots 5 --reference-method bdpt --integrators volpath"
         " volpath:sampler=multijitter bdpt bdpm:bdd=0 bdpm_auto",
         "converge",
-        ("method", "seconds", "relMSE", "relMSE trimmed", "on the front"),
+        _FRONT,
         own=MEDIA,
         elsewhere=False,
         pictures={

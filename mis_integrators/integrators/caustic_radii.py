@@ -15,7 +15,7 @@ PASS_SHARE = 1 / 16
 """Tuned: light passes that tell of the light around, for each iteration of the render."""
 MOST_PASSES = 16
 """Light passes at most; there is one at least."""
-LARGEST_SHARE = 1 / 4
+WIDEST_SHARE = 1 / 4
 """Tuned: the largest radius, in units of the scene's extent over the square root of three: what of
 a disk lies beyond the surfaces is lost."""
 PURPOSE = 5
@@ -61,7 +61,7 @@ class CausticRadii:
                     mean_flux(power, count) / QUANTA,
                     self.iterations / passes,
                     session.light_path_count * passes,
-                    LARGEST_SHARE * float(dr.norm(session.traits.bounds.extents())) / 3**0.5,
+                    WIDEST_SHARE * session.extent / 3**0.5,
                 )
             around.add(surface, power, count)
         return around

@@ -22,7 +22,7 @@ NEIGHBOURS = 16
 LIGHT_SHARES = tuple(2.0**-k for k in range(6))
 """Of the light sub-paths, what an iteration may do with. (1/16 and 1/32 differ little in error.)"""
 FEWEST_LIGHT_PATHS = 1 << 12
-"""Tuned: ... but not with fewer than so many: an iteration of fewer takes no less time."""
+"""Tuned: light sub-paths that a share leaves at least: fewer take no less time."""
 UNPLANNED_ITERATIONS = 64
 """Tuned: iterations that a render without a planned end is taken to have."""
 
