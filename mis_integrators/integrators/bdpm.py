@@ -222,13 +222,13 @@ class BDPMSession(PilotedSession):
             (integrator.bdd == 0 and self.narrow is None) or not self.has_caustics
         )
         self.split_paths(CHUNK_IN_MEDIA if self.has_volume else CAMERA_CHUNK)
+        self._left_by_a_path = 0.0, 0.0  # photons on surfaces and in media, in the last light pass
         self._make_room_for_photons()
         self.beam_capacity = self._beam_room(self.chunk)
         self.vertex_capacity = self._vertex_room(self.chunk)
         if integrator.initial_radius:
             self.radii = dict.fromkeys(self.kinds(), integrator.initial_radius)
         self.corrected = dict.fromkeys(self.kinds(), False)
-        self.photons_a_path = 0.0  # those that a light sub-path left, in the last light pass
         self.recorded = recorder()
         self.direct_light = DirectLight(self)
         self.caustic_radii = CausticRadii(self)
@@ -266,9 +266,20 @@ class BDPMSession(PilotedSession):
         ]
 
     def _make_room_for_photons(self):
-        self.photon_capacity = rounded_up(3 * self.light_path_count)
-        self.volume_capacity = self.photon_capacity if self.traits.has_media else 0
-        self._sized = False
+        """By the last light pass; before the first one, for three photons a path."""
+        self._sized = self.photons_a_path > 0
+        on_surfaces, in_media = self._left_by_a_path if self._sized else (3.0, 3.0)
+        self.photon_capacity = self._photon_room(on_surfaces)
+        self.volume_capacity = self._photon_room(in_media) if self.traits.has_media else 0
+
+    def _photon_room(self, a_path):
+        """Room for so many photons `a_path`, with an eighth and some more."""
+        return rounded_up(math.ceil(a_path * self.light_path_count * 9 / 8) + 1024)
+
+    @property
+    def photons_a_path(self):
+        """Those that a light sub-path left, in the last light pass."""
+        return sum(self._left_by_a_path)
 
     def _record_camera_pass(self):
         self._camera_pass = self.recorded(self._render_chunk)
@@ -621,12 +632,12 @@ class BDPMSession(PilotedSession):
             dr.eval(photons)
             found = int(photons[2][0])
             in_media = int(photons[-1][2][0]) if self.traits.has_media else 0
-            self.photons_a_path = (found + in_media) / self.light_path_count
+            self._left_by_a_path = found / self.light_path_count, in_media / self.light_path_count
             if in_media > self.volume_capacity:
-                self.volume_capacity = rounded_up(in_media + in_media // 8)
+                self.volume_capacity = self._photon_room(self._left_by_a_path[1])
                 self._freeze()
                 continue
-            room = rounded_up(found + found // 8 + 1024)
+            room = self._photon_room(self._left_by_a_path[0])
             spare = self.photon_capacity - 2 * room
             if found <= self.photon_capacity and (self._sized or spare < SPARE_PHOTONS):
                 return photons

@@ -11,7 +11,7 @@ from .radius import LARGEST_SHARE, ladder, ladder_from
 from .result import PilotResult, PilotSamples, measure
 from .setting import PilotPixels, PilotSetting
 
-FEWEST_ITERATIONS, MOST_ITERATIONS = 4, 16
+FEWEST_ITERATIONS, MOST_ITERATIONS = 3, 16
 """Tuned: iterations of a pilot: the fewest, and the most."""
 PILOT_TIME_SHARE = 0.04
 """Tuned: share of the planned iterations, or seconds, that the pilot may have once it has the

@@ -12,8 +12,8 @@ from .denoiser import GROUPS
 PILOT_PATHS = 4096
 """Tuned: camera paths of a pilot's iteration, about."""
 PILOT_LIGHT_PATHS = 1 << 17
-"""Light sub-paths of a pilot's iteration, where the render's have more than twice as many: what
-more of them would tell follows from these."""
+"""Light sub-paths of a pilot's iteration at most: what more of them would tell follows from
+these."""
 MOST_CAMERA_PATHS = 16
 """Camera paths of a pixel: more of them change little of an iteration's noise, which is then that
 of photons."""
@@ -22,7 +22,8 @@ NEIGHBOURS = 16
 LIGHT_SHARES = tuple(2.0**-k for k in range(6))
 """Of the light sub-paths, what an iteration may do with. (1/16 and 1/32 differ little in error.)"""
 FEWEST_LIGHT_PATHS = 1 << 12
-"""Tuned: light sub-paths that a share leaves at least: fewer take no less time."""
+"""Tuned: light sub-paths that a share leaves at least, and a pilot has: fewer take no less
+time."""
 UNPLANNED_ITERATIONS = 64
 """Tuned: iterations that a render without a planned end is taken to have."""
 
@@ -70,8 +71,9 @@ class PilotSetting:
 
 
 def pilot_light_paths(count: int) -> int:
-    """Light sub-paths of a pilot's iteration for a render with so many."""
-    return count if count <= 2 * PILOT_LIGHT_PATHS else PILOT_LIGHT_PATHS
+    """Light sub-paths of a pilot's iteration for a render with so many: half of them, if these are
+    not too few or too many."""
+    return min(max(count // 2, FEWEST_LIGHT_PATHS), PILOT_LIGHT_PATHS, count)
 
 
 def light_shares(count: int) -> tuple[float, ...]:
