@@ -134,16 +134,17 @@ def unfinite_data(scene):
 class SceneTraits:
     """What a scene is made of.
 
-    Attributes: `bounds` (bounding box), `has_delta` (perfectly specular or null scattering
-    somewhere), `has_mixed` (BSDFs with both a smooth and a delta part), `has_rough` (smooth
-    scattering that is not Lambertian), `has_lambertian`, `has_perturbed` (bump or normal maps),
-    `has_light_surfaces` (emitters that a ray can meet: area lights, environments), `lambertian`,
-    `perturbed` (registry tables for BSDF pointers), `has_media`, and with media those of
-    `MediaTraits`.
+    Attributes: `bounds` (bounding box), `extent` (its diagonal), `has_delta` (perfectly specular or
+    null scattering somewhere), `has_mixed` (BSDFs with both a smooth and a delta part), `has_rough`
+    (smooth scattering that is not Lambertian), `has_lambertian`, `has_perturbed` (bump or normal
+    maps), `has_light_surfaces` (emitters that a ray can meet: area lights, environments),
+    `lambertian`, `perturbed` (registry tables for BSDF pointers), `has_media`, and with media those
+    of `MediaTraits`.
     """
 
     def __init__(self, scene, sensor=None):
         self.bounds = scene_bounds(scene)
+        self.extent = float(dr.norm(self.bounds.extents()))
         flag = mi.BSDFFlags
         bsdfs = used_bsdfs(scene)
         flags = [b.flags() for b in bsdfs]

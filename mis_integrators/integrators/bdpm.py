@@ -284,17 +284,12 @@ class BDPMSession(PilotedSession):
     def _record_camera_pass(self):
         self._camera_pass = self.recorded(self._render_chunk)
 
-    @property
-    def extent(self):
-        """The diagonal of the scene's bounds."""
-        return float(dr.norm(self.traits.bounds.extents()))
-
     def pilot_setting(self):
         integrator = self.integrator
         return PilotSetting(
             film_size(self.sensor)[0],
             film_sample_count(self.sensor),
-            self.extent,
+            self.traits.extent,
             tuple(self.kinds()),
             integrator.bdd == 0,
             self.narrow is not None,

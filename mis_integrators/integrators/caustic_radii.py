@@ -61,7 +61,7 @@ class CausticRadii:
                     mean_flux(power, count) / QUANTA,
                     self.iterations / passes,
                     session.light_path_count * passes,
-                    WIDEST_SHARE * session.extent / 3**0.5,
+                    WIDEST_SHARE * session.traits.extent / 3**0.5,
                 )
             around.add(surface, power, count)
         return around

@@ -15,6 +15,7 @@ from ..paths.subpaths import on_surfaces, read_vertices
 from ..paths.vertex import in_medium
 from ..photons.gather import KeptVertices, gather_photons
 from ..photons.vertex_map import state_of, vertex_map
+from ..pilot.result import RADIUS_WITHOUT_VERTICES
 from ..pilot.run import PILOT_INDEX
 from .bdpt import BDPT, CAMERA, BDPTSession
 from .common import MOST_LIGHT_PATHS
@@ -141,7 +142,7 @@ class VCMSession(BDPTSession):
         """A share of the spread of the vertices on surfaces that camera paths meet first: the
         diagonal, over the root of three, of the box that leaves out 2 % of them at either end of
         each axis. Of the scene's bounds where they meet none."""
-        self.radius = 1e-3 * float(dr.norm(self.traits.bounds.extents()))
+        self.radius = RADIUS_WITHOUT_VERTICES * self.traits.extent
         if not self.bidirectional:
             return
         spectral = {**spectral, "radius": dr.opaque(mi.Float, self.radius)}
