@@ -699,6 +699,32 @@ def test_pilots_find_the_room_that_vertices_need(rgb):
     assert session.vertex_capacity == room > 11
 
 
+def test_pilots_find_the_room_that_photons_need(rgb, monkeypatch):
+    """Light sub-paths leave more photons than were expected before the first pass: it is recorded
+    anew once for the pilot, but not for the render, which has twice as many."""
+    session = bdpm(bdd=0, initial_radius=0.0, photon_count=16384).session(
+        box_scene(), seed=1, spp=32
+    )
+    kind = type(session)
+    monkeypatch.setattr(kind, "_photon_room", small_first(kind._photon_room))
+    session._make_room_for_photons()
+    recorded, trace = [], kind._trace_light
+    monkeypatch.setattr(
+        kind,
+        "_trace_light",
+        lambda *arguments: recorded.append(arguments[0].light_path_count) or trace(*arguments),
+    )
+    session._freeze()
+    for _ in range(4):
+        session.iterate()
+    assert recorded == [8192, 8192, 16384]
+
+
+def small_first(room):
+    """`_photon_room`, but for a hundredth of the three photons a path that are expected first."""
+    return lambda session, a_path: room(session, a_path / 100 if a_path == 3 else a_path)
+
+
 @pytest.mark.parametrize("chunk", [333, *extended(1024)])
 def test_camera_pass_in_parts(rgb, monkeypatch, chunk):
     scene = glossy_box()
