@@ -105,6 +105,11 @@ def rounded_up(count):
     return -(-count // step) * step
 
 
+def with_reserve(count):
+    """The size of a buffer for what was so many: an eighth more, `rounded_up`."""
+    return rounded_up(count + count // 8)
+
+
 ALIGNMENT = 64
 """Bytes."""
 

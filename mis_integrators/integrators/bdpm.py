@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.film import splat_samples
-from ..core.packing import rounded_up
+from ..core.packing import with_reserve
 from ..core.recording import recorder
 from ..core.traits import SceneTraits, lookup
 from ..lights.lights import Lights
@@ -274,7 +274,7 @@ class BDPMSession(PilotedSession):
 
     def _photon_room(self, a_path):
         """Room for so many photons `a_path`, with an eighth and some more."""
-        return rounded_up(math.ceil(a_path * self.light_path_count * 9 / 8) + 1024)
+        return with_reserve(math.ceil(a_path * self.light_path_count) + 1024)
 
     @property
     def photons_a_path(self):
@@ -387,7 +387,7 @@ class BDPMSession(PilotedSession):
 
     def _room_for(self, found, paths):
         """Room in a chunk for what so many `paths` had, and an eighth more."""
-        return rounded_up(math.ceil(found / paths * self.chunk * 9 / 8))
+        return with_reserve(math.ceil(found / paths * self.chunk))
 
     # ------------------------------------------------------------------ passes
 
@@ -665,9 +665,9 @@ class BDPMSession(PilotedSession):
                 if not radii or (wanted <= self.vertex_capacity and beams <= self.beam_capacity):
                     return (block,)
                 if wanted > self.vertex_capacity:
-                    self.vertex_capacity = rounded_up(wanted + wanted // 8)
+                    self.vertex_capacity = with_reserve(wanted)
                 if beams > self.beam_capacity:
-                    self.beam_capacity = rounded_up(beams + beams // 8)
+                    self.beam_capacity = with_reserve(beams)
                 self._freeze()
 
         (block,) = self.sum_of_chunks(render)

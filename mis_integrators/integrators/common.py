@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.film import Accumulator, direct_channels, shared_wavelengths, variance_channels
-from ..core.packing import rounded_up
+from ..core.packing import with_reserve
 from ..core.random import mix, reversed_bits
 from ..core.recording import settle
 from ..core.render_lock import RENDER_LOCK, under_render_lock
@@ -505,7 +505,7 @@ class IterativeSession:
         found = int(count[0])
         if found <= self.capacity[name]:
             return False
-        self.capacity[name] = rounded_up(found + found // 8)
+        self.capacity[name] = with_reserve(found)
         self._freeze(name)
         return True
 

@@ -11,7 +11,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.film import splat_samples
-from ..core.packing import rounded_up
+from ..core.packing import rounded_up, with_reserve
 from ..core.recording import no_garbage_collection
 from ..mis.published_optimal import FrozenMap, Limits, ThreeStrategies, TwoStrategies, typical_flux
 from ..photons.chains import NONE, PhotonChains, trace_camera_chains, trace_photon_chains
@@ -61,7 +61,7 @@ class PublishedSession(BDPMSession):
             found = int(chains.count[0])
             if found <= capacity:
                 return chains
-            capacity = rounded_up(found + found // 8)
+            capacity = with_reserve(found)
 
     def _learn(self):
         """One light pass, frozen, the first time that it is asked for: for the weights only. Its
@@ -142,7 +142,7 @@ class PublishedSession(BDPMSession):
             wanted = int(dr.max(chains.count)[0])
             if wanted <= capacity:
                 break
-            capacity = rounded_up(wanted + wanted // 8)
+            capacity = with_reserve(wanted)
         gathered, direct = light.gather(chains, self.chunk, sequence.own_seed())
         radiance += direct + (gathered if beyond is None else gathered * beyond)
         if integrator.hide_emitters:

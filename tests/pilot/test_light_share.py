@@ -4,7 +4,13 @@ from mis_integrators.pilot.cost import CAMERA_SHARE
 from mis_integrators.pilot.denoiser import LEFT
 from mis_integrators.pilot.noise import noise_by_radius
 from mis_integrators.pilot.result import PilotSamples, measure
-from mis_integrators.pilot.setting import LIGHT_SHARES, PilotSetting, pilot_pixels
+from mis_integrators.pilot.setting import (
+    FEWEST_LIGHT_PATHS,
+    LIGHT_SHARES,
+    PilotSetting,
+    light_shares,
+    pilot_pixels,
+)
 
 import numpy as np
 import pytest
@@ -113,8 +119,6 @@ def test_an_iteration_fits_into_the_time():
 
 def test_few_light_paths_are_not_made_fewer():
     """An iteration of fewer than `FEWEST_LIGHT_PATHS` takes no less time."""
-    from mis_integrators.pilot.setting import FEWEST_LIGHT_PATHS, light_shares
-
     assert light_shares(100) == light_shares(FEWEST_LIGHT_PATHS) == (1.0,)
     assert light_shares(4 * FEWEST_LIGHT_PATHS) == (1.0, 0.5, 0.25)
     assert light_shares(1280 * 720) == LIGHT_SHARES
