@@ -25,7 +25,9 @@ from ..photons.queries import Queries, read_queries, trace_camera_paths
 from ..photons.tiers import TieredMap, build_tiered_map, gather_tiers
 from ..photons.trace import trace_light_paths
 from ..photons.volume import VolumeMap, build_volume_map
+from ..photons.volume_radii import VolumeDensity
 from ..pilot.direct_paths import MOST_PATHS
+from ..pilot.radius import LARGEST_SHARE
 from ..pilot.run import PILOT_INDEX
 from ..pilot.setting import PilotSetting, light_shares, pilot_light_paths
 from .caustic_radii import CausticRadii
@@ -192,6 +194,8 @@ class BDPMSession(PilotedSession):
     know of it before they are made.)"""
     widens_caustics = True
     """Whether caustic photons have radii of their own where the radius is automatic."""
+    narrows_volume = True
+    """Whether volume photons have. (Weights know one radius for all.)"""
 
     def __init__(self, integrator, scene, sensor, seed, iterations):
         super().__init__(integrator, scene, sensor, seed, iterations)
@@ -232,6 +236,7 @@ class BDPMSession(PilotedSession):
         self.recorded = recorder()
         self.direct_light = DirectLight(self)
         self.caustic_radii = CausticRadii(self)
+        self._volume_density = None
         self._freeze()
 
     @property
@@ -315,6 +320,20 @@ class BDPMSession(PilotedSession):
         self._use_light_paths(self.iteration_light_paths)
         return pilot
 
+    def volume_density(self):
+        """The `VolumeDensity` of the first light pass of a pilot, measured when it is first asked
+        for; None where all volume photons have the same radius."""
+        differ = self.has_volume and self.narrows_volume and not self.integrator.initial_radius
+        if differ and self._volume_density is None:
+            count = self.light_path_count
+            self._use_light_paths(pilot_light_paths(self.iteration_light_paths))
+            in_media = self.trace_photons(PILOT_INDEX, LIGHT)[-1]
+            self._volume_density = VolumeDensity.of(
+                *in_media[:3], LARGEST_SHARE * self.traits.extent / 3**0.5
+            )
+            self._use_light_paths(count)
+        return self._volume_density
+
     def photons_of_a_path(self):
         """How many photons a light sub-path leaves, on average: by the light pass of a pilot."""
         self._use_light_paths(pilot_light_paths(self.iteration_light_paths))
@@ -351,6 +370,7 @@ class BDPMSession(PilotedSession):
 
     def _prepare(self):
         self.caustic_radii.find()
+        self.volume_density()
 
     @property
     def learned(self):
@@ -515,13 +535,13 @@ class BDPMSession(PilotedSession):
         )
         return total
 
-    def _map(self, photons, kind, radius):
+    def _map(self, photons, kind, radius, density):
+        """The map of photons of a kind; `density`: that of volume photons."""
         if self.traits.has_media:
             *photons, in_media = photons
             if kind == "volume":
-                place, power, count, *mis_words = in_media
                 return build_volume_map(
-                    place, power, count, radius, self.volume_capacity, *mis_words
+                    *in_media[:3], radius, self.volume_capacity, *in_media[3:], density=density
                 )
         mis_words = photons[3] if kind == "indirect" and len(photons) > 3 else None
         return build_photon_map(
@@ -541,13 +561,13 @@ class BDPMSession(PilotedSession):
             return TieredMap(arrays, self.traits.bounds, self.photon_capacity)
         return PhotonMap.with_grid(arrays, self.traits.bounds, radius, self.photon_capacity)
 
-    def _build_maps(self, photons, radii, around):
+    def _build_maps(self, photons, radii, around, density):
         maps = {}
         for kind, radius in radii.items():
             if kind == "caustic" and around is not None:
                 photon_map = self._tiered_map(photons, radius, around)
             else:
-                photon_map = self._map(photons, kind, radius)
+                photon_map = self._map(photons, kind, radius, density)
             maps[kind] = photon_map.arrays()
         return maps
 
@@ -644,9 +664,9 @@ class BDPMSession(PilotedSession):
         radii = self.radii_at(iteration)
         spectral = self._spectral(iteration)
         # Before any pass is looked up: they may have to be recorded anew.
-        around = self.caustic_radii.find()
+        around, density = self.caustic_radii.find(), self.volume_density()
         photons = self._photons(iteration, spectral) if radii else None
-        maps = self._map_pass(photons, radii, around) if radii else None
+        maps = self._map_pass(photons, radii, around, density) if radii else None
 
         def render(chunk, first):
             while True:

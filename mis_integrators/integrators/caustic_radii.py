@@ -3,12 +3,9 @@ own tell."""
 
 from __future__ import annotations
 
-import math
-
-import drjit as dr
-import mitsuba as mi
-
-from ..photons.light_around import QUANTA, LightAround, flux_of
+from ..photons.grid import read_photons
+from ..photons.light_around import LightAround
+from ..photons.light_cells import flux_of, quantum_of
 from ..photons.photon import power_layout
 
 PASS_SHARE = 1 / 16
@@ -58,19 +55,11 @@ class CausticRadii:
             if around is None:
                 around = LightAround.empty(
                     session.radii["caustic"],
-                    mean_flux(power, count) / QUANTA,
+                    quantum_of(power, count),
                     self.iterations / passes,
                     session.light_path_count * passes,
                     WIDEST_SHARE * session.traits.extent / 3**0.5,
                 )
-            around.add(surface, power, count)
+            record, active = read_photons(surface, count, power_layout().capacity(power))
+            around.cells.add(record["p"], flux_of(power, active), active)
         return around
-
-
-def mean_flux(power, count):
-    """Of photons (as of `trace_light_paths`), to the next lower power of two: a sum of floats
-    depends on their order a little. 1 where there are none."""
-    index = dr.arange(mi.UInt32, power_layout().capacity(power))
-    total = float(dr.sum(flux_of(power, index < count))[0])
-    mean = total / max(int(count[0]), 1)
-    return 2.0 ** math.floor(math.log2(mean)) if 0 < mean < math.inf else 1.0

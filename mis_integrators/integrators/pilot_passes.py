@@ -23,6 +23,7 @@ class SubsetPasses:
 
     def __init__(self, session, setting, pixels, purpose):
         self.session, self.setting, self.pixels, self.purpose = session, setting, pixels, purpose
+        self.density = session.volume_density()
         room = session._vertex_room(pixels.paths) * (1 if session.one_vertex else 4)
         self._record_camera(room, 4 * session._beam_room(pixels.paths))
         self._record_gather()
@@ -62,9 +63,9 @@ class SubsetPasses:
         session = self.session
         self.photon_capacity = session.photon_capacity, session.volume_capacity
         self._gather = session.recorded(
-            lambda scene, tables, photons, vertices, radii, spectral: {
+            lambda scene, tables, photons, density, vertices, radii, spectral: {
                 kind: session._gather(
-                    session._map(photons, kind, radii[kind][-1]),
+                    session._map(photons, kind, radii[kind][-1], density),
                     vertices,
                     kind,
                     radii[kind],
@@ -110,7 +111,9 @@ class SubsetPasses:
             kind: [dr.opaque(mi.Float, float(radius)) for radius in ladder]
             for kind, ladder in radii.items()
         }
-        gathered = self._gather(session.scene, session._tables, photons, vertices, radii, spectral)
+        gathered = self._gather(
+            session.scene, session._tables, photons, self.density, vertices, radii, spectral
+        )
         for kind, values in gathered.items():
             for corrected in self.setting.corrections(kind):
                 if corrected:
@@ -132,7 +135,7 @@ class SubsetPasses:
     def mean_photon_count(self, photons, vertices, kind, radius):
         """Photons of a kind within `radius` of a vertex, or of a path's beams, on average."""
         radius = dr.opaque(mi.Float, radius)
-        photon_map = self.session._map(photons, kind, radius)
+        photon_map = self.session._map(photons, kind, radius, self.density)
         if kind == "volume":
             beams = Beams.read(vertices["beams"], self.session._spectral(0)["wavelengths"])
             return mean_count_along(photon_map, beams, radius, self.pixels.paths)

@@ -248,7 +248,8 @@ def gather_along(
 ):
     """Radiance that volume photons bring to camera paths along beams, for each radius of a list:
     the sum over photons of phase function x flux x transmittance to the beam's beginning, over
-    (pi radius^2 x light sub-paths) (Jarosz et al. 2008, with a constant kernel).
+    (pi radius^2 x light sub-paths) (Jarosz et al. 2008, with a constant kernel). The radius is the
+    photon's own share of that of the list.
 
     Parameters and result are those of `gather.gather_photons`, but for ``weigh(index, pdf,
     active)``: the weight (a number) of a photon to which camera paths would go on with density
@@ -278,8 +279,9 @@ def gather_along(
             alone = (landing.depth == 1) & beams.first
             smooth = dr.select(alone, mi.UInt32(1), mi.UInt32(2))
             values = by_class(class_of(smooth, delta_at_light), value)
-        inside = [hit & (distance_squared < dr.square(radius)) for radius in radii]
-        found = [dr.select(i, value, 0) for i in inside for value in values]
+        share = dr.square(landing.share)
+        inside = [hit & (distance_squared < dr.square(radius) * share) for radius in radii]
+        found = [dr.select(i, value / share, 0) for i in inside for value in values]
         return tuple(total + value for total, value in zip(totals, found))
 
     sums = [radius for radius in radii for _ in range(len(CLASSES) if split else 1)]
@@ -292,8 +294,8 @@ def gather_along(
 
 
 def mean_count_along(photon_map, beams, radius, paths):
-    """Photons within `radius` of the beams of a camera path that count there, on average over
-    `paths` of them (a number)."""
+    """Photons within `radius` of the beams of a camera path that a query has to look at, on average
+    over `paths` of them (a number)."""
     query = BeamQuery(photon_map, beams, radius)
     (count,) = visit_hits(
         query,

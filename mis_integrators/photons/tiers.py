@@ -20,7 +20,8 @@ from .grid import (
     read_photons,
     sorted_photons,
 )
-from .light_around import TIERS, flux_of, tier_radius
+from .light_around import TIERS
+from .light_cells import flux_of, tier_radius
 from .photon import landing_of
 
 AT_NARROW_LOBES = 2.0

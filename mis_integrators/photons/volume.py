@@ -15,6 +15,7 @@ import mitsuba as mi
 from ..core.packing import DEPTH_BITS, MAX_DEPTH, pack_direction, with_mark
 from ..core.records import Layout
 from .grid import Grid, Table, sort_by_cell
+from .light_cells import flux_of
 from .photon import power_layout
 
 Array = Any
@@ -24,42 +25,63 @@ CELL = 2.0
 
 
 def place_layout():
-    """Position `p`; `word`: depth, kind and medium, as of `pack_place`."""
+    """Position `p`; `word`: depth, kind, medium and share of the radius, as of `pack_place`."""
     return Layout({"p": mi.Point3f, "word": mi.UInt32})
 
 
 CAUSTIC = 1 << DEPTH_BITS
 """Bit of a photon's word that says of which kind it is."""
+MEDIUM_SHIFT, MOST_MEDIA = DEPTH_BITS + 1, (1 << 16) - 1
+SHARE_SHIFT, SHARE_STEPS = DEPTH_BITS + 17, 4
+"""Where the share of the radius is in a word; steps for each halving of it."""
+LEAST_SHARE = 1 / 32
+"""Tuned: of the radius, what a photon has at least."""
 
 
 def pack_place(depth, caustic, medium):
     """A path depth (saturated at `MAX_DEPTH`), the photon's kind (caustic or not), and the number
-    of a medium in 22 bits."""
-    word = dr.minimum(depth, MAX_DEPTH) | (number_of_medium(medium) << (DEPTH_BITS + 1))
+    of a medium in 16 bits. The share of the radius is one."""
+    word = dr.minimum(depth, MAX_DEPTH) | (number_of_medium(medium) << MEDIUM_SHIFT)
     return word | dr.select(caustic, mi.UInt32(CAUSTIC), 0)
 
 
+def with_share(word, share):
+    """A word of `pack_place` with that share of the radius, from `LEAST_SHARE` to one, in six
+    bits."""
+    return word | (mi.UInt32(dr.round(-SHARE_STEPS * dr.log2(share))) << SHARE_SHIFT)
+
+
 def number_of_medium(medium):
-    """Dr.Jit's registry number of media (0: none)."""
-    return dr.reinterpret_array(mi.UInt32, medium)
+    """Dr.Jit's registry number of media (0: none), of which there are hardly `MOST_MEDIA`."""
+    return dr.reinterpret_array(mi.UInt32, medium) & MOST_MEDIA
 
 
 @dataclass
 class VolumeLanding:
-    """Where a volume photon was left: position, depth in segments, number of the medium, kind."""
+    """Where a volume photon was left: position, depth in segments, number of the medium, kind; and
+    its radius over that of the query."""
 
     p: mi.Point3f
     depth: mi.UInt32
     medium: mi.UInt32
     caustic: mi.Bool
+    share: mi.Float
 
 
 def read_place(place, index, active=True):
     """The `VolumeLanding` of photons `index`."""
     record = place_layout().read(place, index, active)
     word = record["word"]
-    medium = word >> (DEPTH_BITS + 1)
-    return VolumeLanding(record["p"], word & MAX_DEPTH, medium, (word & CAUSTIC) != 0)
+    medium = (word >> MEDIUM_SHIFT) & MOST_MEDIA
+    share = dr.exp2(mi.Float(word >> SHARE_SHIFT) * (-1 / SHARE_STEPS))
+    return VolumeLanding(record["p"], word & MAX_DEPTH, medium, (word & CAUSTIC) != 0, share)
+
+
+def read_places(place, count):
+    """The records of all photons of a buffer, and which of them are photons."""
+    index = dr.arange(mi.UInt32, place_layout().capacity(place))
+    active = index < dr.gather(mi.UInt32, count, 0)
+    return place_layout().read(place, index, active), active
 
 
 def new_volume_photons(capacity):
@@ -126,13 +148,16 @@ def volume_grid(box, radius, capacity):
     return Grid(box, CELL * radius, Table(capacity))
 
 
-def build_volume_map(place, power, count, radius, capacity: int, mis_words=None):
+def build_volume_map(place, power, count, radius, capacity: int, mis_words=None, density=None):
     """Sorts volume photons into a grid over the box that holds them all. `mis_words` (None: there
-    are none) stay unsorted."""
+    are none) stay unsorted. Photons have the share of the `radius` that their `density` says (a
+    `VolumeDensity`; None: all of it)."""
     index = dr.arange(mi.UInt32, capacity)
-    active = index < dr.gather(mi.UInt32, count, 0)
-    record = place_layout().read(place, index, active)
+    record, active = read_places(place, count)
     p = record["p"]
+    if density is not None:
+        share = density.share(p, flux_of(power, active), active)
+        record["word"] = with_share(record["word"], share)
     box = Box(
         mi.Point3f(*(_extreme(dr.min, x, active, dr.inf) for x in p)),
         mi.Point3f(*(_extreme(dr.max, x, active, -dr.inf) for x in p)),
