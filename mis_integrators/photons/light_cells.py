@@ -75,13 +75,17 @@ class LightCells:
     def around(self, p, tier, active):
         """Quanta in the cube around `p`."""
         corner = mi.Vector3i(dr.floor(self._local(p, tier) - 0.5))
-        total = mi.UInt32(0)
-        for number in range(8):
-            cell = corner + mi.Vector3i(number & 1, number >> 1 & 1, number >> 2)
-            place, fingerprint = self._place(cell, tier)
-            light, found = dr.gather(mi.Vector2u, self.words, place, active)
-            total += dr.select(found == fingerprint, light, 0)
-        return mi.Float(total)
+        offsets = [mi.Vector3i(n & 1, n >> 1 & 1, n >> 2) for n in range(8)]
+        return mi.Float(sum(self._in_cell(corner + offset, tier, active) for offset in offsets))
+
+    def in_cell_of(self, p, tier, active):
+        """Quanta in the cell that `p` lies in."""
+        return mi.Float(self._in_cell(mi.Vector3i(dr.floor(self._local(p, tier))), tier, active))
+
+    def _in_cell(self, cell, tier, active):
+        place, fingerprint = self._place(cell, tier)
+        light, found = dr.gather(mi.Vector2u, self.words, place, active)
+        return dr.select(found == fingerprint, light, 0)
 
     def quanta(self, flux):
         """Those of a photon."""

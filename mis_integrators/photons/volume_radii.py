@@ -24,7 +24,7 @@ from .light_cells import GRIDS, LightCells, flux_of, quantum_of, tier_radius
 from .volume import LEAST_SHARE, read_places
 
 ENOUGH = 16
-"""Photons in a cube that tell of the density there."""
+"""Photons in a cell that tell of the density there."""
 
 
 @dataclass
@@ -38,10 +38,10 @@ class VolumeDensity:
     @classmethod
     def of(cls, place, power, count, largest):
         """That of the photons of a light pass (as of `trace_light_paths`). `largest`: the widest
-        cubes are so wide (a number)."""
+        cells are so wide (a number)."""
         record, active = read_places(place, count)
         p, flux = record["p"], flux_of(power, active)
-        cells = LightCells.empty(largest / 2**GRIDS, quantum_of(power, count), int(count[0]))
+        cells = LightCells.empty(largest / 2 ** (GRIDS - 1), quantum_of(power, count), int(count[0]))
         cells.add(p, flux, active)
         density = cls(cells, dr.opaque(mi.Float, 1.0))
         found, light = density.at(p, flux, active), dr.select(active, flux, 0)
@@ -49,12 +49,12 @@ class VolumeDensity:
         return density
 
     def at(self, p, flux, active):
-        """Density around photons at `p`: that of the smallest cube that has `ENOUGH`, else of the
+        """Density around photons at `p`: that of the smallest cell that has `ENOUGH`, else of the
         widest."""
         own = mi.Float(self.cells.quanta(flux))
 
         def look_further(tier, found, searching):
-            found = dr.select(searching, self.cells.around(p, tier, searching), found)
+            found = dr.select(searching, self.cells.in_cell_of(p, tier, searching), found)
             searching &= (found < ENOUGH * own) & (tier < GRIDS - 1)
             return dr.select(searching, tier + 1, tier), found, searching
 
@@ -64,11 +64,13 @@ class VolumeDensity:
             look_further,
             label="density of volume photons",
         )
-        return found * dr.rcp(own * (2 * tier_radius(self.cells.radius, tier)) ** 3)
+        return found * dr.rcp(own * tier_radius(self.cells.radius, tier) ** 3)
 
     def share(self, p, flux, active):
-        """The radius of photons at `p`, over that of the sparsest ones."""
-        return dr.clip(dr.sqrt(self.median / self.at(p, flux, active)), LEAST_SHARE, 1)
+        """The radius of photons at `p`, over that of the sparsest ones; one where no density was
+        found."""
+        there = self.at(p, flux, active)
+        return dr.select(there > 0, dr.clip(dr.sqrt(self.median / there), LEAST_SHARE, 1), 1)
 
 
 def weighted_median(values, weights):

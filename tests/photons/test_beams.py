@@ -48,8 +48,8 @@ def media():
     return scene, by_id["a"], by_id["b"]
 
 
-def photon_map(points, flux, medium, radius, depth=1, caustic=False):
-    """The map of volume photons, NumPy (n, 3) and (n,)."""
+def written(points, flux, medium, depth=1, caustic=False):
+    """Volume photons, NumPy (n, 3) and (n,): both records and their number."""
     count, capacity = len(points), len(points) + 3
     place, power = new_volume_photons(capacity)
     photon = {
@@ -60,8 +60,15 @@ def photon_map(points, flux, medium, radius, depth=1, caustic=False):
         "caustic": mi.Bool(caustic),
         "medium": mi.MediumPtr(medium),
     }
-    write_volume_photon(place, power, dr.arange(mi.UInt32, count), photon, True)
-    return build_volume_map(place, power, mi.UInt32([count]), mi.Float([radius]), capacity)
+    if count:
+        write_volume_photon(place, power, dr.arange(mi.UInt32, count), photon, True)
+    return place, power, mi.UInt32([count])
+
+
+def photon_map(points, flux, medium, radius, depth=1, caustic=False):
+    """Their map."""
+    place, power, count = written(points, flux, medium, depth, caustic)
+    return build_volume_map(place, power, count, mi.Float([radius]), len(points) + 3)
 
 
 def beams(o, d, length, medium, depth=1, normal=(0, 0, 1), surface=dr.inf, bits=LONG | FIRST):
