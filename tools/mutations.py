@@ -50,6 +50,7 @@ OPTIMAL = "tests/integrators/test_weights_in_renders.py"
 ANALYTIC = "tests/integrators/test_analytic.py"
 LONG = "tests/app/test_long_renders.py"
 TIERS = "tests/photons/test_tiers.py"
+VOLUME_RADII = "tests/photons/test_volume_radii.py"
 LOBES = "tests/integrators/test_narrow_lobes.py"
 
 MUTATIONS = [
@@ -291,11 +292,25 @@ MUTATIONS = [
         TIERS,
     ),
     Mutation(
-        "photons/light_around.py",
+        "photons/light_cells.py",
         "dr.select(found == fingerprint, light, 0)",
         "light",
         "the light of other cells counts as light around",
         TIERS,
+    ),
+    Mutation(
+        "photons/volume_radii.py",
+        "dr.sqrt(self.median / there)",
+        "dr.sqrt(there / self.median)",
+        "photons that lie densely have the larger radii",
+        VOLUME_RADII,
+    ),
+    Mutation(
+        "photons/beams.py",
+        "dr.select(i, value / share, 0)",
+        "dr.select(i, value, 0)",
+        "photons of small disks bring too little light",
+        VOLUME_RADII,
     ),
     # ------------------------------------------------------------------ pilot
     Mutation(

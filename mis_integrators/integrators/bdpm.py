@@ -75,7 +75,7 @@ class BDPM(IterativeIntegrator):
        - Merge radius of the first iteration, in scene units; 0 balances noise against blur in a
          short pilot, apart for caustic and for other photons, and corrects the estimate near edges
          where that pays. Caustic photons with little light around have larger radii of their own
-         then. (Default: 0)
+         then, and volume photons that lie densely have smaller ones. (Default: 0)
      * - alpha
        - |float|
        - Radius reduction of progressive photon mapping, in (0, 1]: iteration i uses R_i^2 = R_0^2
@@ -195,7 +195,7 @@ class BDPMSession(PilotedSession):
     widens_caustics = True
     """Whether caustic photons have radii of their own where the radius is automatic."""
     narrows_volume = True
-    """Whether volume photons have. (Weights know one radius for all.)"""
+    """Whether volume photons have, too. (Weights know one radius for all.)"""
 
     def __init__(self, integrator, scene, sensor, seed, iterations):
         super().__init__(integrator, scene, sensor, seed, iterations)

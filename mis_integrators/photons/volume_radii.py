@@ -23,8 +23,8 @@ import numpy as np
 from .light_cells import GRIDS, LightCells, flux_of, quantum_of, tier_radius
 from .volume import LEAST_SHARE, read_places
 
-ENOUGH = 16
-"""Photons in a cell that tell of the density there."""
+ENOUGH = 32
+"""Tuned: photons in a cell that tell of the density there."""
 
 
 @dataclass
