@@ -41,36 +41,37 @@ class VolumeDensity:
         cells are so wide (a number)."""
         record, active = read_places(place, count)
         p, flux = record["p"], flux_of(power, active)
-        cells = LightCells.empty(largest / 2 ** (GRIDS - 1), quantum_of(power, count), int(count[0]))
+        finest = largest / 2 ** (GRIDS - 1)
+        cells = LightCells.empty(finest, quantum_of(power, count), int(count[0]))
         cells.add(p, flux, active)
-        density = cls(cells, dr.opaque(mi.Float, 1.0))
-        found, light = density.at(p, flux, active), dr.select(active, flux, 0)
-        density.median = dr.opaque(mi.Float, weighted_median(np.array(found), np.array(light)))
-        return density
-
-    def at(self, p, flux, active):
-        """Density around photons at `p`: that of the smallest cell that has `ENOUGH`, else of the
-        widest."""
-        own = mi.Float(self.cells.quanta(flux))
-
-        def look_further(tier, found, searching):
-            found = dr.select(searching, self.cells.in_cell_of(p, tier, searching), found)
-            searching &= (found < ENOUGH * own) & (tier < GRIDS - 1)
-            return dr.select(searching, tier + 1, tier), found, searching
-
-        tier, found, _ = dr.while_loop(
-            (mi.UInt32(0), mi.Float(0), mi.Bool(active)),
-            lambda tier, found, searching: searching,
-            look_further,
-            label="density of volume photons",
-        )
-        return found * dr.rcp(own * tier_radius(self.cells.radius, tier) ** 3)
+        light = dr.select(active, flux, 0)
+        median = weighted_median(np.array(density_in(cells, p, flux, active)), np.array(light))
+        return cls(cells, dr.opaque(mi.Float, median))
 
     def share(self, p, flux, active):
         """The radius of photons at `p`, over that of the sparsest ones; one where no density was
         found."""
-        there = self.at(p, flux, active)
+        there = density_in(self.cells, p, flux, active)
         return dr.select(there > 0, dr.clip(dr.sqrt(self.median / there), LEAST_SHARE, 1), 1)
+
+
+def density_in(cells, p, flux, active):
+    """Density around photons at `p`: that of the smallest cell that has `ENOUGH`, else of the
+    widest."""
+    own = mi.Float(cells.quanta(flux))
+
+    def look_further(tier, found, searching):
+        found = dr.select(searching, cells.in_cell_of(p, tier, searching), found)
+        searching &= (found < ENOUGH * own) & (tier < GRIDS - 1)
+        return dr.select(searching, tier + 1, tier), found, searching
+
+    tier, found, _ = dr.while_loop(
+        (mi.UInt32(0), mi.Float(0), mi.Bool(active)),
+        lambda tier, found, searching: searching,
+        look_further,
+        label="density of volume photons",
+    )
+    return found * dr.rcp(own * tier_radius(cells.radius, tier) ** 3)
 
 
 def weighted_median(values, weights):

@@ -300,9 +300,7 @@ def test_sessions_of_a_render_have_the_same_radii(rgb):
     other._freeze()
     for session in (one, other):
         session.iterate()
-    np.testing.assert_array_equal(
-        *(each.caustic_radii.find().cells.words for each in (one, other))
-    )
+    np.testing.assert_array_equal(*(each.caustic_radii.find().cells.words for each in (one, other)))
     np.testing.assert_allclose(one.image(), other.image(), rtol=1e-4, atol=1e-5)
     given = mi.load_dict({"type": "bdpm", "initial_radius": 0.2}).session(scene, seed=1)
     given.start()

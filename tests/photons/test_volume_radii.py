@@ -160,7 +160,9 @@ def lamp_in_fog(size=32, distance=2.0, half_width=0.5):
             "light": {"type": "point", "position": list(POINT), "intensity": 1.0},
             "sensor": {
                 **view(
-                    (0, 0, distance), size=size, fov=np.degrees(2 * np.arctan(half_width / distance))
+                    (0, 0, distance),
+                    size=size,
+                    fov=np.degrees(2 * np.arctan(half_width / distance)),
                 ),
                 "to_world": look((0, 0, distance), (0, 0, 0), (0, 1, 0)),
                 "medium": FOG,
