@@ -306,6 +306,13 @@ MUTATIONS = [
         VOLUME_RADII,
     ),
     Mutation(
+        "photons/volume.py",
+        "return VolumeMap(self.box, grid, self.start, self.place, self.power), radius, count",
+        "return VolumeMap(self.box, grid, self.start, self.place, self.power), self.radius, count",
+        "volume photons of all tiers have the radius of the first",
+        VOLUME_RADII,
+    ),
+    Mutation(
         "photons/beams.py",
         "dr.select(i, value / share, 0)",
         "dr.select(i, value, 0)",
