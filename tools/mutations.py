@@ -300,8 +300,8 @@ MUTATIONS = [
     ),
     Mutation(
         "photons/volume_radii.py",
-        "dr.sqrt(self.median / there)",
-        "dr.sqrt(there / self.median)",
+        "dr.sqrt(self.median / dr.select(dense, there, 1))",
+        "dr.sqrt(dr.select(dense, there, 1) / self.median)",
         "photons that lie densely have the larger radii",
         VOLUME_RADII,
     ),

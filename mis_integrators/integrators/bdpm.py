@@ -540,8 +540,9 @@ class BDPMSession(PilotedSession):
         )
         return total
 
-    def _map(self, photons, kind, radius, density):
-        """The map of photons of a kind; `density`: that of volume photons."""
+    def _map(self, photons, kind, radius, density=None):
+        """The map of photons of a kind; `density`: that of volume photons, by which their radii
+        differ."""
         if self.traits.has_media:
             *photons, in_media = photons
             if kind == "volume":
