@@ -300,16 +300,9 @@ MUTATIONS = [
     ),
     Mutation(
         "photons/volume_radii.py",
-        "dr.sqrt(self.median / dr.select(dense, there, 1))",
-        "dr.sqrt(dr.select(dense, there, 1) / self.median)",
+        "dr.sqrt(self.median / there)",
+        "dr.sqrt(there / self.median)",
         "photons that lie densely have the larger radii",
-        VOLUME_RADII,
-    ),
-    Mutation(
-        "photons/volume.py",
-        "return VolumeMap(self.box, grid, self.start, self.place, self.power), radius, count",
-        "return VolumeMap(self.box, grid, self.start, self.place, self.power), self.radius, count",
-        "volume photons of all tiers have the radius of the first",
         VOLUME_RADII,
     ),
     Mutation(

@@ -17,7 +17,7 @@ from ..paths.layers import CHANNELS, SPLIT
 from ..paths.light_classes import LightClasses
 from ..paths.lobes import is_narrow, narrow_bsdfs
 from ..paths.setting import World
-from ..photons.beams import Beams, gather_along, gather_tiers_along, read_beams
+from ..photons.beams import Beams, gather_along, read_beams
 from ..photons.coverage import covered_share
 from ..photons.gather import QueryVertices, gather_photons
 from ..photons.grid import PhotonMap, build_photon_map
@@ -74,8 +74,8 @@ class BDPM(IterativeIntegrator):
        - |float|
        - Merge radius of the first iteration, in scene units; 0 balances noise against blur in a
          short pilot, apart for caustic and for other photons, and corrects the estimate near edges
-         where that pays. Caustic and volume photons with little light around have larger radii of
-         their own then, and volume photons that lie densely have smaller ones. (Default: 0)
+         where that pays. Caustic photons with little light around have larger radii of their own
+         then, and volume photons that lie densely have smaller ones. (Default: 0)
      * - alpha
        - |float|
        - Radius reduction of progressive photon mapping, in (0, 1]: iteration i uses R_i^2 = R_0^2
@@ -194,8 +194,8 @@ class BDPMSession(PilotedSession):
     know of it before they are made.)"""
     widens_caustics = True
     """Whether caustic photons have radii of their own where the radius is automatic."""
-    varies_volume = True
-    """Whether volume photons have. (Weights know one radius for all.)"""
+    narrows_volume = True
+    """Whether volume photons have, too. (Weights know one radius for all.)"""
 
     def __init__(self, integrator, scene, sensor, seed, iterations):
         super().__init__(integrator, scene, sensor, seed, iterations)
@@ -323,7 +323,7 @@ class BDPMSession(PilotedSession):
     def volume_density(self):
         """The `VolumeDensity` of the first light pass of a pilot, measured when it is first asked
         for; None where all volume photons have the same radius."""
-        differ = self.has_volume and self.varies_volume and not self.integrator.initial_radius
+        differ = self.has_volume and self.narrows_volume and not self.integrator.initial_radius
         if differ and self._volume_density is None:
             count = self.light_path_count
             self._use_light_paths(pilot_light_paths(self.iteration_light_paths))
@@ -333,14 +333,6 @@ class BDPMSession(PilotedSession):
             )
             self._use_light_paths(count)
         return self._volume_density
-
-    def density_in_render(self):
-        """The same for all iterations that are planned (see `VolumeDensity.in_render`)."""
-        density, iterations = self.volume_density(), self.caustic_radii.iterations
-        if density is None or not iterations:
-            return density
-        counted = pilot_light_paths(self.iteration_light_paths)
-        return density.in_render(iterations * self.light_path_count / counted)
 
     def photons_of_a_path(self):
         """How many photons a light sub-path leaves, on average: by the light pass of a pilot."""
@@ -483,12 +475,15 @@ class BDPMSession(PilotedSession):
         """What photons of one kind bring to each vertex, volume photons to each beam, for each
         radius (and class: see `gather_photons`)."""
         if kind == "volume":
-            beams = Beams.read(vertices["beams"], spectral["wavelengths"])
-            light_paths, max_depth = self._light_paths, self.integrator.max_depth
-            marked = self.integrator.splits_light
-            if photon_map.radius is not None:
-                return gather_tiers_along(photon_map, beams, light_paths, max_depth, marked)
-            return gather_along(photon_map, beams, radii, light_paths, max_depth, grey, marked)
+            return gather_along(
+                photon_map,
+                Beams.read(vertices["beams"], spectral["wavelengths"]),
+                radii,
+                self._light_paths,
+                self.integrator.max_depth,
+                grey,
+                self.integrator.splits_light,
+            )
         return self._merge(photon_map, read_queries(vertices), kind, radii, spectral, grey)
 
     def _merge(self, photon_map, record, kind, radii, spectral, grey=False, weigh=None, scale=1):
@@ -670,7 +665,7 @@ class BDPMSession(PilotedSession):
         radii = self.radii_at(iteration)
         spectral = self._spectral(iteration)
         # Before any pass is looked up: they may have to be recorded anew.
-        around, density = self.caustic_radii.find(), self.density_in_render()
+        around, density = self.caustic_radii.find(), self.volume_density()
         photons = self._photons(iteration, spectral) if radii else None
         maps = self._map_pass(photons, radii, around, density) if radii else None
 

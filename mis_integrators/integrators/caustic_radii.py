@@ -32,9 +32,7 @@ class CausticRadii:
     def most_iterations(self):
         """The largest value that `iterations` may have: 0 where radii never differ."""
         session = self.session
-        differ = (session.widens_caustics and session.has_caustics) or (
-            session.varies_volume and session.has_volume
-        )
+        differ = session.widens_caustics and session.has_caustics
         return MOST_ITERATIONS if differ and not session.integrator.initial_radius else 0.0
 
     def plan(self, iterations):
@@ -45,7 +43,7 @@ class CausticRadii:
     def find(self):
         """The `LightAround`, measured when it is first asked for; None where radii do not
         differ."""
-        if self.iterations and self.session.has_caustics and self._around is None:
+        if self.iterations and self._around is None:
             self._around = self._measure()
         return self._around
 

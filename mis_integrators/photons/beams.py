@@ -16,7 +16,6 @@ A comprehensive theory of volumetric radiance estimation using photon points and
 
 from __future__ import annotations
 
-import copy
 from dataclasses import dataclass
 
 import drjit as dr
@@ -30,7 +29,7 @@ from ..paths.light_classes import CLASSES, by_class, class_of
 from ..paths.media import point_in
 from .grid import Query, visit_hits
 from .photon import read_power
-from .volume import WIDE_TIERS, number_of_medium, read_place
+from .volume import number_of_medium, read_place
 
 SHORT, LONG = 0, 1 << 31
 """Bit of a beam's depth that tells its kind."""
@@ -292,26 +291,6 @@ def gather_along(
         dr.select(beams.active, total * factor / (dr.pi * dr.square(radius) * light_path_count), 0)
         for total, radius in zip(totals, sums)
     ]
-
-
-def gather_tiers_along(photon_map, beams, light_path_count, max_depth, marked=False):
-    """`gather_along` of all tiers of a map, each with its radius. Result as there, of one
-    radius."""
-
-    def step(number, totals):
-        tier, radius, count = photon_map.tier(number)
-        there = copy.copy(beams)
-        there.active = beams.active & (count > 0)
-        parts = gather_along(tier, there, [radius], light_path_count, max_depth, marked=marked)
-        return number + 1, [total + part for total, part in zip(totals, parts)]
-
-    totals = [mi.Spectrum(0) for _ in range(len(CLASSES) if marked else 1)]
-    return dr.while_loop(
-        (mi.UInt32(0), totals),
-        lambda number, totals: number < WIDE_TIERS,
-        step,
-        label="volume tiers",
-    )[1]
 
 
 def mean_count_along(photon_map, beams, radius, paths):

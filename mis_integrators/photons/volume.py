@@ -36,8 +36,6 @@ SHARE_SHIFT, SHARE_STEPS = DEPTH_BITS + 17, 4
 """Where the share of the radius is in a word; steps for each halving of it."""
 LEAST_SHARE = 1 / 32
 """Tuned: of the radius, what a photon has at least."""
-WIDE_TIERS = 3
-"""Tiers of a map whose photons may have larger radii, each twice as large as in the one before."""
 
 
 def pack_place(depth, caustic, medium):
@@ -48,7 +46,8 @@ def pack_place(depth, caustic, medium):
 
 
 def with_share(word, share):
-    """A word of `pack_place` with that share of its tier's radius, not above one, in six bits."""
+    """A word of `pack_place` with that share of the radius, from `LEAST_SHARE` to one, in six
+    bits."""
     return word | (mi.UInt32(dr.round(-SHARE_STEPS * dr.log2(share))) << SHARE_SHIFT)
 
 
@@ -115,23 +114,17 @@ class Box:
 class VolumeMap:
     """Sorted volume photons: their `box`, a `grid` over it, `start` (first photon of each table
     entry), `place` and `power`. Under weights there are also `mis_words`, as light sub-paths have
-    left them, and for each sorted photon its `number` among them.
+    left them, and for each sorted photon its `number` among them."""
 
-    Where photons may have larger radii, there are `WIDE_TIERS` of them: `radius` is then that of
-    the first one, and the map shows that one (see `tier`).
-    """
-
-    def __init__(self, box, grid, start, place, power, mis_words=None, number=None, radius=None):
+    def __init__(self, box, grid, start, place, power, mis_words=None, number=None):
         self.box, self.grid, self.start, self.place, self.power = box, grid, start, place, power
-        self.mis_words, self.number, self.radius = mis_words, number, radius
+        self.mis_words, self.number = mis_words, number
 
     def arrays(self):
         """What a recorded function can take; `with_grid` makes the map of it again."""
         names = ["start", "place", "power"]
         if self.mis_words is not None:
             names += ["mis_words", "number"]
-        if self.radius is not None:
-            names += ["radius"]
         return {
             **{name: getattr(self, name) for name in names},
             "low": self.box.min,
@@ -142,32 +135,12 @@ class VolumeMap:
         """Where among the `mis_words` those of photon `index` are."""
         return dr.gather(mi.UInt32, self.number, index, active)
 
-    def tier(self, number):
-        """The map of a tier, its radius, and how many photons it has (arrays)."""
-        table, radius = self.grid.table, tier_radius(self.radius, number)
-        grid = Grid(self.box, CELL * radius, table, table.first_entry(number))
-        last = table.first_entry(number + 1) - 1  # where no photon is
-        count = dr.gather(mi.UInt32, self.start, last) - dr.gather(
-            mi.UInt32, self.start, grid.first
-        )
-        return VolumeMap(self.box, grid, self.start, self.place, self.power), radius, count
-
     @classmethod
     def with_grid(cls, arrays, radius, capacity: int):
         """The map of `arrays`, built for the same radius and capacity."""
         arrays = dict(arrays)
         box = Box(arrays.pop("low"), arrays.pop("high"))
         return cls(box, volume_grid(box, radius, capacity), **arrays)
-
-
-def tier_radius(radius, number):
-    """That of a tier, by that of the first one."""
-    return radius * mi.Float(mi.UInt32(1) << number)
-
-
-def tier_of(share):
-    """The tier of photons with that share of the first one's radius."""
-    return mi.UInt32(dr.clip(dr.ceil(dr.log2(share)), 0, WIDE_TIERS - 1))
 
 
 def volume_grid(box, radius, capacity):
@@ -178,24 +151,19 @@ def volume_grid(box, radius, capacity):
 def build_volume_map(place, power, count, radius, capacity: int, mis_words=None, density=None):
     """Sorts volume photons into a grid over the box that holds them all. `mis_words` (None: there
     are none) stay unsorted. Photons have the share of the `radius` that their `density` says (a
-    `VolumeDensity`; None: all of it). There are tiers if it widens some."""
+    `VolumeDensity`; None: all of it)."""
     index = dr.arange(mi.UInt32, capacity)
     record, active = read_places(place, count)
     p = record["p"]
+    if density is not None:
+        share = density.share(p, flux_of(power, active), active)
+        record["word"] = with_share(record["word"], share)
     box = Box(
         mi.Point3f(*(_extreme(dr.min, x, active, dr.inf) for x in p)),
         mi.Point3f(*(_extreme(dr.max, x, active, -dr.inf) for x in p)),
     )
-    grid, tiers = volume_grid(box, radius, capacity), 1
-    if density is not None:
-        share = density.share(p, flux_of(power, active), radius, active)
-        if density.widens:
-            tier, tiers = tier_of(share), WIDE_TIERS
-            share /= tier_radius(1, tier)
-            first = grid.table.first_entry(tier)
-            grid = Grid(box, CELL * tier_radius(radius, tier), grid.table, first)
-        record["word"] = with_share(record["word"], share)
-    start, target = sort_by_cell(grid, p, active, tiers)
+    grid = volume_grid(box, radius, capacity)
+    start, target = sort_by_cell(grid, p, active)
     sorted_place = place_layout().room(capacity)
     place_layout().write(sorted_place, record, target, active)
     sorted_power = power_layout().move(power, index, target, active)
@@ -204,16 +172,7 @@ def build_volume_map(place, power, count, radius, capacity: int, mis_words=None,
         number = dr.empty(mi.UInt32, capacity)
         dr.scatter(number, index, target, active)
     dr.eval(sorted_place, sorted_power, number)
-    return VolumeMap(
-        box,
-        volume_grid(box, radius, capacity),
-        start,
-        sorted_place,
-        sorted_power,
-        mis_words,
-        number,
-        radius if tiers > 1 else None,
-    )
+    return VolumeMap(box, grid, start, sorted_place, sorted_power, mis_words, number)
 
 
 def _extreme(reduce, values, active, neutral):

@@ -4,9 +4,7 @@ Close to a lamp, and where glass focuses, light in a medium changes over less th
 suits the rest of the scene. There photons lie densely, and smaller disks hold enough of them. By
 the square-root law of Abramson (1982, On bandwidth variation in kernel estimates) a photon's radius
 is R sqrt(D / d), with d the density of photons around it and D that of the median photon; but not
-above R. And where photons are so few that each would show as a disk of its own, a radius is larger
-than R: so that a cube as wide as the disk has `FEWEST` photons of the whole render (as for caustic
-photons, see `light_around`).
+above R.
 
 A dim photon counts less for the density around it than a bright one, and one that is brighter than
 those around it lies in a sparse place: density is light over the photon's own. As it is a function
@@ -16,20 +14,17 @@ each photon brings its own light.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from .light_cells import GRIDS, LightCells, flux_of, quantum_of, tier_radius
-from .volume import LEAST_SHARE, WIDE_TIERS, read_places
+from .volume import LEAST_SHARE, read_places
 
 ENOUGH = 32
 """Tuned: photons in a cell that tell of the density there."""
-FEWEST = 16
-"""Tuned: photons of the whole render in a cube as wide as a photon's disk. Where there would be
-fewer, the disk is larger."""
 
 
 @dataclass
@@ -39,10 +34,6 @@ class VolumeDensity:
     cells: LightCells
     median: mi.Float
     """Density [1/volume] at half of the light."""
-    times: mi.Float
-    """Photons of the whole render over those that are counted here."""
-    widens: bool
-    """Whether few photons have larger radii."""
 
     @classmethod
     def of(cls, place, power, count, largest):
@@ -55,22 +46,13 @@ class VolumeDensity:
         cells.add(p, flux, active)
         light = dr.select(active, flux, 0)
         median = weighted_median(np.array(density_in(cells, p, flux, active)), np.array(light))
-        return cls(cells, dr.opaque(mi.Float, median), dr.opaque(mi.Float, 1.0), False)
+        return cls(cells, dr.opaque(mi.Float, median))
 
-    def in_render(self, times):
-        """The same for a render with so many `times` the photons."""
-        return replace(self, times=dr.opaque(mi.Float, times), widens=True)
-
-    def share(self, p, flux, radius, active):
-        """The radius of photons at `p`, over `radius`."""
+    def share(self, p, flux, active):
+        """The radius of photons at `p`, over that of the sparsest ones; one where no density was
+        found."""
         there = density_in(self.cells, p, flux, active)
-        dense = there > self.median
-        smaller = dr.maximum(dr.sqrt(self.median / dr.select(dense, there, 1)), LEAST_SHARE)
-        larger = mi.Float(1)
-        if self.widens:
-            few = dr.maximum(there, 1e-30) * self.times / FEWEST
-            larger = dr.clip(0.5 * dr.rcp(dr.cbrt(few)) / radius, 1, 2.0 ** (WIDE_TIERS - 1))
-        return dr.select(dense, smaller, larger)
+        return dr.select(there > 0, dr.clip(dr.sqrt(self.median / there), LEAST_SHARE, 1), 1)
 
 
 def density_in(cells, p, flux, active):

@@ -15,7 +15,6 @@ from mis_integrators.photons.beams import (
 )
 from mis_integrators.photons.grid import longest_row, table_size
 from mis_integrators.photons.volume import (
-    WIDE_TIERS,
     VolumeMap,
     build_volume_map,
     new_volume_photons,
@@ -237,14 +236,14 @@ def test_records_hold_what_was_written(rgb):
 
 
 def test_ten_million_photons_fit_into_two_gibibytes(rgb):
-    """Records, unsorted and sorted; counts and first photons of the tables of all tiers; rank and
-    table entry of each photon."""
+    """Records, unsorted and sorted; the table's counts and first photons; rank and table entry of
+    each photon."""
     count = 10**7
     place, power = new_volume_photons(1000)
     record = 4 * (dr.width(place) + dr.width(power)) / 1000
     assert record == 32
     size = table_size(count)
-    total = 2 * record * count + 2 * 4 * WIDE_TIERS * (size + longest_row(size)) + 2 * 4 * count
+    total = 2 * record * count + 2 * 4 * (size + longest_row(size)) + 2 * 4 * count
     assert total < 2 * 2**30
     _scene, medium, _ = media()
     arrays = photon_map(np.zeros((1000, 3)), np.ones(1000), medium, 0.1).arrays()
