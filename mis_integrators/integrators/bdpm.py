@@ -27,7 +27,7 @@ from ..photons.trace import trace_light_paths
 from ..photons.volume import VolumeMap, build_volume_map
 from ..photons.volume_radii import VolumeDensity
 from ..pilot.direct_paths import MOST_PATHS
-from ..pilot.radius import LARGEST_SHARE
+from ..pilot.radius import largest_radius
 from ..pilot.run import PILOT_INDEX
 from ..pilot.setting import PilotSetting, light_shares, pilot_light_paths
 from .caustic_radii import CausticRadii
@@ -328,16 +328,16 @@ class BDPMSession(PilotedSession):
             count = self.light_path_count
             self._use_light_paths(pilot_light_paths(self.iteration_light_paths))
             in_media = self.trace_photons(PILOT_INDEX, LIGHT)[-1]
-            self._volume_density = VolumeDensity.of(
-                *in_media[:3], LARGEST_SHARE * self.traits.extent / 3**0.5
-            )
+            largest = largest_radius(self.traits.extent)
+            self._volume_density = VolumeDensity.of(*in_media[:3], largest)
             self._use_light_paths(count)
         return self._volume_density
 
     def photons_of_a_path(self):
         """How many photons a light sub-path leaves, on average: by the light pass of a pilot."""
         self._use_light_paths(pilot_light_paths(self.iteration_light_paths))
-        self.trace_photons(PILOT_INDEX, LIGHT)
+        if self.volume_density() is None:  # else it has just been measured, by the same pass
+            self.trace_photons(PILOT_INDEX, LIGHT)
         return self.photons_a_path
 
     def trace_photons(self, iteration, purpose):
@@ -370,7 +370,6 @@ class BDPMSession(PilotedSession):
 
     def _prepare(self):
         self.caustic_radii.find()
-        self.volume_density()
 
     @property
     def learned(self):

@@ -60,6 +60,11 @@ def ladder_from(largest: float) -> np.ndarray:
     return largest * STEP ** -np.arange(LADDER_STEPS - 1, -1, -1.0)
 
 
+def largest_radius(extent: float) -> float:
+    """The largest radius of a ladder that suits a whole scene, by the diagonal of its bounds."""
+    return LARGEST_SHARE * extent / 3**0.5
+
+
 def middle_index(radii: np.ndarray) -> int:
     """The place of a middling radius of the ladder: little bias, little noise."""
     return len(radii) * 2 // 3

@@ -7,7 +7,7 @@ from typing import Protocol
 
 import numpy as np
 
-from .radius import LARGEST_SHARE, ladder, ladder_from
+from .radius import ladder, ladder_from, largest_radius
 from .result import PilotResult, PilotSamples, measure
 from .setting import PilotPixels, PilotSetting
 
@@ -119,7 +119,7 @@ def choose_ladder(
     on_surfaces = [kind for kind in setting.kinds if kind != "volume"]
     radii, photons = ladder_on_surfaces(setting, on_surfaces, iteration)
     if "volume" in setting.kinds:
-        largest = LARGEST_SHARE * setting.extent / 3**0.5
+        largest = largest_radius(setting.extent)
         probe = largest / PROBED_SHARE
         count = iteration.mean_photon_count("volume", probe) * PROBED_SHARE**2
         if count > 0:
@@ -141,7 +141,7 @@ def ladder_on_surfaces(
         return {kind: iteration.mean_photon_count(kind, float(radii[-1])) for kind in kinds}
 
     photons = count(radii)
-    largest = LARGEST_SHARE * setting.extent / 3**0.5
+    largest = largest_radius(setting.extent)
     while (most := max(photons.values())) < FEWEST_PHOTONS and radii[-1] < largest:
         radii = radii * min(WIDER, largest / radii[-1])
         photons = count(radii)
