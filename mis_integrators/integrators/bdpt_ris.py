@@ -14,8 +14,9 @@ class PCBPT(ResampledIntegrator):
 
     .. pluginparameters::
 
-     * - light_paths, resamples, cache_neighbors, target, weights, light_tracing, camera_paths,
-         variance, aovs, max_depth, rr_depth, hide_emitters, sampler
+     * - light_paths, resamples, cache_neighbors, target, weights, light_tracing, merging,
+         initial_radius, alpha, camera_paths, variance, aovs, max_depth, rr_depth, hide_emitters,
+         sampler
        -
        - As of :monosp:`bdpt_ris`.
 
@@ -75,6 +76,19 @@ class BDPTRIS(ResampledIntegrator):
        - |float|
        - Light sub-paths that are joined to the sensor, for each camera path (N_t); from 0.125 to 8.
          0 stands for the default. (Default: 1)
+     * - merging
+       - |bool|
+       - Merges camera vertices with the light sub-paths that end near them, as :monosp:`vcm` does:
+         those that are joined to the sensor. Not with ``published`` weights. (Default: no, i.e.
+         |false|)
+     * - initial_radius
+       - |float|
+       - With ``merging``: merge radius of the first iteration, in scene units; 0 stands for 0.4 %
+         of the spread of what the camera sees. (Default: 0)
+     * - alpha
+       - |float|
+       - With ``merging``: radius reduction of progressive photon mapping, in (0, 1]: iteration i
+         uses R_i^2 = R_0^2 (i + 1)^(alpha - 1). 1 keeps the radius. (Default: 1)
      * - camera_paths
        - |int|
        - Camera paths per pixel and iteration, which share its light sub-paths and pmfs. (Default:
@@ -111,9 +125,11 @@ class BDPTRIS(ResampledIntegrator):
     makes the pmf of the light vertices of M of them, with shadow rays. A camera vertex draws the
     light vertices that it connects to from the pmfs of the cache points near it. Light tracing and
     emission that camera paths meet are techniques beside it, and the weights of all know that the
-    connections were resampled (Nabata, Iwasaki and Dobashi 2020). Unbiased.
+    connections were resampled (Nabata, Iwasaki and Dobashi 2020). Unbiased, but for the bias of
+    ``merging``, which vanishes with the radius.
 
-    In participating media vertices are drawn and joined as on surfaces; media of flakes,
+    In participating media vertices are drawn and joined as on surfaces, and surfaces alone merge;
+    media of flakes,
     ``hide_emitters`` and the value ``published`` of ``weights`` are refused there. Polarised
     variants, gradients and the film ``specfilm`` are refused by name.
 

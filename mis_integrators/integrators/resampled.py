@@ -46,6 +46,7 @@ from ..paths.subpaths import (
     vertex_bsdf_of,
 )
 from ..paths.vertex import facing
+from ..photons.vertex_map import state_of
 from ..resampling.cache_pmfs import CachePmfs, cumulative_pmfs
 from ..resampling.cache_points import CacheGrid
 from ..resampling.cache_targets import TARGETS, CacheTargets, integrals, receiving_cosine
@@ -53,6 +54,8 @@ from ..resampling.light_vertices import END, LightVertices, list_light_vertices
 from ..resampling.proposals import Proposals, arriving, cumulative_sums
 from ..weights import resampling
 from .common import IterativeIntegrator, IterativeSession
+from .merging import automatic_radius, map_of_surfaces, merged_light, with_merged
+from .schedule import read_radius, shrunk
 
 CHUNK = 1 << 18
 """Camera paths, and as many light sub-paths, traced at once at most; larger films are traced in
@@ -106,6 +109,15 @@ class ResampledIntegrator(IterativeIntegrator):
             f"0 or from {LEAST_LIGHT_TRACING:g} to {MOST_LIGHT_TRACING:g}",
         )
         self.light_tracing = given or LIGHT_TRACING
+        self.merging = parameters.boolean("merging", False)
+        if self.merging and self.published:
+            parameters.refuse("merging", 'the papers\' weights know none; use "weights" = bounded')
+        self.initial_radius, self.alpha = 0.0, 1.0
+        if self.merging:
+            self.initial_radius, self.alpha = read_radius(parameters)
+        for name in ("initial_radius", "alpha"):
+            if not self.merging:
+                parameters.refuse(name, 'nothing is merged; set "merging" = true')
 
     def settings(self):
         return {
@@ -116,7 +128,13 @@ class ResampledIntegrator(IterativeIntegrator):
             "target": self.target,
             "weights": self.weights,
             "light_tracing": self.light_tracing,
+            **self._merging_settings(),
         }
+
+    def _merging_settings(self):
+        if not self.merging:
+            return {}
+        return {"merging": True, "initial_radius": self.initial_radius, "alpha": self.alpha}
 
     MEDIA = True
 
@@ -146,6 +164,7 @@ class ResampledSession(IterativeSession):
         "_target_pass": ("_own_targets", ("light", "ends")),
         "_connection_pass": ("_connect", ("light", "camera", "ends")),
         "_hit_pass": ("_meet", ("camera", "hits")),
+        "_merge_pass": ("_merge_vertices", ("light", "camera")),
         "_sensor_pass": ("_join_sensor", ("light",)),
     }
 
@@ -178,6 +197,7 @@ class ResampledSession(IterativeSession):
         self.records, self.shares = uniform_tables(self.grid)
         self.cache = self.known = self.first_light = None
         self.published_tables, self.next_tables = unknown_tables(1), {}
+        self.radius = integrator.initial_radius or automatic_radius(self.traits)
         self._freeze()
 
     def _grid(self, points, normals):
@@ -188,7 +208,8 @@ class ResampledSession(IterativeSession):
     def _share_light(self):
         """How many light sub-paths are traced: enough in any case for what is drawn from and for
         Q."""
-        wanted = float(self.lens) * self.integrator.light_tracing * self.chunk
+        shares = self.lens or self.integrator.merging
+        wanted = float(shares) * self.integrator.light_tracing * self.chunk
         self.light_rounds = max(round(wanted / CHUNK), 1)
         self.light_chunk = max(
             round(wanted / self.light_rounds), self.integrator.resampled_light_paths, KNOWN_PATHS
@@ -228,13 +249,30 @@ class ResampledSession(IterativeSession):
             self.reach,
         )
 
-    def weights(self, wavelengths=()):
-        """The weights of this session; those of the papers as soon as there are cache points."""
+    @property
+    def settings(self):
+        radius = {"radius": self.radius} if self.integrator.merging else {}
+        return {**super().settings, **radius}
+
+    def _spectral(self, iteration):
+        spectral = super()._spectral(iteration)
+        if self.integrator.merging:
+            radius = shrunk(self.radius, self.integrator.alpha, iteration)
+            spectral["radius"] = dr.opaque(mi.Float, radius)
+        return spectral
+
+    @property
+    def merged_paths(self):
+        """Light sub-paths with which each camera path is merged."""
+        return self.light_chunk * self.light_rounds
+
+    def weights(self, spectral):
+        """The weights of an iteration; those of the papers as soon as there are cache points."""
         integrator = self.integrator
         if integrator.published and integrator.aware and self.cache is not None:
             return PublishedWeights(
                 self.lights,
-                self._cache_targets(wavelengths),
+                self._cache_targets(spectral["wavelengths"]),
                 *self.published_tables,
                 integrator.resampled_light_paths,
                 integrator.resamples,
@@ -250,6 +288,7 @@ class ResampledSession(IterativeSession):
             integrator.aware and not integrator.published,
             self.ratio,
             self.traits,
+            dr.pi * dr.square(spectral["radius"]) * self.merged_paths if integrator.merging else 0.0,
         )
 
     # ------------------------------------------------------------------ passes
@@ -260,7 +299,7 @@ class ResampledSession(IterativeSession):
             self.world,
             self.limits,
             light_pass,
-            self.weights(spectral["wavelengths"]),
+            self.weights(spectral),
             self.capacity["light"],
             self.integrator.splits_light,
         )
@@ -271,7 +310,7 @@ class ResampledSession(IterativeSession):
             self.world,
             self.limits,
             self.describe_camera_pass(sensor, sequence, first, spectral),
-            self.weights(spectral["wavelengths"]),
+            self.weights(spectral),
             self.ratio,
             self.capacity["camera"],
             self.capacity["hits"],
@@ -286,11 +325,19 @@ class ResampledSession(IterativeSession):
             mi.Float(sensor.shutter_open()),
         )
 
-    def _ends(self, starts, light, places, found):
+    def _ends(self, starts, light, places, found, weights):
         M = self.integrator.resampled_light_paths
         kept = dr.minimum(found, dr.opaque(mi.UInt32, self.capacity["ends"]))
         return LightVertices(
-            self.traits, self.lights, starts, M, light, places, kept + M, self.reach
+            self.traits,
+            self.lights,
+            starts,
+            M,
+            light,
+            places,
+            kept + M,
+            self.reach,
+            weights.eta_at,
         )
 
     def _targets(self, scene, sensor, tables, sequence, subpaths, first, cache, spectral, target):
@@ -303,8 +350,8 @@ class ResampledSession(IterativeSession):
         places, found = list_light_vertices(
             light, count, lengths, first, M, self.capacity["light"], room
         )
-        starts = self._starts(sensor, sequence, spectral)
-        ends = self._ends(starts, light, places, found)
+        starts, weights = self._starts(sensor, sequence, spectral), self.weights(spectral)
+        ends = self._ends(starts, light, places, found, weights)
         index = lanes(dr.width(cache["depth"]) * (M + room))
         width = dr.opaque(mi.UInt32, M + room)
         point, end = index // width, index % width
@@ -338,7 +385,7 @@ class ResampledSession(IterativeSession):
             places,
             found,
             dr.select(end < dr.gather(mi.UInt32, ends.count, 0), sent.vertices, 0),
-            guessed_weight(self.traits, z, sent),
+            guessed_weight(self.traits, z, sent, weights.eta_at(z["n"])),
         )
 
     def _seen(self, scene, ends, z, sent, spectral, rng, active):
@@ -410,8 +457,8 @@ class ResampledSession(IterativeSession):
         light sub-paths added, and the entries of its classes (None where light is not split).
         `proposals`: as of `_proposals`."""
         light, starts, places, found, pmfs = proposals
-        integrator, weights = self.integrator, self.weights(spectral["wavelengths"])
-        ends = self._ends(starts, light, places, found)
+        integrator, weights = self.integrator, self.weights(spectral)
+        ends = self._ends(starts, light, places, found, weights)
         kind = CachePmfs if integrator.published else Proposals
         pmf = kind(
             self.grid,
@@ -515,14 +562,15 @@ class ResampledSession(IterativeSession):
             back,
             segments,
             weights.kernels_of_vertex(z["row"], z["p"], vertex_bsdf, sent.d, active),
+            weights.eta_at(z["n"]),
         )
         nearer = sum_before(camera, z, z["parent"], end, weights, active)
         return own * dr.rcp(dr.maximum(own + forward * cosine * sent.mis_sum + nearer, 1e-20))
 
-    def _meet(self, tables, radiance, camera, hits, hit_count, entries):
+    def _meet(self, tables, radiance, camera, hits, hit_count, spectral, entries):
         """Radiance of camera paths with that of emission that they meet beyond the first vertex
         added, and the entries of its classes."""
-        weights = self.weights()
+        weights = self.weights(spectral)
         index = lanes(self.capacity["hits"])
         active = index < dr.gather(mi.UInt32, hit_count, 0)
         hit = hit_layout(weights).read(hits, index, active)
@@ -539,6 +587,49 @@ class ResampledSession(IterativeSession):
         classes = LightClasses(self.chunk, entries, ("met",))
         classes.add("met", hit["path"], self._class_of_hit(hit, camera, active), value, active)
         return total, classes.entries
+
+    def _merge_vertices(self, scene, tables, radiance, camera, count, light, spectral, entries):
+        """Radiance of camera paths with that of merges with the light sub-paths `light` added, and
+        the entries of its classes."""
+        weights, radius = self.weights(spectral), spectral["radius"]
+        photon_map = map_of_surfaces(self.traits, light, self.capacity["light"], radius, END)
+        index = lanes(self.capacity["camera"])
+        active = index < dr.gather(mi.UInt32, count, 0)
+        z = read_vertices(camera, index, active, states=STEP)
+        if self.integrator.splits_light:
+            z["mark"] = z["parent"] == NO_PARENT
+
+        parts, active = merged_light(
+            self.traits,
+            photon_map,
+            z,
+            active,
+            self._merge_weigher(weights, camera, z, photon_map),
+            radius,
+            self.merged_paths,
+            self.integrator.max_depth,
+            spectral,
+        )
+        return with_merged(radiance, entries, parts, z, active, self.chunk)
+
+    @staticmethod
+    def _merge_weigher(weights, camera, z, photon_map):
+        """What weighs the photons of a map at the vertices `z` (records of the buffer `camera`):
+        `weigh` of `gather_photons`."""
+
+        def weigh(index, landing, scattering, active):
+            return weights.merged(
+                camera,
+                z,
+                state_of(photon_map, index, active, END),
+                channel_mean(scattering.f),
+                scattering.p,
+                scattering.back(),
+                z["depth"] + landing.depth,
+                active,
+            )
+
+        return weigh
 
     @staticmethod
     def _class_of_hit(hit, camera, active):
@@ -567,7 +658,7 @@ class ResampledSession(IterativeSession):
             active,
             rng,
         )
-        value = joined.value * (self.weights().seen_by_sensor(joined, y) / self.ratio)
+        value = joined.value * (self.weights(spectral).seen_by_sensor(joined, y) / self.ratio)
         channels = list(colour_channels(value, spectral["sensor_matrix"]))
         if self.integrator.splits_light:
             smooth = dr.select(y["depth"] == 1, mi.UInt32(1), mi.UInt32(2))
@@ -581,7 +672,12 @@ class ResampledSession(IterativeSession):
         """Begins the first iteration: traces its light, and draws the cache points from its first
         part. All sessions of a render see the same here."""
         spectral = self._spectral(0)
-        light, traced = self._light(0, 0, spectral), self._camera(0, 0, spectral)
+        traced = self._camera(0, 0, spectral)
+        if self.integrator.merging and not self.integrator.initial_radius:
+            found = min(int(traced[4][0]), self.capacity["camera"])
+            self.radius = automatic_radius(self.traits, traced[3], found, STEP)
+            spectral = self._spectral(0)
+        light = self._light(0, 0, spectral)
         vertices, M = (
             min(int(traced[4][0]), self.capacity["camera"]),
             self.integrator.resampled_light_paths,
@@ -780,7 +876,9 @@ class ResampledSession(IterativeSession):
             dr.opaque(mi.UInt32, chunk * self.chunk),
             spectral,
         )
-        radiance, entries = self._hit_pass(self._tables, radiance, camera, hits, hit_count, entries)
+        radiance, entries = self._hit_pass(
+            self._tables, radiance, camera, hits, hit_count, spectral, entries
+        )
         dr.eval(radiance, entries)  # else its sums may still wait when the film's are made
         return radiance, entries
 
@@ -803,15 +901,26 @@ class ResampledSession(IterativeSession):
             radiance, entries = self._radiance(iteration, chunk, traced, proposals, spectral)
             for part in (
                 range(chunk * self.light_rounds, (chunk + 1) * self.light_rounds)
-                if self.lens
+                if self.lens or self.integrator.merging
                 else ()
             ):
-                met = self._meet_sensor(
-                    self._light(iteration, part, spectral) if part else light,
-                    self._seed(iteration, APERTURE, part),
-                    spectral,
-                )
-                block = met if block is None else block + met
+                subpaths = self._light(iteration, part, spectral) if part else light
+                if self.integrator.merging:
+                    radiance, entries = self._merge_pass(
+                        self.scene,
+                        self._tables,
+                        radiance,
+                        traced[3],
+                        traced[4],
+                        subpaths,
+                        spectral,
+                        entries,
+                    )
+                    dr.eval(radiance, entries)
+                if self.lens:
+                    seed = self._seed(iteration, APERTURE, part)
+                    met = self._meet_sensor(subpaths, seed, spectral)
+                    block = met if block is None else block + met
         if self.integrator.hide_emitters:
             radiance = dr.select(
                 alpha > 0, radiance, 0

@@ -4,25 +4,17 @@ from __future__ import annotations
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
-from ..core.packing import to_numpy
 from ..core.recording import lanes
 from ..core.untrusted import Fields
 from ..mis.vertex_merging import ConnectionWeights
-from ..paths.light_classes import CLASSES, LightClasses
-from ..paths.subpaths import on_surfaces, read_vertices
-from ..paths.vertex import in_medium
-from ..photons.gather import KeptVertices, gather_photons
-from ..photons.vertex_map import state_of, vertex_map
-from ..pilot.result import RADIUS_WITHOUT_VERTICES
+from ..paths.subpaths import read_vertices
+from ..photons.vertex_map import state_of
 from ..pilot.run import PILOT_INDEX
 from .bdpt import BDPT, CAMERA, BDPTSession
 from .common import MOST_LIGHT_PATHS
+from .merging import automatic_radius, map_of_surfaces, merged_light, with_merged
 from .schedule import LARGEST_RADIUS, SMALLEST_RADIUS, read_radius, shrunk
-
-RADIUS_SHARE = 0.004
-"""Tuned: the automatic radius, in units of the spread of what the camera sees."""
 
 
 class VCM(BDPT):
@@ -139,10 +131,8 @@ class VCMSession(BDPTSession):
             fields.finish()
 
     def _choose_radius(self, spectral):
-        """A share of the spread of the vertices on surfaces that camera paths meet first: the
-        diagonal, over the root of three, of the box that leaves out 2 % of them at either end of
-        each axis. Of the scene's bounds where they meet none."""
-        self.radius = RADIUS_WITHOUT_VERTICES * self.traits.extent
+        """That of what the camera sees."""
+        self.radius = automatic_radius(self.traits)
         if not self.bidirectional:
             return
         spectral = {**spectral, "radius": dr.opaque(mi.Float, self.radius)}
@@ -157,18 +147,7 @@ class VCMSession(BDPTSession):
             )
             if not self._grown("camera", count):
                 break
-        found = int(count[0])
-        if not found:
-            return
-        fields = ("p", "number", "n")
-        vertices = read_vertices(camera, dr.arange(mi.UInt32, found), True, fields)
-        merged = (vertices["number"] == 0) & ~in_medium(vertices["n"])
-        points = to_numpy(vertices["p"])[:, np.array(merged)]
-        if points.shape[1]:
-            low, high = np.percentile(points, [2, 98], axis=1)
-            self.radius = max(
-                RADIUS_SHARE * float(np.linalg.norm(high - low)) / 3**0.5, 1e-3 * self.radius
-            )
+        self.radius = automatic_radius(self.traits, camera, int(count[0]))
 
     def weights(self, spectral):
         plain = super().weights(spectral)
@@ -176,40 +155,29 @@ class VCMSession(BDPTSession):
         return ConnectionWeights(self.lights, plain.beta, plain.ratio, eta, plain.media)
 
     def _merge_vertices(self, scene, tables, radiance, camera, count, light, spectral, entries):
-        vertices, light_count, _ = light
-        if self.traits.has_media:
-            vertices, light_count = on_surfaces(vertices, light_count, self.capacity["light"])
-        photon_map = vertex_map(
-            vertices, light_count, self.capacity["light"], self.traits.bounds, spectral["radius"]
-        )
+        radius = spectral["radius"]
+        photon_map = map_of_surfaces(self.traits, light, self.capacity["light"], radius)
         index = lanes(self.capacity["camera"])
         active = index < dr.gather(mi.UInt32, count, 0)
         z = read_vertices(camera, index, active)
-        if self.traits.has_media:
-            active &= ~in_medium(z["n"])
         weights = self.weights(spectral)
 
-        def weigh(index, f, p, back, active):
-            return weights.merged(z, state_of(photon_map, index, active), p, back())
+        def weigh(index, landing, scattering, active):
+            state = state_of(photon_map, index, active)
+            return weights.merged(z, state, scattering.p, scattering.back())
 
-        parts = gather_photons(
+        parts, active = merged_light(
+            self.traits,
             photon_map,
-            KeptVertices(self.traits, z, spectral["wavelengths"], active),
-            [spectral["radius"]],
+            z,
+            active,
+            weigh,
+            radius,
             self.light_chunk,
             self.integrator.max_depth,
-            weigh,
-            marked=self.integrator.splits_light,
+            spectral,
         )
-        total, (merged, *others) = mi.Spectrum(radiance), parts
-        dr.scatter_reduce(dr.ReduceOp.Add, total, sum(others, merged), z["path"], active)
-        if self.integrator.splits_light:
-            names = [f"merged.{name}" for name in CLASSES]
-            classes = LightClasses(self.chunk, entries, names)
-            for number, (name, merged) in enumerate(zip(names, parts)):
-                classes.add(name, z["path"], mi.UInt32(number), merged, active)
-            entries = classes.entries
-        return total, entries
+        return with_merged(radiance, entries, parts, z, active, self.chunk)
 
     def _merge(self, radiance, camera, count, light, spectral, entries):
         return self._merge_pass(

@@ -73,12 +73,12 @@ class WeightedSession(BDPMSession):
             return None
         light_state, state = weights.light_state(), [vertices[name] for name in STATE]
 
-        def weigh(index, f, p, back, active):
+        def weigh(index, landing, scattering, active):
             return weights.merge_weight(
                 level,
                 state,
-                f,
-                p,
+                scattering.f,
+                scattering.p,
                 light_state.read(
                     level,
                     photon_map.mis_words,

@@ -161,8 +161,9 @@ class HeuristicWeights:
         photons are caustic ones (`weigh` of `gather_photons`)."""
         total, p_before = (vertices[name][0] for name in STATE[:2])
 
-        def weigh(index, f, p, back, active):
-            before = add_ratio(total, ratio(back(), p_before), self.beta)
+        def weigh(index, landing, scattering, active):
+            p = scattering.p
+            before = add_ratio(total, ratio(scattering.back(), p_before), self.beta)
             after = mi.Float(0)
             if kind == "caustic":
                 before *= bounded_power(self.caustic_share, self.beta)

@@ -26,12 +26,14 @@ import numpy as np
 
 from ..core.packing import from_numpy
 from ..core.spectra import channel_mean
+from ..paths.camera_vertices import LightEnd, sum_before
 from ..paths.light_starts import seen_from
 from ..paths.vertex import facing, in_medium
 from ..resampling.light_vertices import END
 from ..resampling.proposals import BLIND_SHARE, uniform_share
 from ..weights import bidirectional as theory
 from ..weights import resampling
+from .vertex_merging import eta_on_surfaces
 
 LENGTHS = 16
 """Tuned: lengths of light sub-paths whose shares are told apart; longer ones count with the
@@ -50,17 +52,27 @@ class ResampledWeights:
     `LENGTHS` a row), M light sub-paths, N draws; `aware`: whether the weights know of the
     resampling (else every technique has the density of its path alone); `ratio`: N_t, light
     sub-paths that are joined to the sensor over camera paths, of all the film; `traits`: a
-    `SceneTraits`."""
+    `SceneTraits`; `eta` [m^2]: pi R^2 times the light sub-paths that each camera path merges with,
+    or 0.
+
+    Merging is one more technique at each vertex on a surface, with the density of both sub-paths up
+    to there times eta (Georgiev et al. 2012). It takes all light sub-paths, and nothing is
+    resampled."""
 
     states = END
     kernels: tuple[str, ...] = ()
     light_kernels: tuple[str, ...] = ()
     """What vertices and hits keep besides (`paths.camera_vertices`): nothing."""
 
-    def __init__(self, lights, grid, records, shares, M, N, aware, ratio, traits):
+    def __init__(self, lights, grid, records, shares, M, N, aware, ratio, traits, eta=0.0):
         self.lights, self.grid, self.records, self.shares = lights, grid, records, shares
         self.M, self.N, self.aware, self.ratio = M, N, aware, ratio
-        self.traits = traits
+        self.traits, self.eta = traits, eta
+        self.merges = not (isinstance(eta, float) and eta == 0)
+
+    def eta_at(self, n):
+        """`eta` at vertices with the normals `n`."""
+        return eta_on_surfaces(self.eta, n, self.traits.has_media)
 
     # ------------------------------------------------------------------ resampling
 
@@ -155,7 +167,7 @@ class ResampledWeights:
         d_vcm, d_vc, strength, *others = state
         return [
             d_vcm,
-            dr.select(delta, d_vc, theory.d_vc_of(d_vcm + p_back * d_vc, p_forward)),
+            dr.select(delta, d_vc, theory.d_vc_of(self._nearer(state, p_back, n), p_forward)),
             dr.select(
                 delta,
                 strength,
@@ -170,19 +182,34 @@ class ResampledWeights:
         better = self.gain_of_vertex(state, density, si, squared, depth)
         return [dr.select(density > 0, better * theory.reciprocal(density), 0), *state[1:]]
 
+    def _nearer(self, state, p_back, n):
+        """A_i, of all techniques nearer to the light than joining the vertex with that state."""
+        d_vcm, d_vc = state[:2]
+        return d_vcm + p_back * d_vc + self.eta_at(n)
+
     # ------------------------------------------------------------------ techniques
 
     def seen_by_sensor(self, connection, light):
         """Weight of a `LensConnection` of a light vertex (t = 1)."""
-        a_light = light["d_vcm"] + connection.back * light["d_vc"]
+        a_light = self._nearer([light["d_vcm"], light["d_vc"]], connection.back, light["n"])
         return theory.connection(connection.density * (1 / self.ratio), a_light, 0, 0, 1)
 
+    def merged(self, camera, z, state, f, back_at_light, back_at_camera, segments, active):
+        """Weight of merging the camera vertices `z` (records of the buffer `camera`) with light
+        vertices of that `state`, on paths of so many segments. `f` [1/sr]: the BSDF, channel mean;
+        `back_at_light`, `back_at_camera`: densities per projected solid angle with which the
+        camera's side goes on to the vertex before the light's, and the light's to the camera's."""
+        d_vcm, d_vc, strength = state
+        end = LightEnd(mi.Float(1), strength, f, back_at_camera, segments, [], self.eta)
+        from_here_on = sum_before(camera, z, z["parent"], end, self, active)
+        return self.eta * dr.rcp(from_here_on + d_vcm + back_at_light * d_vc)
 
-def guessed_weight(traits, z, joined):
+
+def guessed_weight(traits, z, joined, eta=0.0):
     """Weight that joining the cache point `z` (a record of a camera vertex) to a light vertex that
     sends `joined` would have among itself, the techniques nearer to the light, if the surface at
-    `z` is diffuse or the medium isotropic, and the one next to the camera; all as if nothing was
-    resampled.
+    `z` is diffuse or the medium isotropic, and those next to the camera: joining `z` with what is
+    before it, and merging there with `eta` [m^2]; all as if nothing was resampled.
 
     What is drawn should be proportional to weight times contribution. By q* alone long light
     sub-paths matter as much as direct light, though each of them is one of many ways to make its
@@ -193,7 +220,7 @@ def guessed_weight(traits, z, joined):
     return dr.rcp(
         1
         + dr.minimum(
-            cosine * (onwards * joined.mis_sum + joined.pdf_area * z["d_vcm"]),
+            cosine * (onwards * joined.mis_sum + joined.pdf_area * (z["d_vcm"] + eta)),
             theory.LARGEST_RATIO,
         )
     )

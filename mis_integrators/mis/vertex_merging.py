@@ -16,6 +16,13 @@ from ..paths.vertex import in_medium
 from ..weights import bidirectional as theory
 
 
+def eta_on_surfaces(eta, n, media: bool):
+    """`eta` [m^2] at vertices with the normals `n`: surfaces merge, vertices in media do not."""
+    if not media or (isinstance(eta, float) and eta == 0):
+        return eta
+    return dr.select(in_medium(n), 0, eta)
+
+
 class ConnectionWeights:
     """The state of sub-paths (`mis.state.ConnectionState`), and the weights of joined sub-paths.
 
@@ -89,10 +96,8 @@ class ConnectionWeights:
     # ------------------------------------------------------------------ joined sub-paths
 
     def eta_at(self, n):
-        """`eta` at vertices with the normals `n`: surfaces merge, vertices in media do not."""
-        if not self.media or (isinstance(self.eta, float) and self.eta == 0):
-            return self.eta
-        return dr.select(in_medium(n), 0, self.eta)
+        """`eta` at vertices with the normals `n`."""
+        return eta_on_surfaces(self.eta, n, self.media)
 
     def _nearer(self, state, p_back, n):
         return theory.nearer(*state, p_back, self.beta, self.eta_at(n))

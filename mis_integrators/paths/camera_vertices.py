@@ -238,7 +238,7 @@ class LightEnd:
     `p_made` [1/m^2]: the density with which the light's side makes that; `strength`: flux, over the
     density of that; `scattered`, `back`: BSDF there, and density per projected solid angle with
     which the light's side goes on to the parent; `segments`: of the joint path; `kernels`: as of
-    `kernels_of_vertex` or `kernels_of_light`.
+    `kernels_of_vertex` or `kernels_of_light`; `eta` [m^2]: as of `weights.eta_at` (zero at lights).
     """
 
     p_made: mi.Float
@@ -247,6 +247,7 @@ class LightEnd:
     back: mi.Float
     segments: mi.UInt32
     kernels: list[mi.Float] = field(default_factory=list)
+    eta: mi.Float | float = 0.0
 
 
 @dr.syntax
@@ -257,9 +258,10 @@ def sum_before(vertices, step, parent, end: LightEnd, weights, active):
     `step`, `parent`: those of the vertex, or hit, at the camera's end. `weights.gain(r, row, s,
     active)`: what resampling makes of the technique that joins a light sub-path of s vertices,
     which sends r = q*/p (`weights.sent`), to a vertex of that row. Joining to the sensor (the last
-    step, without a parent) has the gain one.
+    step, without a parent) has the gain one. If `weights.merges`, each vertex may also be merged
+    with light sub-paths that end there: `weights.eta_at(n)` [m^2] of them have the density of one.
     """
-    names = (*STEP, *weights.kernels)
+    names, merges = (*STEP, *weights.kernels), weights.merges
     count = len(weights.kernels)
     layout = vertex_layout(names)
     d_vcm, geometry, forward, back_there, scattered_there, row = (
@@ -274,18 +276,24 @@ def sum_before(vertices, step, parent, end: LightEnd, weights, active):
     strength = mi.Float(end.strength)
     scattered, back = mi.Float(end.scattered), mi.Float(end.back)
     active = mi.Bool(active)
-    total = mi.Float(0)
+    total, eta = mi.Float(0), mi.Float(end.eta)
     while dr.hint(active, label="techniques"):
         joined = parent != NO_PARENT
         depth = layout.read(vertices["words"], parent, active & joined, ("depth",))["depth"]
         sent = weights.sent(strength, scattered * geometry, kernels)
         better = weights.gain(sent, mi.UInt32(row), segments - depth, active & joined)
-        total = dr.select(active, total + ratio * d_vcm * dr.select(joined, better, 1), total)
+        here = d_vcm * dr.select(joined, better, 1)
+        if dr.hint(merges, mode="scalar"):
+            here += eta
+        total = dr.select(active, total + ratio * here, total)
         ratio = dr.minimum(ratio * (back * dr.rcp(dr.maximum(forward, 1e-20))), 1e15)
         strength = dr.minimum(strength * (scattered * dr.rcp(dr.maximum(back, 1e-20))), 1e15)
         back, scattered = mi.Float(back_there), mi.Float(scattered_there)
         active &= joined & (ratio > 0)
         record = layout.read(vertices["words"], parent, active, names)
+        if dr.hint(merges, mode="scalar"):
+            n = layout.read(vertices["words"], parent, active, ("n",))["n"]
+            eta = mi.Float(weights.eta_at(n))
         for number in dr.hint(range(count), mode="scalar"):
             kernels[number] = mi.Float(kernels_there[number])
             kernels_there[number] = record[names[number - count]]

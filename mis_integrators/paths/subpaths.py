@@ -147,18 +147,18 @@ def read_vertices(vertices, index, active, only=None, states=STATES):
     return record
 
 
-def on_surfaces(vertices, count, capacity):
+def on_surfaces(vertices, count, capacity, states=STATES):
     """Those of `count` kept vertices (places without parents) that lie on surfaces, in a buffer of
     their own: `(vertices, count)`. For scenes with media."""
     index = dr.arange(mi.UInt32, capacity)
     active = index < dr.gather(mi.UInt32, count, 0)
-    record = read_vertices(vertices, index, active)
+    record = read_vertices(vertices, index, active, states=states)
     keep = active & ~in_medium(record["n"])
     found = dr.zeros(mi.UInt32, 1)
     slot = dr.scatter_inc(found, mi.UInt32(0), keep)
     dr.eval(slot, found)
-    chosen = {"words": vertex_layout().room(capacity)}
-    vertex_layout().write(chosen["words"], record, slot, keep)
+    chosen = {"words": vertex_layout(states).room(capacity)}
+    vertex_layout(states).write(chosen["words"], record, slot, keep)
     if "mark" in vertices:
         chosen["mark"] = dr.zeros(mi.Bool, capacity)
         dr.scatter(chosen["mark"], record["mark"], slot, keep)

@@ -40,7 +40,8 @@ class Scattering:
     """How vertices scatter the light of one photon each.
 
     `towards`: direction to where the photon came from; `shading`: its shading cosine; `value`: BSDF
-    times that cosine, without what is in the vertices' `factor`; `f`: the BSDF [1/sr]; `p`: density
+    times that cosine, without what is in the vertices' `factor`; `f`: the BSDF [1/sr] (of kept
+    vertices `value` over the geometric cosine, as densities are); `p`: density
     per projected solid angle with which a camera path goes on there; `back()`: the same of a light
     sub-path that goes on to the vertex before.
     """
@@ -140,8 +141,8 @@ class KeptVertices:
         towards = dr.normalize(towards)
         value, p, back = self.bsdf.f_and_pdfs(self.towards, towards, active)
         shading = dr.abs(dr.dot(self.bsdf.ns, towards))
-        f = value * dr.rcp(dr.maximum(shading, SMALLEST_COSINE))
-        return Scattering(towards, shading, value, f, p, lambda: back)
+        cosine = dr.maximum(dr.abs(dr.dot(self.n, towards)), SMALLEST_COSINE)
+        return Scattering(towards, shading, value, value * dr.rcp(cosine), p, lambda: back)
 
 
 def same_surface(landing, n):
@@ -197,8 +198,8 @@ def gather_photons(
     radii : ascending; each of width one, or one a vertex
     light_path_count : light sub-paths that made the photons
     max_depth : segments of a whole path (negative: unlimited)
-    weigh : None, or the weight of a photon, ``weigh(index, f, p, back, active)``, a spectrum or a
-        number: its index in the map, and what its `Scattering` says
+    weigh : None, or the weight of a photon, ``weigh(index, landing, scattering, active)``, a
+        spectrum or a number: its index in the map, its `Landing` and its `Scattering`
     grey : sums the mean over channels only (fewer sums to keep for many radii)
     marked : the photons are (`photon.write_photon`)
     height : the radius by which photons are close to a vertex' plane (None: that of the disk)
@@ -248,7 +249,7 @@ def _contribution(flux, towards, vertices, index, landing, weigh, active):
     value = scattering.value
     if weigh is not None:
         lit = active & (dr.max(value) > 0)
-        weight = weigh(index, scattering.f, scattering.p, scattering.back, lit)
+        weight = weigh(index, landing, scattering, lit)
         value *= dr.select(lit, weight, 0)
     return value * flux * dr.rcp(landing_cosine(landing.n, scattering, vertices.plane))
 

@@ -11,18 +11,19 @@ from .grid import build_photon_map
 from .photon import new_photons, write_photon
 
 
-def state_layout():
-    """What such photons have of the weights: the state of their vertex."""
-    return Layout(dict.fromkeys(STATES, mi.Float))
+def state_layout(states):
+    """What such photons have of the weights: the state of their vertex, numbers of these names."""
+    return Layout(dict.fromkeys(states, mi.Float))
 
 
-def vertex_map(vertices, count, capacity: int, bounds, cell):
-    """A `PhotonMap` of all kept light vertices; its mis_words are records of `state_layout`.
-    Arguments as of `build_photon_map`. If the vertices are marked, so are the photons."""
+def vertex_map(vertices, count, capacity: int, bounds, cell, states=STATES):
+    """A `PhotonMap` of all kept light vertices, whose weights have these `states`; its mis_words
+    are records of `state_layout`. Arguments as of `build_photon_map`. If the vertices are marked,
+    so are the photons."""
     index = dr.arange(mi.UInt32, capacity)
     active = index < dr.gather(mi.UInt32, count, 0)
-    fields = ("p", "n", "depth", "towards", "throughput", "mark", *STATES)
-    y = read_vertices(vertices, index, active, fields)
+    fields = ("p", "n", "depth", "towards", "throughput", "mark", *states)
+    y = read_vertices(vertices, index, active, fields, states)
     upright = mi.Vector3f(0, 0, 1)  # other places hold no unit vectors
     photon = {
         "p": y["p"],
@@ -35,15 +36,15 @@ def vertex_map(vertices, count, capacity: int, bounds, cell):
     if "mark" in y:
         photon["delta_at_light"] = y["mark"]
     surface, power = new_photons(capacity)
-    mis_words = state_layout().room(capacity)
+    mis_words = state_layout(states).room(capacity)
     write_photon(surface, power, index, photon, active)
-    state_layout().write(mis_words, y, index, active)
+    state_layout(states).write(mis_words, y, index, active)
     dr.eval(surface, power, mis_words)
     return build_photon_map(surface, power, count, bounds, cell, capacity, "all", mis_words)
 
 
-def state_of(photon_map, index, active):
+def state_of(photon_map, index, active, states=STATES):
     """The weights' state of photons `index` of a `vertex_map`, a list."""
     place = photon_map.place_of_mis_words(index, active)
-    record = state_layout().read(photon_map.mis_words, place, active)
-    return [record[name] for name in STATES]
+    record = state_layout(states).read(photon_map.mis_words, place, active)
+    return [record[name] for name in states]

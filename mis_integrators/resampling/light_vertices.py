@@ -47,12 +47,14 @@ class LightVertices:
     """Ends of M light sub-paths. The first M are starts (`light_starts`), the others the vertices
     at the places `list` of a buffer of `subpaths`, whose states have the fields `END`.
 
-    `count`: how many ends there are (uint32 of width one).
+    `count`: how many ends there are (uint32 of width one); `eta_at`: the weights' (None: nothing is
+    merged).
     """
 
-    def __init__(self, traits, lights, starts, paths, vertices, places, count, reach):
+    def __init__(self, traits, lights, starts, paths, vertices, places, count, reach, eta_at=None):
         self.traits, self.lights, self.starts, self.paths = traits, lights, starts, paths
         self.vertices, self.places, self.count, self.reach = vertices, places, count, reach
+        self.eta_at = eta_at or (lambda n: 0)
 
     def send(self, p, index, time, wavelengths, active):
         """What the ends `index` send to points `p`: a `LightConnection`."""
@@ -73,7 +75,7 @@ class LightVertices:
             value * y["throughput"] * (leaving * dr.rcp(landing)),
             y["strength"] * vertex_bsdf.scattered_mean(value, y["towards"], surface) * leaving,
             forward * leaving,
-            leaving * (y["d_vcm"] + back * y["d_vc"]),
+            leaving * (y["d_vcm"] + back * y["d_vc"] + self.eta_at(y["n"])),
             y["depth"] + 1,
         )
 

@@ -343,8 +343,9 @@ class JointPaths:
         )
         brought = []
 
-        def merged(index, f, p, back, active):
-            return weights.merged(z, state_of(photons, index, active), p, back())
+        def merged(index, landing, scattering, active):
+            state = state_of(photons, index, active)
+            return weights.merged(z, state, scattering.p, scattering.back())
 
         for weigh in (merged, None):
             (radiance,) = gather_photons(

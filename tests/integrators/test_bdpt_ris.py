@@ -30,7 +30,9 @@ from mis_integrators.paths.subpaths import (
     vertex_bsdf_of,
     vertex_layout,
 )
-from mis_integrators.paths.vertex import VertexBSDF, facing
+from mis_integrators.paths.vertex import VertexBSDF, facing, in_medium
+from mis_integrators.photons.gather import KeptVertices, gather_photons
+from mis_integrators.photons.vertex_map import vertex_map
 from mis_integrators.resampling.light_vertices import END, LightVertices
 
 import drjit as dr
@@ -182,8 +184,10 @@ class ResampledPaths(JointPaths):
         return buffer, slots
 
     def weights(self):
-        """{s: weight of technique s}, zero where it cannot make the path (numpy)."""
-        session, weights, last = self.session, self.session.weights(), self.vertices[-1][1]
+        """{s: weight of technique s}, zero where it cannot make the path (numpy); with merging also
+        {"merged at i": that of merging at vertex i, from the camera}."""
+        session, last = self.session, self.vertices[-1][1]
+        weights = self.session.weights(session._spectral(1))
         self.capacity = self.COUNT * self.length
         infinite = mi.has_flag(self.light.emitter.flags(), mi.EmitterFlags.Infinite)
         place = dr.select(infinite, mi.Point3f(self.light.d), self.light.p)
@@ -239,6 +243,7 @@ class ResampledPaths(JointPaths):
                 places,
                 mi.UInt32(2 * self.COUNT),
                 session.reach,
+                weights.eta_at,
             )
             steps = (*STEP, *weights.kernels)
             vertex = read_vertices(camera, camera_slots[z], self.valid, states=steps)
@@ -257,6 +262,10 @@ class ResampledPaths(JointPaths):
             )
             blocked = delta[z] if z == self.length - 1 else delta[z] | delta[z + 1]
             result[self.length - z] = np.array(share) * ~blocked
+            if weights.merges:
+                result[f"merged at {z}"] = (
+                    self.merged(weights, camera, camera_slots[z], light, light_slots[z]) * ~delta[z]
+                )
         y = read_vertices(light, light_slots[0], self.valid, states=END)
         seen = join_sensor(
             World(self.scene, self.lights, self.traits),
@@ -278,6 +287,38 @@ class ResampledPaths(JointPaths):
         valid = np.array(self.valid)
         return {s: np.broadcast_to(w, self.COUNT)[valid] for s, w in result.items()}
 
+    def merged(self, weights, camera, camera_slot, light, light_slot):
+        """Weight of a merge at a vertex: what a gather of just this light vertex brings, over what
+        it would bring without weights; zero in media."""
+        z = read_vertices(camera, camera_slot, self.valid, states=STEP)
+        y = read_vertices(light, light_slot, self.valid, states=END)
+        inside, index = in_medium(z["n"]), dr.arange(mi.UInt32, self.COUNT)
+        words = vertex_layout(END).room(self.COUNT)
+        y["n"] = dr.select(inside | ~self.valid, mi.Vector3f(0, 0, 1), y["n"])
+        vertex_layout(END).write(words, y, index, True)
+        dr.eval(words)
+        photons = vertex_map(
+            {"words": words},
+            mi.UInt32(self.COUNT),
+            self.COUNT,
+            self.traits.bounds,
+            mi.Float(0.01),
+            END,
+        )
+        brought = []
+        for weigh in (self.session._merge_weigher(weights, camera, z, photons), None):
+            (radiance,) = gather_photons(
+                photons,
+                KeptVertices(self.traits, z, [], self.valid & ~inside),
+                [dr.opaque(mi.Float, 1e-4)],
+                1,
+                -1,
+                weigh,
+            )
+            brought.append(np.array(dr.mean(radiance)))
+        self.valid &= mi.Bool(brought[1] > 0) | inside
+        return brought[0] / np.maximum(brought[1], 1e-30)
+
     def own_gain(self, weights, vertex, ends, sent, place):
         """The gain of joining `ends` to the camera `vertex`: of published weights from what the
         pmfs of its cache points would be made of."""
@@ -293,10 +334,13 @@ class ResampledPaths(JointPaths):
         return weights.gain(r, row, sent.vertices, self.valid)
 
     def junction_at(self, buffer, slots):
-        steps = (*STEP, *self.session.weights().kernels)
+        steps = (*STEP, *self.session.weights(self.session._spectral(1)).kernels)
         return vertex_bsdf_of(
             self.traits, read_vertices(buffer, slots, self.valid, states=steps), [], self.valid
         )
+
+
+MERGING = {"merging": True, "initial_radius": 0.02}
 
 
 @pytest.mark.parametrize(
@@ -320,7 +364,9 @@ class ResampledPaths(JointPaths):
             2,
             {"weights": "published", "light_paths": 30},
         ),
+        ("bdpt_ris", "rough", "area", "perspective", 3, MERGING),
         *extended(
+            ("pcbpt", "plastic", "point", "thinlens", 2, MERGING),
             ("bdpt_ris", "bump", "constant", "perspective", 2, {}),
             ("bdpt_ris", "plastic", "point", "orthographic", 3, {"light_paths": 1}),
             ("bdpt_ris", "plastic", "sphere", "perspective", 3, {"cache_neighbors": 1}),

@@ -126,6 +126,7 @@ def test_half_transparent_surfaces(rgb):
     "name, light, sensor, length, parameters",
     [
         ("bdpt_ris", "area", "perspective", 3, {"resamples": 4, "light_paths": 30}),
+        ("bdpt_ris", "area", "perspective", 3, {"merging": True, "initial_radius": 0.02}),
         *extended(
             ("bdpt_ris", "point", "thinlens", 3, {}),
             ("pcbpt", "area", "perspective", 4, {"light_tracing": 4}),
