@@ -121,6 +121,18 @@ def test_recursion(case):
     assert all(np.all((x > 0) & (x <= 1)) for x in e)
 
 
+@pytest.mark.parametrize("K, seed", [(K, seed) for K in (2, 3, 4, 5) for seed in range(3)])
+def test_recursion_with_mixed_kernels(K, seed):
+    """Merging costs differ from vertex to vertex, as between disks and balls: with BSDFs and
+    densities in units of the cost, the recursion finds the best weights of brute force."""
+    world, expected, J, _ = generated(K, seed, mixed=True)
+    weights, _ = worlds.recurse(world)
+    assert distance(weights, expected) < 1e-9
+    assert worlds.noise(world, weights) == pytest.approx(J, rel=1e-9)
+    even, _ = worlds.recurse(dataclasses.replace(world, cost=None))
+    assert worlds.noise(world, even) > 1.001 * J
+
+
 def test_recursion_in_single_precision(case):
     world, expected, _, _ = case
     weights, _ = worlds.recurse(world, dtype=np.float32)

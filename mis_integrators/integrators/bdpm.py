@@ -21,6 +21,7 @@ from ..photons.beams import Beams, gather_along, read_beams
 from ..photons.coverage import covered_share
 from ..photons.gather import QueryVertices, gather_photons
 from ..photons.grid import PhotonMap, build_photon_map
+from ..photons.points import read_points
 from ..photons.queries import Queries, read_queries, trace_camera_paths
 from ..photons.tiers import TieredMap, build_tiered_map, gather_tiers
 from ..photons.trace import trace_light_paths
@@ -196,6 +197,8 @@ class BDPMSession(PilotedSession):
     """Whether caustic photons have radii of their own where the radius is automatic."""
     narrows_volume = True
     """Whether volume photons have, too. (Weights know one radius for all.)"""
+    points = False
+    """Whether volume photons are gathered at vertices in media, and not along beams."""
 
     def __init__(self, integrator, scene, sensor, seed, iterations):
         super().__init__(integrator, scene, sensor, seed, iterations)
@@ -306,6 +309,7 @@ class BDPMSession(PilotedSession):
             light_shares(self.iteration_light_paths)
             if self.chooses_light_paths and not integrator.photon_count
             else (1.0,),
+            3 if self.points else 2,
         )
 
     def pilot_passes(self, setting, pixels):
@@ -456,8 +460,9 @@ class BDPMSession(PilotedSession):
             self.has_caustics,
             self.has_indirect,
             self.one_vertex,
-            beams,
+            0 if self.points else beams,
             self.narrow,
+            self.points,
         )
         return trace_camera_paths(
             self.world,
@@ -517,7 +522,9 @@ class BDPMSession(PilotedSession):
 
     def _per_path(self, values, vertices, kind, paths):
         """Sums values of the vertices, or beams, for each of `paths` camera paths."""
-        if kind == "volume":
+        if kind == "volume" and self.points:
+            vertices = read_points(vertices["points"]["words"])
+        elif kind == "volume":
             vertices = read_beams(vertices["beams"])
         elif self.one_vertex:
             return values

@@ -10,7 +10,9 @@ import mitsuba as mi
 
 from ..mis.neighbour_radiance import NeighbourRadiance
 from ..mis.optimal import OptimalWeights
+from ..photons.frozen import SurfacePhotons, VolumePhotons
 from ..photons.irradiance_cache import IrradianceCache
+from ..photons.points import ball_volume
 from ..photons.trace import trace_light_paths
 from ..pilot.denoiser import LEFT
 from .common import MOST_LIGHT_PATHS
@@ -22,6 +24,8 @@ USUAL_FROZEN_PATHS = 1 << 16
 """Tuned: light sub-paths of the frozen pass, unless the parameter says otherwise."""
 USUAL_PHOTONS = 10
 """Tuned: photons a merge disk of the radius for which the weights of a pilot are made."""
+SMALLEST_USUAL_RADIUS = 1e-5
+"""That radius at least, in units of the scene's diagonal."""
 PHOTONS_A_PATH = 5
 """Room for photons of the frozen pass; it grows where that is not enough."""
 
@@ -132,6 +136,12 @@ class BDPMOpt(WeightedBDPM):
             "frozen_photons": self.frozen_photons,
         }
 
+    MEDIA = True
+
+    def refused_in_media(self):
+        other = [] if self.weights == "local" else [(f'"weights" = {self.weights}', '"local"')]
+        return other + super().refused_in_media()
+
     def new_session(self, scene, sensor, seed, iterations):
         session = PublishedSession if self.weights == "published" else BDPMOptSession
         return session(self, scene, sensor, seed, iterations)
@@ -154,27 +164,35 @@ class BDPMOptSession(WeightedSession):
 
     weighted_pilot = True
 
-    def usual_radius(self):
-        """The radius at which a typical lit point has `USUAL_PHOTONS` photons within its merge
-        disk."""
-        area = (
-            USUAL_PHOTONS
-            * self.cache.typical_flux
-            / (self.light_path_count * max(self.cache.mean, 1e-30))
-        )
-        return dr.opaque(mi.Float, math.sqrt(area / math.pi))
+    def usual_radii(self):
+        """Radii at which a typical lit point has `USUAL_PHOTONS` photons within its merge disk, or
+        within its merge ball."""
+
+        def measure(cache):
+            share = cache.typical_flux / (self.light_path_count * max(cache.mean, 1e-30))
+            return USUAL_PHOTONS * share
+
+        radii = {"indirect": math.sqrt(measure(self.cache) / math.pi)}
+        if self.fluence is not None:
+            radii["volume"] = (measure(self.fluence) / (4 / 3 * math.pi)) ** (1 / 3)
+        least = SMALLEST_USUAL_RADIUS * self.traits.extent  # where no light meets any
+        return {kind: dr.opaque(mi.Float, max(radius, least)) for kind, radius in radii.items()}
 
     def __init__(self, integrator, scene, sensor, seed, iterations):
-        self.cache = self.neighbour_radiance = None
+        self.cache = self.neighbour_radiance = self.fluence = None
         super().__init__(integrator, scene, sensor, seed, iterations)
+
+    @property
+    def points(self):
+        return self._weighted and self.has_volume
 
     def mixes(self):
         if not (self.traits.has_rough or self.integrator.mix_diffuse):
             return False
         self._learn()
-        return (
-            dr.width(self.cache.center) > 0
-        )  # where light meets nothing there is nothing to learn, nor to mix
+        # Where light meets nothing there is nothing to learn, nor to mix.
+        caches = [cache for cache in (self.cache, self.fluence) if cache is not None]
+        return any(dr.width(cache.center) > 0 for cache in caches)
 
     def prepare(self, spectral):
         if self.integrator.weights == "full":
@@ -191,29 +209,46 @@ class BDPMOptSession(WeightedSession):
             return
         integrator, spectral = self.integrator, self._spectral(0)
         paths = integrator.frozen_photons or USUAL_FROZEN_PATHS
+        media = self.traits.has_media
         capacity, found = 0, PHOTONS_A_PATH * paths
         while found > capacity:
             capacity = found
             light_pass = self.describe_light_pass(
                 self.sensor, self._sequence(0, FROZEN, paths), paths, spectral
             )
-            photons = trace_light_paths(
-                self.world, self.limits, light_pass, capacity, keep_direct=True
+            surface, power, count, *in_media = trace_light_paths(
+                self.world,
+                self.limits,
+                light_pass,
+                capacity,
+                keep_direct=True,
+                volume_capacity=capacity if media else 0,
             )
-            dr.eval(photons)
-            found = int(photons[2][0])
-        self.cache = IrradianceCache(
-            self.scene, self.lights, *photons, paths, self.traits.bounds, spectral["wavelengths"]
-        )
+            dr.eval(surface, power, count, in_media)
+            found = max(int(number[0]) for number in (count, *(kept[2] for kept in in_media)))
+
+        def cache(photons):
+            return IrradianceCache(
+                self.scene,
+                self.lights,
+                photons,
+                paths,
+                self.traits.bounds,
+                spectral["wavelengths"],
+            )
+
+        self.cache = cache(SurfacePhotons(surface, power, count, self.traits.bounds))
+        if media:
+            self.fluence = cache(VolumePhotons(*in_media[0], spectral["wavelengths"]))
 
     def _freeze(self):
         super()._freeze()
         if self._weighted:
-            self._tables += self.cache.tables() + (
-                [self.neighbour_radiance.table, self.neighbour_radiance.albedo]
-                if self.neighbour_radiance
-                else []
-            )
+            self._tables += self.cache.tables()
+            if self.neighbour_radiance:
+                self._tables += [self.neighbour_radiance.table, self.neighbour_radiance.albedo]
+            if self.fluence is not None:
+                self._tables += self.fluence.tables()
 
     def weights(self, merge_settings):
         integrator = self.integrator
@@ -229,21 +264,28 @@ class BDPMOptSession(WeightedSession):
             self.camera_paths / (LEFT if integrator.denoised else 1),
             integrator.weights == "full",
             integrator.mix_diffuse,
+            self.fluence,
+            merge_settings.get("disk_per_ball"),
         )
 
     def merge_settings(self, radii):
-        cache = self.cache
+        cache = self.cache if any(self.cache.photon_flux) else self.fluence or self.cache
         inverse = [
             dr.opaque(mi.Float, self.light_path_count / flux if flux > 0 else 0.0)
             for flux in cache.photon_flux
         ]  # no kernel's literals
-        radius = radii.get("indirect", radii.get("caustic"))
+        radius = radii.get("indirect", radii.get("caustic", radii.get("volume")))
+        of_media = {}
+        if self.fluence is not None:
+            ball = ball_volume(radii.get("volume", radius))
+            of_media["disk_per_ball"] = dr.pi * dr.square(radius) / ball
         dearer = dr.opaque(mi.Float, sum(cache.caustic_flux) / max(sum(cache.photon_flux), 1e-30))
         return {
             "n": dr.pi
             * dr.square(radius)
             * mi.Spectrum(inverse if len(inverse) > 1 else inverse[0]),
             "caustic_cost": dearer * dr.square(radius / radii.get("caustic", radius)),
+            **of_media,
         }
 
 

@@ -14,6 +14,7 @@ from ..core.recording import lanes
 from ..core.spectra import channel_mean
 from ..photons.beams import Beams, mean_count_along
 from ..photons.gather import mean_photon_count
+from ..photons.points import Points, mean_count_in_balls, read_points
 from ..photons.queries import read_queries
 
 
@@ -137,7 +138,12 @@ class SubsetPasses:
         radius = dr.opaque(mi.Float, radius)
         photon_map = self.session._map(photons, kind, radius, self.density)
         if kind == "volume":
-            beams = Beams.read(vertices["beams"], self.session._spectral(0)["wavelengths"])
+            wavelengths = self.session._spectral(0)["wavelengths"]
+            if self.session.points:
+                record = read_points(vertices["points"]["words"])
+                points = Points.of(self.session.traits, record, wavelengths)
+                return mean_count_in_balls(photon_map, points, radius)
+            beams = Beams.read(vertices["beams"], wavelengths)
             return mean_count_along(photon_map, beams, radius, self.pixels.paths)
         return mean_photon_count(photon_map, read_queries(vertices), radius)
 

@@ -288,7 +288,9 @@ class ResampledSession(IterativeSession):
             integrator.aware and not integrator.published,
             self.ratio,
             self.traits,
-            dr.pi * dr.square(spectral["radius"]) * self.merged_paths if integrator.merging else 0.0,
+            dr.pi * dr.square(spectral["radius"]) * self.merged_paths
+            if integrator.merging
+            else 0.0,
         )
 
     # ------------------------------------------------------------------ passes

@@ -7,6 +7,7 @@ import mitsuba as mi
 
 from ..core.recording import lanes
 from ..photons.beams import Beams, beam_layout, gather_along
+from ..photons.points import Points, gather_in_balls, point_layout, read_points
 from ..photons.queries import STATE, query_layout, read_queries, weight_layout
 from .bdpm import BDPM, BDPMSession
 
@@ -31,7 +32,7 @@ class WeightedSession(BDPMSession):
     chooses_light_paths = narrows_volume = False
     weighted_pilot = False
     """Whether the pilot of the automatic radius renders under the weights, made for
-    `usual_radius()`; else it merges at the first vertex."""
+    `usual_radii()`; else it merges at the first vertex."""
 
     def __init__(self, integrator, scene, sensor, seed, iterations):
         self._weighted = False
@@ -89,6 +90,25 @@ class WeightedSession(BDPMSession):
 
         return weigh
 
+    def point_weigher(self, weights, level, points, record, photon_map):
+        """What weighs volume photons at the vertices in media of one strategy (`weigh` of
+        `gather_in_balls`): caustic ones as the vertex's direct light. `record` as of
+        `_read_points`, `points` made of it."""
+        light_state, state = weights.light_state(), [record[name] for name in STATE]
+        cost = weights.ball_cost(points.extinction)
+
+        def weigh(index, landing, scattering, active):
+            weight = state[0]
+            if level < self.integrator.strategies - 1:
+                place = photon_map.place_of_mis_words(index, active)
+                passed = light_state.read(level, photon_map.mis_words, place, active)
+                weight = weights.merge_weight(
+                    level, state, scattering.f * cost, scattering.p * cost, passed
+                )
+            return dr.select(landing.caustic, record["share"], weight)
+
+        return weigh
+
     def beam_weigher(self, weights, beams, state, photon_map):
         """What weighs volume photons along beams (`weigh` of `gather_along`), whose paths arrive
         with that `state` of the weights."""
@@ -121,7 +141,7 @@ class WeightedSession(BDPMSession):
     def _spectral(self, iteration):
         spectral = super()._spectral(iteration)
         if self._weighted:
-            radii = self.radii_at(iteration) if self.radii else {"indirect": self.usual_radius()}
+            radii = self.radii_at(iteration) if self.radii else self.usual_radii()
             spectral["merge_settings"] = self.merge_settings(radii)
             dr.make_opaque(spectral["merge_settings"])
         return spectral
@@ -137,19 +157,61 @@ class WeightedSession(BDPMSession):
     def _gather(self, photon_map, vertices, kind, radii, spectral, grey=False):
         if not self._weighted:
             return super()._gather(photon_map, vertices, kind, radii, spectral, grey)
+        if kind == "volume" and self.points:
+            points = vertices["points"]
+            return self._gather_weighted_in_balls(photon_map, points, radii, spectral, grey)
         if kind == "volume":
             return self._gather_weighted_along(photon_map, vertices, radii, spectral, grey)
         if kind == "caustic":
             record = read_queries(vertices)
             return self._merge_weighted(photon_map, record, kind, None, radii, spectral, grey)
+
+        def gather(level, first, section):
+            record = read_queries(vertices, first, section)
+            return self._merge_weighted(photon_map, record, kind, level, radii, spectral, grey)
+
+        return self._by_section(query_layout().capacity(vertices["words"]), gather)
+
+    def _read_points(self, points, first, count):
+        """Records of `count` vertices in media from place `first` of a buffer on, with the state of
+        the weights there."""
+        record = read_points(points["words"], first, count)
+        index = lanes(count) + first
+        record |= weight_layout().read(points["weights"], index)
+        if "first" in points:
+            record["first"] = dr.gather(mi.Bool, points["first"], index)
+        return record
+
+    def _gather_weighted_in_balls(self, photon_map, points, radii, spectral, grey):
+        """`gather_in_balls` at the vertices of all strategies, weighted: caustic photons as their
+        vertex's direct light."""
+        weights = self.weights(spectral["merge_settings"])
+
+        def gather(level, first, section):
+            record = self._read_points(points, first, section)
+            there = Points.of(self.traits, record, spectral["wavelengths"])
+            return gather_in_balls(
+                photon_map,
+                there,
+                radii,
+                self._light_paths,
+                self.integrator.max_depth,
+                self.point_weigher(weights, level, there, record, photon_map),
+                grey,
+                self.integrator.splits_light,
+            )
+
+        return self._by_section(point_layout().capacity(points["words"]), gather)
+
+    def _by_section(self, width, gather):
+        """What `gather(level, first, section)` returns for each strategy's section of vertices, the
+        `section` places from `first` on, as lists of arrays of all sections."""
         integrator = self.integrator
-        width = query_layout().capacity(vertices["words"])
         section = width // (integrator.first_vertex + integrator.strategies)
         totals = None
         for level in range(integrator.strategies):
             first = (level + integrator.first_vertex) * section
-            record = read_queries(vertices, first, section)
-            merged = self._merge_weighted(photon_map, record, kind, level, radii, spectral, grey)
+            merged = gather(level, first, section)
             totals = totals or [dr.zeros(type(values), width) for values in merged]
             for total, values in zip(totals, merged):
                 dr.scatter(total, values, dr.arange(mi.UInt32, section) + first)

@@ -16,6 +16,7 @@ import mitsuba as mi
 from ..core.records import Layout
 from ..core.spectra import channel_mean
 from ..core.traits import lookup
+from ..paths.vertex import in_medium
 from ..weights import recursion
 from .neighbour_radiance import HALVES
 
@@ -28,6 +29,8 @@ TRUSTED_PHOTONS = 128
 the means over directions."""
 SMALLEST_COSINE, SMALLEST_LOBE_COSINE = 1e-6, 0.05
 SMALLEST_DENSITY = 1e-6
+SMALLEST_EXTINCTION = 1e-6
+"""[1/m]: where a medium is thinner no photon is left."""
 
 
 class Node:
@@ -112,7 +115,14 @@ class OptimalWeights:
     N_B; where noise counts that a denoiser leaves, F + d B in place of F + B, it is N_B / d.
     `mix_diffuse`:
     whether strategies go on beyond Lambertian vertices; else the first of these is a path's last
-    strategy.
+    strategy. In scenes with media, which have local weights only, `fluence` is the
+    `IrradianceCache` of these, and `disk_per_ball` [1/m] the area of a merge disk over the volume
+    of a merge ball (width one).
+
+    **Vertices in media.** A ball of volume V there finds as many photons as a disk of the area V
+    sigma, sigma being the extinction. So merging costs the BSDF f times A / (V sigma), where A is
+    the disk of surfaces, and with densities p scaled alike the recursion stays as it is (docs/
+    bdpm_opt.md derives it). The BSDF is the phase function times the albedo.
     """
 
     weighs_points_of_lights = False
@@ -130,7 +140,10 @@ class OptimalWeights:
         camera_paths,
         full,
         mix_diffuse,
+        fluence=None,
+        disk_per_ball=None,
     ):
+        self.fluence, self.disk_per_ball = fluence, disk_per_ball
         self.lights, self.traits, self.cache, self.neighbour_radiance, self.n, self.caustic_cost = (
             lights,
             traits,
@@ -156,22 +169,52 @@ class OptimalWeights:
 
     def scattering(self, si, bsdf, wo, mask):
         """BSDF value without cosine and density per projected solid angle of the camera path that
-        goes on to `wo`."""
+        goes on to `wo`; in media scaled (see above)."""
+        if self.fluence is None:
+            return self.bsdf_scattering(si, bsdf, wo, mask)
+        value, pdf = bsdf.eval_pdf(self.context, si, wo, mask)
+        scale = dr.rcp(dr.maximum(dr.abs(wo.z), SMALLEST_COSINE))
+        return self.per_disk(si, bsdf, mask, value * scale, pdf * scale, value, pdf)
+
+    def bsdf_scattering(self, si, bsdf, wo, mask):
+        """The same of a BSDF."""
         value, pdf = bsdf.eval_pdf(self.context, si, wo, mask)
         scale = dr.rcp(dr.maximum(dr.abs(wo.z), SMALLEST_COSINE))
         return value * scale, pdf * scale
 
+    def per_disk(self, si, bsdf, mask, f, p, phase, phase_pdf):
+        """`f` and `p` on surfaces, and in media those of the phase function, scaled."""
+        inside = mask & in_medium(si.n)
+        albedo, extinction = bsdf.coefficients(si, inside)
+        scale = self.ball_cost(extinction)
+        f = dr.select(inside, phase * albedo * scale, f)
+        return f, dr.select(inside, phase_pdf * scale, p)
+
+    def ball_cost(self, extinction):
+        """A / (V sigma): what merging a photon in a ball costs in units of merging it in a disk of
+        surfaces."""
+        return self.disk_per_ball * dr.rcp(dr.maximum(extinction, SMALLEST_EXTINCTION))
+
     def lobe(self, si, bsdf, mask):
         """Value and density of the scattering in a typical direction, by one fixed sample of the
         BSDF."""
+        if self.fluence is None:
+            return self.surface_lobe(si, bsdf, mask)
+        f, p = self.surface_lobe(si, bsdf.bsdf, mask & ~in_medium(si.n))
+        pdf = bsdf.sample_phase(si, mi.Float(0.5), mi.Point2f(0.5), mask).pdf
+        f, p = self.per_disk(si, bsdf, mask, f, p, pdf, pdf)
+        return f, dr.maximum(p, SMALLEST_DENSITY)
+
+    def surface_lobe(self, si, bsdf, mask):
+        """The same of a BSDF."""
         upright = mi.Vector3f(
             0, 0, dr.select(mi.Frame3f.cos_theta(si.wi) > 0, mi.Float(1), mi.Float(-1))
         )
         if not self.traits.has_rough:
-            f, p = self.scattering(si, bsdf, upright, mask)
+            f, p = self.bsdf_scattering(si, bsdf, upright, mask)
             return f, dr.maximum(p, SMALLEST_DENSITY)
         lambertian = lookup(self.traits.lambertian, bsdf, mi.Bool, mask)
-        f, p = self.scattering(si, bsdf, upright, mask & lambertian)
+        f, p = self.bsdf_scattering(si, bsdf, upright, mask & lambertian)
         bs, weight = bsdf.sample(
             self.smooth, si, mi.Float(0.5), mi.Point2f(0.5), mask & ~lambertian
         )
@@ -189,11 +232,12 @@ class OptimalWeights:
         than what a path further on would bring."""
         if self.mix_diffuse or not self.traits.has_lambertian:
             return mi.Bool(False)
-        return (
-            lookup(self.traits.lambertian, bsdf, mi.Bool, mask)
-            if self.traits.has_rough
-            else mi.Bool(True)
-        )
+        on_surfaces = mi.Bool(True)
+        if self.fluence is not None:
+            on_surfaces, bsdf = ~bsdf.scatters, bsdf.bsdf
+        if not self.traits.has_rough:
+            return on_surfaces
+        return on_surfaces & lookup(self.traits.lambertian, bsdf, mi.Bool, mask & on_surfaces)
 
     def side(self, si):
         """The geometric normal on the side of `si.wi`."""
@@ -202,32 +246,35 @@ class OptimalWeights:
     def node(self, si, bsdf, mask, f=None, p=None):
         """The `Node` of a vertex with its predecessor in direction `si.wi`."""
         known = self.cache.lookup(si.p, self.side(si), mask)
+        if self.fluence is not None:
+            inside = mask & bsdf.scatters
+            known = known.replaced(self.fluence.lookup(si.p, mi.Normal3f(0), inside), inside)
         lobe_f, lobe_p = self.lobe(si, bsdf, mask)
         # The strongest light as if nothing stood between, scaled to what the cell has of it:
         # sharper than the cell.
         sharp = mask & (known.visible_share > 0)
         ds, unoccluded = self.lights.unoccluded(si, dr.select(sharp, known.light, 0), sharp)
         wo = si.to_local(dr.select(sharp, ds.d, known.direction))
+        cosine = dr.abs(wo.z)
+        if self.fluence is not None:
+            cosine = dr.select(inside, 1, cosine)
         scale = dr.select(
             sharp,
             unoccluded
             * known.visible_share
-            * dr.abs(wo.z)
+            * cosine
             / recursion.at_least(channel_mean(known.direct), recursion.SMALLEST_DENOMINATOR),
             1,
         )
-        value = lobe_f
-        if self.traits.has_rough:
-            lit = (
-                mask
-                & (dr.max(known.direct) > 0)
-                & ~lookup(self.traits.lambertian, bsdf, mi.Bool, mask)
-            )
-            towards_light = bsdf.eval(self.context, si, wo, lit) * dr.rcp(
-                dr.maximum(dr.abs(wo.z), SMALLEST_LOBE_COSINE)
-            )
-            value = dr.select(lit, towards_light, lobe_f)
-        indirect = (known.second + known.later) * dr.inv_pi * lobe_f / lobe_p
+        indirect = known.second + known.later
+        if self.fluence is None:
+            value = self.towards_light(si, bsdf, wo, known, lobe_f, mask)
+            indirect *= dr.inv_pi * lobe_f / lobe_p
+        else:  # what the cells of media know has the albedo
+            value = self.towards_light(si, bsdf.bsdf, wo, known, lobe_f, mask & ~inside)
+            phase, _ = bsdf.eval_pdf(self.context, si, wo, inside)
+            value = dr.select(inside, phase, value)
+            indirect *= dr.select(inside, dr.inv_four_pi, dr.inv_pi * lobe_f / lobe_p)
         direct, kernel = value * known.direct * scale, channel_mean(lobe_f)
         # The noise law takes direct light for exact. Its noise costs as that of photons does: n
         # times the variance over the radiance.
@@ -235,6 +282,17 @@ class OptimalWeights:
         if self.has_caustics:
             noise += self.caustic_cost * known.caustic_share * kernel
         return Node(f, p, direct, indirect, kernel, lobe_f, lobe_p, noise, self.is_last(bsdf, mask))
+
+    def towards_light(self, si, bsdf, wo, known, lobe_f, mask):
+        """The BSDF for the direct light that a cell knows: that of a typical direction where it is
+        the same for all."""
+        if not self.traits.has_rough:
+            return lobe_f
+        lit = mask & (dr.max(known.direct) > 0)
+        lit &= ~lookup(self.traits.lambertian, bsdf, mi.Bool, mask)
+        value = bsdf.eval(self.context, si, wo, lit)
+        value *= dr.rcp(dr.maximum(dr.abs(wo.z), SMALLEST_LOBE_COSINE))
+        return dr.select(lit, value, lobe_f)
 
     @staticmethod
     def left(drive, e):
@@ -462,6 +520,10 @@ class LightState:
             result.append([dr.select(mask, a, b) for a, b in zip(new, old)])
             new = old
         return result
+
+    def volume_words(self, state):
+        """As `words`, of photons in media."""
+        return self.words(state)
 
     def words(self, state):
         values = [field for fields in state for field in fields]

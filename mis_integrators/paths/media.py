@@ -384,15 +384,24 @@ def phase_f_and_pdfs(sides, to_camera, to_light, active):
     return value, pdf, pdf
 
 
+def scattered_share(medium, p, wavelengths, active):
+    """`(sigma_s, albedo, extinction)` at points: scattering coefficient [1/m] (a spectrum), what
+    `collision` multiplies throughput with where a path scatters (a spectrum), and the extinction by
+    which paths fly, the channels' mean [1/m]."""
+    sigma_s, _, sigma_t = medium.get_scattering_coefficients(
+        point_in(medium, p, mi.Float(0), wavelengths), active
+    )
+    total = channel_mean(sigma_t)
+    albedo = dr.select(total > 0, sigma_s * dr.rcp(dr.maximum(total, 1e-30)), 0)
+    return sigma_s, albedo, total
+
+
 def albedo_mean(sides, active):
     """Albedo at vertices in media (`vertex.Sides`): mean scattering over mean extinction, which is
     the channels' mean of what `collision` multiplies throughput with where it scatters."""
     medium = dr.select(active, sides.above, dr.zeros(mi.MediumPtr))
-    sigma_s, _, sigma_t = medium.get_scattering_coefficients(
-        point_in(medium, sides.p, mi.Float(0), sides.wavelengths), active
-    )
-    total = channel_mean(sigma_t)
-    return dr.select(total > 0, channel_mean(sigma_s) * dr.rcp(dr.maximum(total, 1e-30)), 0)
+    _, albedo, _ = scattered_share(medium, sides.p, sides.wavelengths, active)
+    return channel_mean(albedo)
 
 
 def direct_light(scene, traits, lights, ref, sides, draws, active):

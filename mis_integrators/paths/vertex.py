@@ -13,7 +13,7 @@ import mitsuba as mi
 
 from ..core.spectra import channel_mean
 from ..core.traits import lookup
-from .media import albedo_mean, phase_f_and_pdfs
+from .media import albedo_mean, phase_f_and_pdfs, sample_phase, scattered_share
 from .perturbed import smooth_density
 
 SMALLEST_COSINE = 1e-6
@@ -77,6 +77,20 @@ class PhaseOrBSDF:
         value, pdf = self.bsdf.eval_pdf(context, si, wo, active & ~self.scatters)
         phase, phase_pdf = self._phase(si, wo, inside)
         return dr.select(inside, phase, value), dr.select(inside, phase_pdf, pdf)
+
+    def coefficients(self, si, active):
+        """`(albedo, extinction)` on lanes that scatter in the medium, as of
+        `media.scattered_share`."""
+        medium = dr.select(active & self.scatters, self.medium, dr.zeros(mi.MediumPtr))
+        _, albedo, extinction = scattered_share(medium, si.p, si.wavelengths, active)
+        return albedo, extinction
+
+    def sample_phase(self, si, choice, point, active):
+        """A `BSDFSample3f` of the phase function on lanes that scatter in the medium."""
+        bs = dr.zeros(mi.BSDFSample3f, dr.width(si))
+        inside = active & self.scatters
+        bs, _ = sample_phase(self.medium, si, choice, point, bs, mi.Spectrum(0), inside)
+        return bs
 
     def pdf(self, context, si, wo, active=True):
         """Density per solid angle."""

@@ -7,9 +7,6 @@ scatters (`QueryVertices`, `KeptVertices`) and in the weight of each photon.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
-
 import drjit as dr
 import mitsuba as mi
 
@@ -21,6 +18,7 @@ from ..paths.subpaths import vertex_bsdf_of
 from .grid import for_each_photon
 from .photon import read_power
 from .queries import LAST_VERTEX
+from .scattering import Scattering
 
 SAME_SURFACE_COSINE = 0.7
 """Tuned: photons merge only with vertices whose geometric normals differ by less than 45
@@ -33,25 +31,6 @@ LARGEST_COSINE_RATIO = 4.0
 """Tuned: bound on shading over geometric cosine of a photon's direction, which grazing light on
 smoothed meshes would exceed."""
 SMALLEST_COSINE = 1e-6
-
-
-@dataclass
-class Scattering:
-    """How vertices scatter the light of one photon each.
-
-    `towards`: direction to where the photon came from; `shading`: its shading cosine; `value`: BSDF
-    times that cosine, without what is in the vertices' `factor`; `f`: the BSDF [1/sr] (of kept
-    vertices `value` over the geometric cosine, as densities are); `p`: density
-    per projected solid angle with which a camera path goes on there; `back()`: the same of a light
-    sub-path that goes on to the vertex before.
-    """
-
-    towards: mi.Vector3f
-    shading: mi.Float
-    value: mi.Spectrum
-    f: mi.Spectrum
-    p: mi.Float
-    back: Callable[[], mi.Float]
 
 
 class QueryVertices:

@@ -1,9 +1,9 @@
-"""Irradiance on the scene's surfaces, kept in cells: a crude, deterministic picture of where light
-is.
+"""Irradiance on the scene's surfaces, or fluence in its media, kept in cells: a crude,
+deterministic picture of where light is.
 
 Made once from the photons of a dense light pass. Each cell of a grid keeps what lands around the
 mean position of its photons; what asks for the irradiance of a point reads the point's cell and no
-photons.
+photons. In media it is the fluence, times the albedo there; normals are zero.
 """
 
 from __future__ import annotations
@@ -20,9 +20,8 @@ from ..core.packing import (
 )
 from ..core.random import streams
 from ..core.spectra import channel_mean
-from .gather import SAME_SURFACE_COSINE
-from .grid import build_photon_map, for_each_photon
-from .photon import read_landing, read_power, surface_layout
+from ..paths.vertex import in_medium
+from .frozen import FrozenPhotons
 
 PHOTONS_A_CELL = 32
 """Tuned: photons of a cell, on average over those that hold any."""
@@ -64,6 +63,11 @@ class Irradiance:
             caustic_share,
         )
 
+    def replaced(self, other, mask):
+        """The same, and on the lanes `mask` what the `other` cell knows."""
+        pairs = ((getattr(other, name), value) for name, value in vars(self).items())
+        return Irradiance(*(dr.select(mask, theirs, own) for theirs, own in pairs))
+
 
 def colours():
     """Channels that are kept apart: those of rgb; in spectral variants, whose wavelengths change,
@@ -82,47 +86,46 @@ class IrradianceCache:
     each cell, from cell number 1 on).
     """
 
-    def __init__(self, scene, lights, surface, power, count, light_path_count, bounds, wavelengths):
-        """`surface`, `power`, `count`: photons as `trace_light_paths` stores them, direct light's
-        included; `light_path_count`: how many sub-paths made them, all of the same `wavelengths`
-        (empty in rgb and mono variants)."""
+    def __init__(
+        self,
+        scene,
+        lights,
+        photons: FrozenPhotons,
+        light_path_count,
+        bounds,
+        wavelengths,
+    ):
+        """`photons`: those of a light pass, direct light's included; `light_path_count`: how many
+        sub-paths made them, all of the same `wavelengths` (empty in rgb and mono variants)."""
         self.origin, self.wavelengths = mi.Point3f(bounds.min), wavelengths
         self.words = 12 if colours() == 1 else 16
-        capacity = surface_layout().capacity(surface)
-        index = dr.arange(mi.UInt32, capacity)
-        stored = index < count
-        landing = read_landing(surface, index, stored)
-        flux, towards = read_power(power, index, stored)
-        normal = mi.Normal3f(dr.normalize(dr.mulsign(landing.n, dr.dot(landing.n, towards))))
-        straight = landing.caustic
+        all_photons = photons.all()
+        stored, normal = all_photons.stored, all_photons.normal
         flux_of = {
-            kind: [_typical(dr.select(stored & mask, value, 0)) for value in self._channels(flux)]
+            kind: [
+                _typical(dr.select(stored & mask, value, 0))
+                for value in self._channels(all_photons.flux)
+            ]
             for kind, mask in (
-                ("indirect", ~straight),
-                ("caustic", straight & (landing.depth > 1)),
+                ("indirect", ~all_photons.straight),
+                ("caustic", all_photons.caustic),
             )
         }
         self.photon_flux = flux_of["indirect"] if any(flux_of["indirect"]) else flux_of["caustic"]
         self.caustic_flux = flux_of["caustic"]
         self.typical_flux = sum(self.photon_flux) / len(self.photon_flux)
-        place = self._choose_cells(landing.p, normal, stored, int(count[0]), bounds)
-        self._sum_cells(landing.p, normal, place, stored)
+        place = self._choose_cells(all_photons.p, normal, stored, photons, bounds)
+        self._sum_cells(all_photons.p, normal, place, stored)
         self.table = dr.zeros(mi.Float, self.words * (dr.width(self.center) + 1))
         self.mean, self.level = 0.0, dr.opaque(mi.Float, 0)
         if dr.width(self.center):
-            reach = GATHER_RADIUS * self.cell
-            self._gather(
-                scene,
-                lights,
-                build_photon_map(surface, power, count, bounds, reach, capacity, "all"),
-                light_path_count,
-            )
+            self._gather(scene, lights, photons, light_path_count)
 
     @staticmethod
     def _channels(flux):
         return [channel_mean(flux)] if colours() == 1 else [flux[i] for i in range(colours())]
 
-    def _choose_cells(self, position, normal, stored, count, bounds):
+    def _choose_cells(self, position, normal, stored, photons, bounds):
         """Sets the cells' size so that those which hold photons hold `PHOTONS_A_CELL` on average;
         returns each photon's place."""
         diagonal = max(float(dr.norm(bounds.extents())), 1e-30)
@@ -142,7 +145,8 @@ class IrradianceCache:
             counts = dr.zeros(mi.UInt32, 1 << INDEX_BITS)
             dr.scatter_inc(counts, place, stored)
             self._occupied = dr.compress(counts > 0)
-            cell *= (PHOTONS_A_CELL * dr.width(self._occupied) / max(count, 1)) ** 0.5
+            wanted = PHOTONS_A_CELL * dr.width(self._occupied) / max(photons.count, 1)
+            cell *= wanted ** (1 / photons.dimensions)
         return place
 
     def _sum_cells(self, position, normal, place, stored):
@@ -167,42 +171,30 @@ class IrradianceCache:
             *[dr.gather(mi.Float, sums, 8 * number + i) * scale for i in (1, 2, 3)]
         )
         facing = mi.Vector3f(*[dr.gather(mi.Float, sums, 8 * number + i) for i in (4, 5, 6)])
-        self.facing = dr.select(
-            dr.squared_norm(facing) > 0, dr.normalize(facing), mi.Vector3f(0, 0, 1)
-        )
+        nowhere = dr.select(in_medium(facing), facing, mi.Vector3f(0, 0, 1))
+        self.facing = dr.select(dr.squared_norm(facing) > 0, dr.normalize(facing), nowhere)
         dr.eval(self.center, self.facing)
 
-    def _gather(self, scene, lights, photon_map, light_path_count):
+    def _gather(self, scene, lights, photons, light_path_count):
         """Fills the table: density estimates at the cells' centers."""
-        facing = self.facing
-        channels = colours()
+        channels, reach = colours(), GATHER_RADIUS * self.cell
 
-        def visit(index, landing, offset, distance_squared, hit, totals):
-            flux, towards = read_power(photon_map.power, index, hit)
-            towards, normal = dr.normalize(towards), landing.n
-            hit &= (dr.dot(towards, facing) > 0) & (
-                dr.square(dr.dot(normal, facing)) > SAME_SURFACE_COSINE**2 * dr.squared_norm(normal)
-            )
-            straight = hit & landing.caustic
-            soon = hit & ~straight & (landing.depth <= 2)
+        def visit(photon, hit, totals):
+            straight = hit & photon.straight
+            soon = hit & ~straight & (photon.depth <= 2)
             added = [
                 dr.select(kind, value, 0)
                 for kind in (straight, soon, hit & ~straight & ~soon)
-                for value in self._channels(flux)
+                for value in self._channels(photon.flux)
             ]
-            added += [dr.select(straight, channel_mean(flux) * x, 0) for x in towards]
-            added += [dr.select(straight & (landing.depth > 1), channel_mean(flux), 0)]
+            mean = channel_mean(photon.flux)
+            added += [dr.select(straight, mean * x, 0) for x in photon.towards]
+            added += [dr.select(hit & photon.caustic, mean, 0)]
             return tuple(old + new for old, new in zip(totals, added))
 
-        totals = for_each_photon(
-            photon_map,
-            self.center,
-            GATHER_RADIUS * self.cell,
-            mi.Bool(True),
-            visit,
-            tuple(mi.Float(0) for _ in range(3 * channels + 4)),
-        )
-        area = dr.rcp(dr.pi * dr.square(GATHER_RADIUS * self.cell) * light_path_count)
+        zeros = tuple(mi.Float(0) for _ in range(3 * channels + 4))
+        totals = photons.around(self.center, self.facing, reach, visit, zeros)
+        area = dr.rcp(photons.measure(reach) * light_path_count)
         irradiance = [total * area for total in totals[: 3 * channels]]
         direction = mi.Vector3f(*totals[3 * channels : -1])
         direction *= dr.rsqrt(dr.maximum(dr.squared_norm(direction), 1e-30))
@@ -251,7 +243,7 @@ class IrradianceCache:
         si = self._facing_surface(self.center, self.facing)
         for index in near[:MOST_LIGHTS]:
             ds, value = lights.unoccluded(si, mi.UInt32(index), mi.Bool(True))
-            value *= dr.maximum(dr.dot(ds.d, self.facing), 0)
+            value *= _cosine(ds.d, self.facing)
             value = dr.select(
                 (value > 0) & ~scene.ray_test(si.spawn_ray_to(ds.p), value > 0), value, 0
             )
@@ -272,7 +264,7 @@ class IrradianceCache:
         ds, weight, _ = lights.sample_direct(
             si, streams(number, mi.UInt32(OWN_STREAM)), mi.Bool(True)
         )
-        value = channel_mean(weight) * dr.maximum(dr.dot(ds.d, facing), 0)
+        value = channel_mean(weight) * _cosine(ds.d, facing)
         mean, square = (
             dr.block_sum(value, DIRECT_SAMPLES) / DIRECT_SAMPLES,
             dr.block_sum(dr.square(value), DIRECT_SAMPLES) / DIRECT_SAMPLES,
@@ -320,6 +312,11 @@ class IrradianceCache:
         rest = words[3 * channels :]
         light, visible_share = _unpack_light(rest[3])
         return Irradiance(*spectra, mi.Vector3f(*rest[:3]), slot, light, visible_share, *rest[4:6])
+
+
+def _cosine(d, facing):
+    """Of light from `d` on what faces that way; one in media."""
+    return dr.select(in_medium(facing), 1, dr.maximum(dr.dot(d, facing), 0))
 
 
 def _mean(values):

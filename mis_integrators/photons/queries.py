@@ -23,6 +23,7 @@ from ..paths.setting import CameraPass, Limits, ListedPass, World
 from ..paths.subpaths import selected, smooth_at
 from ..paths.vertex import PhaseOrBSDF, Sides
 from .beams import FIRST, LEVEL_SHIFT, LONG, SHORT, beam_layout, new_beams
+from .points import new_points, point_layout
 
 LAST_VERTEX = 1 << 31
 """Bit of a vertex' depth that says that all photons are wanted there, else only caustic ones."""
@@ -100,7 +101,7 @@ class Queries:
     there are; `one_vertex`: no path asks twice, and each owns the place of its number; `beams`: how
     many beams of each kind there is room for (0: none are kept); `narrow`: a registry table of
     BSDFs at which none but caustic photons are gathered, and which the `bdd` does not count (None:
-    there are none).
+    there are none); `points`: in media, too, photons are asked for at vertices (under weights).
     """
 
     bdd: int
@@ -110,6 +111,7 @@ class Queries:
     one_vertex: bool
     beams: int = 0
     narrow: Any = None
+    points: bool = False
 
 
 class QueryVisitor:
@@ -126,7 +128,7 @@ class QueryVisitor:
     through these without being scattered.
 
     In media, paths scatter until they have left `bdd` smooth vertices behind, and go straight on
-    from there.
+    from there; where photons are asked for at points, until they have left one more behind.
     """
 
     def __init__(self, world, limits, queries, weights, first, beyond, classes):
@@ -143,12 +145,14 @@ class QueryVisitor:
             room=dr.opaque(mi.UInt32, queries.capacity),
             count=dr.zeros(mi.UInt32, self.sections),
         )
-        self.flies = self.traits.has_media and self.bdd > 0
+        self.flights = self.bdd + queries.points
+        self.flies = self.traits.has_media and self.flights > 0
         # Half transparent boundaries are none for the light that is met beyond the last vertex.
         self.passes_masks = self.traits.has_media and self.traits.has_null_vertices
         self.deepest = limits.max_depth - 1 if limits.max_depth > 0 else None
         self.kinds = [LONG]
-        if self.flies and (queries.has_caustics or weights is not None):
+        asked_on_the_way = queries.has_caustics or weights is not None
+        if self.flies and asked_on_the_way and not queries.points:
             self.kinds.append(SHORT)
         if queries.beams:
             room = len(self.kinds) * queries.beams
@@ -158,6 +162,12 @@ class QueryVisitor:
             self.store.beam_room = dr.opaque(mi.UInt32, queries.beams)
             # One each: what a loop has counted up, no other one can within the same iteration.
             self.store.beam_count = {kind: dr.zeros(mi.UInt32, 1) for kind in self.kinds}
+        if queries.points:
+            room = queries.capacity * self.sections
+            self.store.points = {"words": new_points(room), "weights": weight_layout().room(room)}
+            if classes is not None:
+                self.store.points["first"] = dr.zeros(mi.Bool, room)
+            self.store.point_count = dr.zeros(mi.UInt32, self.sections)
 
     def begin(self, n_paths, splat, aperture):
         sums = [] if self.weights is None else self.weights.init(n_paths)
@@ -175,7 +185,7 @@ class QueryVisitor:
             keep_short = None
             if SHORT in self.kinds:
                 keep_short = self._keep_beams(state, throughput, path, depth + 1, SHORT)
-            flies = state[0] < self.bdd
+            flies = state[0] < self.flights
             hit, ray, flight, kept = next_hit_either(
                 self.scene, self.traits, ray, flight, numbers, keep_short, keep, flies, active
             )
@@ -263,7 +273,7 @@ class QueryVisitor:
         if weights is not None:
             sums, share = weights.propagate(sums, at.si, self._scattering(at), vertex, smooth)
             share_here = dr.select(smooth, share, share_here)
-            at.ends |= weights.ends(bsdf, vertex, smooth)
+            at.ends |= weights.ends(self._scattering(at), vertex, smooth)
         state = [vertex, met, behind_delta, scatter_pdf, origin, share_here, times, sums, *more]
         direct = mi.Spectrum(0)
         if not self.lights.dark:
@@ -299,12 +309,36 @@ class QueryVisitor:
         share = dr.select(ds.delta, 1, mis_power(light_pdf, response_pdf)) * share_here
         return dr.select(smooth, at.throughput * share * response * light, 0)
 
+    def _ask_in_medium(self, state, at, wants):
+        """Stores the vertices in media at which photons are to be gathered."""
+        vertex, _, _, _, _, share_here, _, sums, history, _ = state
+        store = self.store
+        section = dr.select(at.ends, mi.UInt32(self.bdd), vertex)
+        slot = dr.scatter_inc(store.point_count, section, wants)
+        wants &= slot < store.room
+        slot += section * store.room
+        point = {
+            "p": at.si.p,
+            "path": at.path,
+            "d": at.ray.d,
+            "depth": at.depth,
+            "throughput": at.throughput,
+            "medium": at.medium,
+        }
+        point_layout().write(store.points["words"], point, slot, wants)
+        state = {**dict(zip(STATE, self.weights.stored(sums))), "share": share_here}
+        weight_layout().write(store.points["weights"], state, slot, wants)
+        if self.classes is not None:
+            dr.scatter(store.points["first"], history[0] == 0, slot, wants)
+
     def _ask_for_photons(self, state, at, smooth):
         """Stores the vertices at which photons are to be gathered."""
         vertex, _, _, _, _, share_here, _, sums, history, _ = state
         weights, store, queries = self.weights, self.store, self.queries
         last = at.ends | (weights is not None)
         wants = smooth & (dr.max(at.throughput) > 0)
+        if queries.points:
+            self._ask_in_medium(state, at, wants & at.scatters)
         if self.flies:
             wants &= ~at.scatters
         if not queries.has_caustics:
@@ -388,7 +422,10 @@ def trace_camera_paths(
     With `weights` all of these count along all of the way: the number of the segment's last vertex,
     and the state of the weights before it, are kept with each beam (`beam_weights`).
     Where `queries` have room for beams, of each kind, `vertices` have two entries more, `beams`
-    (see `beams.new_beams`) and `beam_count`, how many of one kind wanted a place.
+    (see `beams.new_beams`) and `beam_count`, how many of one kind wanted a place. Where they ask at
+    `points`, paths scatter once more, and `vertices` have the entry `points`: vertices in media
+    (`words`: see `points.new_points`), in sections as those on surfaces, with the same `weights`
+    and `first`.
 
     With `weights` (a `mis.state.MergeState`) all photons are wanted at every smooth vertex, and
     direct light at each is weighted. The vertex buffer is then one section for each smooth vertex
@@ -408,4 +445,8 @@ def trace_camera_paths(
         store.vertices |= {"beams": store.beams, "beam_count": count}
         if weights is not None:
             store.vertices["beam_weights"] = store.beam_weights
-    return radiance, alpha, splat, store.vertices, store.count
+    count = store.count
+    if queries.points:
+        store.vertices["points"] = store.points
+        count = dr.maximum(count, store.point_count)
+    return radiance, alpha, splat, store.vertices, count

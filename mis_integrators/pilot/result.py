@@ -199,8 +199,8 @@ class PilotResult:
     def gathered(self, kind: str, radius: Radii, share: float) -> Radii:
         """Photons of a kind within `radius` of a vertex, on average, of that `share` of the light
         sub-paths."""
-        disks = (radius / self.errors["relmse"][kind].ladder[-1]) ** 2
-        return share * self.photons[kind] * disks
+        share_of_radius = radius / self.errors["relmse"][kind].ladder[-1]
+        return share * self.photons[kind] * share_of_radius ** self.setting.dimensions(kind)
 
     def _cost(self, kind: str, radius: Radii, corrected: bool, share: float) -> Radii:
         """Cost of an iteration by one kind of photons, see `cost`."""

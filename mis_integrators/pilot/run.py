@@ -21,8 +21,8 @@ PILOT_INDEX = 1 << 30
 MOST_PHOTONS = 160
 """Tuned: photons a vertex within the largest radius that is tried."""
 PROBED_SHARE = 8
-"""Volume photons within the largest radius are counted within one so many times smaller: their
-number grows with its square."""
+"""Volume photons within the largest radius are counted within one so many times smaller: along a
+path's way through media their number grows with its square, around a vertex with its cube."""
 FEWEST_PHOTONS, WIDER = 1, 4
 """Tuned: photons a vertex within the largest radius, fewer than which tell nothing (the camera may
 see one point only): then radii so many times larger are tried, up to those that suit the whole
@@ -38,8 +38,8 @@ class PilotIteration(Protocol):
         none."""
 
     def mean_photon_count(self, kind: str, radius: float) -> float:
-        """Photons of a kind within `radius` of a vertex, on average; volume photons: of a path's
-        way through media."""
+        """Photons of a kind within `radius` of a vertex, on average; volume photons along beams: of
+        a path's way through media."""
 
     def gather(self, radii: dict[str, np.ndarray]) -> dict[tuple[str, bool], np.ndarray]:
         """What photons bring for the radii of each kind, by kind and whether the estimate is
@@ -121,9 +121,10 @@ def choose_ladder(
     if "volume" in setting.kinds:
         largest = largest_radius(setting.extent)
         probe = largest / PROBED_SHARE
-        count = iteration.mean_photon_count("volume", probe) * PROBED_SHARE**2
+        power = setting.dimensions("volume")
+        count = iteration.mean_photon_count("volume", probe) * PROBED_SHARE**power
         if count > 0:
-            largest *= min((MOST_PHOTONS / count) ** 0.5, 1)
+            largest *= min((MOST_PHOTONS / count) ** (1 / power), 1)
             radii["volume"] = ladder_from(largest)
             photons["volume"] = min(count, MOST_PHOTONS)
     return radii, photons

@@ -56,6 +56,12 @@ class PilotSetting:
     """Whether the errors that count are those that a denoiser leaves (see `denoiser`)."""
     light_shares: tuple[float, ...] = (1.0,)
     """To choose from: the share of its light sub-paths that an iteration has."""
+    volume_dimensions: int = 2
+    """Of what volume photons are found in: disks across beams, or balls."""
+
+    def dimensions(self, kind: str) -> int:
+        """Power of the radius with which the number of photons grows."""
+        return self.volume_dimensions if kind == "volume" else 2
 
     @property
     def planned_iterations(self) -> int:

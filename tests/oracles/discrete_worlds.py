@@ -6,7 +6,10 @@ level j has the shape n1 x ... x nj, the states of z1 ... zj. `measure[j-1]` is 
 angle of z_j seen from z_{j-1} [sr], `f[j-1]` the scattering at z_{j-1} towards z_j [1/sr],
 `L0[j-1]` the direct luminance of z_j (0 < j < K-1), `L` and `b` luminance and second photon sum of
 level K-1. The camera path draws its direction with p = f / mu, mu the albedo. Weights are a
-dictionary: `w[l, i]`, an array of level l - 1.
+dictionary: `w[l, i]`, an array of level l - 1. `cost[i]`: what merging a photon at z_i costs in
+units of merging it in the disk that n_F is for, an array of level i (a number for i = 0): above one
+in smaller disks, and in balls, which find as many photons as a disk of their volume times the
+extinction.
 """
 
 from dataclasses import dataclass
@@ -26,6 +29,11 @@ class World:
     L0: list
     L: np.ndarray
     b: np.ndarray
+    cost: list | None = None
+
+    def __post_init__(self):
+        if self.cost is None:
+            self.cost = [np.array(1.0)] + [np.ones(np.shape(a)) for a in self.f]
 
     def families(self):
         """All (l, i), shortest family first; l = 1 has one strategy, whose weight is one."""
@@ -51,7 +59,8 @@ class World:
 
 def load(entry):
     """The world and the known answers of one entry of optimal_weights.json."""
-    arrays = {name: [np.array(a) for a in entry[name]] for name in ("measure", "f", "L0")}
+    names = ("measure", "f", "L0", *(["cost"] if "cost" in entry else []))
+    arrays = {name: [np.array(a) for a in entry[name]] for name in names}
     world = World(
         entry["K"],
         entry["N_B"],
@@ -64,9 +73,9 @@ def load(entry):
     return world, weights, entry["J_optimal"], entry["J_single"]
 
 
-def random_world(seed, K, states=None, n_F=None, N_B=None, spread=1.2, zeros=0.0):
+def random_world(seed, K, states=None, n_F=None, N_B=None, spread=1.2, zeros=0.0, mixed=False):
     """`spread`: standard deviation of the logarithms of f and L; `zeros`: share of L0 and L that is
-    zero."""
+    zero; `mixed`: merging costs differ from vertex to vertex."""
     rng = np.random.default_rng(seed)
     states = states or rng.integers(2, max(2, 7 - K), size=K - 1, endpoint=True)
     shapes = [tuple(states[: j + 1]) for j in range(K - 1)]
@@ -93,6 +102,7 @@ def random_world(seed, K, states=None, n_F=None, N_B=None, spread=1.2, zeros=0.0
         [light(s) for s in shapes[:-1]],
         L,
         L * positive(shapes[-1], 0.2),
+        [positive(shape) for shape in ((), *shapes)] if mixed else None,
     )
 
 
@@ -104,7 +114,7 @@ def residuals(world, weights):
     Voloboy 2021); linear in the weights.
 
     The merging strategies' kernel costs (1/n_F) w^2 kappa_i rho_l, kappa_0 = N_B f_0, kappa_i = T_i
-    f_i, at the last vertex T b/L; and the camera path's variance, P (X - <X>)^2 with X = sum of T_i
+    f_i, at the last vertex T b/L, each times the vertex's cost; and the camera path's variance, P (X - <X>)^2 with X = sum of T_i
     times what is gathered at z_i, averaged over light paths.
     """
     K, measure, f = world.K, world.measure, world.f
@@ -122,9 +132,10 @@ def residuals(world, weights):
         carried = world.light(family) * weights[family, i]
         if i < family - 1 or family == K:
             if i == K - 1:
-                kappa = throughput[i] * world.c()
+                kappa = throughput[i] * world.c() * world.cost[i]
             else:
                 kappa = world.N_B * f[0] if i == 0 else throughput[i][..., None] * f[i]
+                kappa = kappa * world.cost[i][..., None]
                 kappa = kappa.reshape(kappa.shape + (1,) * (family - 2 - i))
             cost = np.sqrt(kappa / world.n_F * flux[family - 1] * world.light(family))
             costs.append(cost * weights[family, i])
@@ -210,10 +221,18 @@ def recurse(world, local=False, dtype=np.float64, call=on_numpy, estimate=lambda
     `local` leaves the integrals out; `call` applies an elementwise function.
     """
     K = world.K
-    measure, f, p, L0 = (
+    measure, f, p, L0, cost = (
         [np.asarray(a, dtype) for a in arrays]
-        for arrays in (world.measure, world.f, [world.p(j) for j in range(K - 1)], world.L0)
+        for arrays in (
+            world.measure,
+            world.f,
+            [world.p(j) for j in range(K - 1)],
+            world.L0,
+            world.cost,
+        )
     )
+    # What merging costs: BSDF and density of the camera path grow alike.
+    dear_f, dear_p = ([x * cost[j][..., None] for j, x in enumerate(of)] for of in (f, p))
     L, c, n, N_B = (np.asarray(a, dtype) for a in (world.L, world.c(), world.n_F, world.N_B))
 
     def integral(j, x):
@@ -223,16 +242,16 @@ def recurse(world, local=False, dtype=np.float64, call=on_numpy, estimate=lambda
     def average(j, x):
         return integral(j, x * p[j])
 
-    r, theta, onward = [None, call(recursion.first_ratio, p[0], N_B)], [None], [None]
+    r, theta, onward = [None, call(recursion.first_ratio, dear_p[0], N_B)], [None], [None]
     for i in range(1, K - 1):
-        theta.append(call(recursion.kernel_share, r[i][..., None], f[i]))
-        onward.append(call(recursion.kernel_rest, r[i][..., None], f[i]))
-        r.append(call(recursion.next_ratio, theta[i], p[i]))
+        theta.append(call(recursion.kernel_share, r[i][..., None], dear_f[i]))
+        onward.append(call(recursion.kernel_rest, r[i][..., None], dear_f[i]))
+        r.append(call(recursion.next_ratio, theta[i], dear_p[i]))
 
     e, eta, tau, luminance = [None] * K, [None] * K, [None] * K, L
     for i in range(K - 1, 0, -1):
         if i == K - 1:
-            gamma = call(recursion.deepest_response, n, L, c, r[i])
+            gamma = call(recursion.deepest_response, n, L, c * cost[i], r[i])
         else:
             first, second = (average(i, onward[i] ** power * eta[i + 1]) for power in (1, 2))
             tau[i] = (
@@ -243,7 +262,7 @@ def recurse(world, local=False, dtype=np.float64, call=on_numpy, estimate=lambda
                 n,
                 L0[i - 1],
                 r[i],
-                integral(i, onward[i] * luminance),
+                integral(i, onward[i] / cost[i][..., None] * luminance),
                 second,
                 first,
                 tau[i],
@@ -269,7 +288,7 @@ def recurse(world, local=False, dtype=np.float64, call=on_numpy, estimate=lambda
         if family < K:
             w = call(recursion.direct_weight, drive[last], e[last])
         else:
-            w = call(recursion.deepest_weight, drive[last], e[last], r[last], c)
+            w = call(recursion.deepest_weight, drive[last], e[last], r[last], c * cost[last])
         weights[family, last] = deeper = w
         for i in range(family - 2, 0, -1):
             at = (...,) + (None,) * (family - 2 - i)

@@ -1,0 +1,206 @@
+"""Point-point density estimation in media: radiance that volume photons bring to camera vertices
+that lie there.
+
+Photons within the radius count by a constant kernel on the ball around the vertex (Jensen and
+Christensen 1998, Efficient simulation of light transport in scenes with participating media using
+photon maps). Compared with beams (`photons.beams`), only photons around one point of the camera's
+way count, so that the estimate is noisier. But what a vertex gathers depends on the path up to
+there alone, as weights of several strategies need it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from ..core.packing import read_mark
+from ..core.recording import lanes
+from ..core.records import Layout
+from ..core.spectra import channel_mean
+from ..paths.light_classes import CLASSES, by_class, class_of
+from ..paths.media import point_in, scattered_share
+from .grid import DiskQuery, visit_hits
+from .photon import read_power
+from .scattering import Scattering
+from .volume import number_of_medium, read_place
+
+SMALLEST_SCATTERING = 1e-12
+"""Stands for the scattering coefficient where a medium only absorbs: no photon is left there."""
+
+
+def point_layout():
+    """Fields of a camera vertex in a medium that waits for photons: position, number of the path,
+    direction `d` of the ray that led there, `depth` in segments, the path's throughput with this
+    scattering's albedo, the medium."""
+    return Layout(
+        {
+            "p": mi.Point3f,
+            "path": mi.UInt32,
+            "d": mi.Vector3f,
+            "depth": mi.UInt32,
+            "throughput": mi.Spectrum,
+            "medium": mi.MediumPtr,
+        }
+    )
+
+
+def new_points(capacity):
+    """Room for `capacity` vertices; unused ones are zero."""
+    return dr.zeros(mi.UInt32, point_layout().words * capacity)
+
+
+def read_points(words, first=0, count=None):
+    """The vertices of a buffer, or `count` of them from place `first` on: a dictionary."""
+    index = lanes(point_layout().capacity(words) if count is None else count) + first
+    return point_layout().read(words, index)
+
+
+@dataclass
+class Points:
+    """Vertices in media, one a lane: the fields of `point_layout`, which are `active`, which have
+    scattered nowhere before (`first`; None: nobody asks), and their coefficients."""
+
+    p: mi.Point3f
+    d: mi.Vector3f
+    depth: mi.UInt32
+    throughput: mi.Spectrum
+    medium: mi.MediumPtr
+    active: mi.Bool
+    first: mi.Bool | None
+    wavelengths: mi.Float
+    scattering: mi.Spectrum
+    albedo: mi.Spectrum
+    extinction: mi.Float
+    even: bool
+
+    @classmethod
+    def of(cls, traits, record, wavelengths):
+        """The vertices of records as of `read_points` (a `first` among them, if there is one)."""
+        active = dr.max(record["throughput"]) > 0
+        medium = dr.select(active, record["medium"], dr.zeros(mi.MediumPtr))
+        sigma_s, albedo, extinction = scattered_share(medium, record["p"], wavelengths, active)
+        return cls(
+            record["p"],
+            record["d"],
+            record["depth"],
+            record["throughput"],
+            medium,
+            active,
+            record.get("first"),
+            wavelengths,
+            sigma_s,
+            albedo,
+            extinction,
+            not traits.has_grids,
+        )
+
+    def scattering_around(self, p, active):
+        """Scattering coefficient [1/m] by which the power that photons at `p` have left per volume
+        is divided: the larger one of theirs and the vertex's own, so that at the rim of a cloud
+        neither makes a firefly. Where the medium is even both are the same."""
+        if self.even:
+            return dr.maximum(self.scattering, SMALLEST_SCATTERING)
+        medium = dr.select(active, self.medium, dr.zeros(mi.MediumPtr))
+        there, _, _ = scattered_share(medium, p, self.wavelengths, active)
+        return dr.maximum(dr.maximum(there, self.scattering), SMALLEST_SCATTERING)
+
+    def phase(self, towards, active):
+        """`Scattering` of light from `towards` (a unit vector): there are no cosines, and phase
+        functions are the same from both sides."""
+        medium = dr.select(active, self.medium, dr.zeros(mi.MediumPtr))
+        mei = point_in(medium, self.p, mi.Float(0), self.wavelengths, -self.d)
+        value, pdf = medium.phase_function().eval_pdf(
+            mi.PhaseFunctionContext(None), mei, towards, active
+        )
+        value = mi.Spectrum(value)
+        return Scattering(towards, mi.Float(1), value, value * self.albedo, pdf, lambda: pdf)
+
+
+class BallQuery(DiskQuery):
+    """The rows of volume photons within `radius` of points."""
+
+    def read(self, index):
+        """The `VolumeLanding` of photons `index`, and its offset from the points."""
+        landing = read_place(self.photon_map.place, index)
+        return landing, landing.p - self.p
+
+
+def takes(points, landing, straight):
+    """Whether photons (`VolumeLanding`) count for the points: those in the same medium; light that
+    comes straight from a light (`straight`) is next-event estimation's, if it is not asked for."""
+    own = landing.medium == number_of_medium(points.medium)
+    return own if straight else own & (landing.caustic | (landing.depth > 1))
+
+
+def gather_in_balls(
+    photon_map,
+    points,
+    radii,
+    light_path_count,
+    max_depth: int,
+    weigh,
+    grey=False,
+    marked=False,
+    straight=False,
+):
+    """Radiance that volume photons bring to vertices in media, for each radius of a list: the sum
+    over photons of phase function x flux over the scattering coefficient, over (4/3 pi radius^3 x
+    light sub-paths).
+
+    A photon has the albedo of its scattering in its flux, and the camera's throughput has that of
+    its own: what is divided by is the coefficient of both. Parameters and result are those of
+    `gather.gather_photons`; `weigh` is called with a `VolumeLanding`; `straight`: as of `takes`.
+    """
+    split = marked and not grey
+
+    def visit(index, landing, offset, distance_squared, hit, totals):
+        hit &= takes(points, landing, straight)
+        if max_depth > 0:
+            hit &= landing.depth + points.depth <= max_depth
+        flux, towards = read_power(photon_map.power, index, hit)
+        if marked:
+            flux, delta_at_light = read_mark(flux)
+        scattering = points.phase(dr.normalize(towards), hit)
+        value = flux * scattering.value / points.scattering_around(landing.p, hit)
+        value *= dr.select(hit, weigh(index, landing, scattering, hit), 0)
+        if grey:
+            value = channel_mean(value * points.throughput)
+        values = [value]
+        if split:
+            alone = (landing.depth == 1) & points.first
+            smooth = dr.select(alone, mi.UInt32(1), mi.UInt32(2))
+            values = by_class(class_of(smooth, delta_at_light), value)
+        inside = [hit & (distance_squared < dr.square(radius)) for radius in radii]
+        found = [dr.select(i, value, 0) for i in inside for value in values]
+        return tuple(total + value for total, value in zip(totals, found))
+
+    query = BallQuery(photon_map, points.p, radii[-1], points.active)
+    sums = [radius for radius in radii for _ in range(len(CLASSES) if split else 1)]
+    zeros = tuple(mi.Float(0) if grey else mi.Spectrum(0) for _ in sums)
+    totals = visit_hits(query, visit, zeros)
+    factor = 1 if grey else points.throughput
+    return [
+        dr.select(points.active, total * factor / (ball_volume(radius) * light_path_count), 0)
+        for total, radius in zip(totals, sums)
+    ]
+
+
+def ball_volume(radius):
+    """4/3 pi radius^3."""
+    return (4 / 3 * dr.pi) * radius * dr.square(radius)
+
+
+def mean_count_in_balls(photon_map, points, radius):
+    """Photons within `radius` of a vertex, on average over the used ones (a number)."""
+    query = BallQuery(photon_map, points.p, radius, points.active)
+    (count,) = visit_hits(
+        query,
+        lambda index, landing, offset, distance_squared, hit, counts: (
+            counts[0] + dr.select(hit & takes(points, landing, False), mi.UInt32(1), 0),
+        ),
+        (mi.UInt32(0),),
+    )
+    used = int(dr.count(points.active)[0])
+    return float(dr.sum(mi.Float(count))[0]) / used if used else 0.0
