@@ -266,6 +266,7 @@ class BDPMOptSession(WeightedSession):
             integrator.mix_diffuse,
             self.fluence,
             merge_settings.get("disk_per_ball"),
+            merge_settings.get("ball_paths"),
         )
 
     def merge_settings(self, radii):
@@ -279,6 +280,7 @@ class BDPMOptSession(WeightedSession):
         if self.fluence is not None:
             ball = ball_volume(radii.get("volume", radius))
             of_media["disk_per_ball"] = dr.pi * dr.square(radius) / ball
+            of_media["ball_paths"] = ball * self.light_path_count
         dearer = dr.opaque(mi.Float, sum(cache.caustic_flux) / max(sum(cache.photon_flux), 1e-30))
         return {
             "n": dr.pi

@@ -92,20 +92,29 @@ class WeightedSession(BDPMSession):
 
     def point_weigher(self, weights, level, points, record, photon_map):
         """What weighs volume photons at the vertices in media of one strategy (`weigh` of
-        `gather_in_balls`): caustic ones as the vertex's direct light. `record` as of
-        `_read_points`, `points` made of it."""
+        `gather_in_balls`): caustic ones as the vertex's direct light, those that come straight from
+        a light as a part of that. `record` as of `_read_points`, `points` made of it."""
         light_state, state = weights.light_state(), [record[name] for name in STATE]
         cost = weights.ball_cost(points.extinction)
+        found = weights.ball_paths * points.extinction
 
         def weigh(index, landing, scattering, active):
-            weight = state[0]
+            weight, share = state[0], record["share"]
+            if light_state is None:
+                return dr.select(landing.caustic, share, weight)
+            words, place = photon_map.mis_words, photon_map.place_of_mis_words(index, active)
             if level < self.integrator.strategies - 1:
-                place = photon_map.place_of_mis_words(index, active)
-                passed = light_state.read(level, photon_map.mis_words, place, active)
                 weight = weights.merge_weight(
-                    level, state, scattering.f * cost, scattering.p * cost, passed
+                    level,
+                    state,
+                    scattering.f * cost,
+                    scattering.p * cost,
+                    light_state.read(level, words, place, active),
                 )
-            return dr.select(landing.caustic, record["share"], weight)
+            straight = landing.depth == 1
+            ratio = light_state.straight_from_light(words, place, active)
+            direct = share * weights.share_of_photons(found, ratio)
+            return dr.select(landing.caustic, share, dr.select(straight, direct, weight))
 
         return weigh
 
@@ -199,6 +208,7 @@ class WeightedSession(BDPMSession):
                 self.point_weigher(weights, level, there, record, photon_map),
                 grey,
                 self.integrator.splits_light,
+                weights.weighs_points_of_lights,
             )
 
         return self._by_section(point_layout().capacity(points["words"]), gather)

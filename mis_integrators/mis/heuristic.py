@@ -120,7 +120,7 @@ class HeuristicWeights:
         return [dr.full(mi.Float, -1, width), dr.ones(mi.Float, width)]
 
     def propagate(self, state, si, bsdf, vertex, mask):
-        return state, mi.Spectrum(1)  # not used: see next_event_weight
+        return state, mi.Spectrum(1)  # all of it is in next_event_weight
 
     def scatter(self, state, si, bsdf, bs, vertex, mask):
         """State after a smooth scattering into `bs.wo`."""

@@ -16,6 +16,7 @@ import mitsuba as mi
 from ..core.records import Layout
 from ..core.spectra import channel_mean
 from ..core.traits import lookup
+from ..paths.light_starts import seen_from
 from ..paths.vertex import in_medium
 from ..weights import recursion
 from .neighbour_radiance import HALVES
@@ -116,16 +117,18 @@ class OptimalWeights:
     `mix_diffuse`:
     whether strategies go on beyond Lambertian vertices; else the first of these is a path's last
     strategy. In scenes with media, which have local weights only, `fluence` is the
-    `IrradianceCache` of these, and `disk_per_ball` [1/m] the area of a merge disk over the volume
-    of a merge ball (width one).
+    `IrradianceCache` of these, `disk_per_ball` [1/m] the area of a merge disk over the volume of a
+    merge ball, and `ball_paths` [m^3] that volume times the light sub-paths (both of width one).
 
     **Vertices in media.** A ball of volume V there finds as many photons as a disk of the area V
     sigma, sigma being the extinction. So merging costs the BSDF f times A / (V sigma), where A is
     the disk of surfaces, and with densities p scaled alike the recursion stays as it is (docs/
     bdpm_opt.md derives it). The BSDF is the phase function times the albedo.
-    """
 
-    weighs_points_of_lights = False
+    Next-event estimation is very noisy close to a lamp in a medium, where nothing keeps vertices
+    away from it. So direct light has two techniques there, that and merging the photons that come
+    straight from the light, and these share what is direct light's by the balance heuristic.
+    """
 
     def __init__(
         self,
@@ -142,8 +145,10 @@ class OptimalWeights:
         mix_diffuse,
         fluence=None,
         disk_per_ball=None,
+        ball_paths=None,
     ):
-        self.fluence, self.disk_per_ball = fluence, disk_per_ball
+        self.fluence, self.disk_per_ball, self.ball_paths = fluence, disk_per_ball, ball_paths
+        self.weighs_points_of_lights = fluence is not None and strategies > 1
         self.lights, self.traits, self.cache, self.neighbour_radiance, self.n, self.caustic_cost = (
             lights,
             traits,
@@ -337,16 +342,37 @@ class OptimalWeights:
     def init(self, width):
         """State of a camera path: drive and r of the vertex it arrives at; after arrival tau, and
         u: e drive, or the offset G at the first strategy's vertex, or the photons' weight where
-        strategies end."""
-        return [mi.Spectrum(dr.full(mi.Float, value, width)) for value in (1, 1, 0, 0)]
+        strategies end. With media also N_F V sigma of that vertex [m^2], zero on surfaces."""
+        state = [mi.Spectrum(dr.full(mi.Float, value, width)) for value in (1, 1, 0, 0)]
+        return state + ([dr.zeros(mi.Float, width)] if self.weighs_points_of_lights else [])
+
+    def found_photons(self, si, bsdf, mask):
+        """N_F V sigma [m^2]: times a density of light sub-paths per area across them, the photons
+        that a ball finds; zero on surfaces."""
+        inside = mask & bsdf.scatters
+        _, extinction = bsdf.coefficients(si, inside)
+        return dr.select(inside, self.ball_paths * extinction, 0)
+
+    def next_event_weight(self, state, ref, ds, mask):
+        """The balance heuristic between next-event estimation for `ds` and merging its photons."""
+        ratio = self.lights.emission_over_nee_pdf(ref, ds, mask)
+        return mi.Spectrum(1 - self.share_of_photons(state[-1], ratio))
+
+    @staticmethod
+    def share_of_photons(found, ratio):
+        """Share of direct light's photons in its weight, with `found` and `ratio` as of
+        `found_photons` and `Lights.emission_over_nee_pdf`."""
+        return 1 - dr.rcp(1 + found * ratio)
 
     def propagate(self, state, si, bsdf, vertex, mask):
         """State at a smooth vertex, and the weight of the direct light there."""
-        drive, r, u, tau = state
+        drive, r, u, tau, *found = state
         share = mi.Spectrum(1)
         at_root = mask & (vertex == self.first)
         if self.strategies == 1:
             return [drive, r, dr.select(at_root, 1, u), tau], share
+        merged = mask & (vertex >= self.first)
+        found = [self.found_photons(si, bsdf, merged) for _ in found]
         u = dr.select(at_root, self.offset(si, bsdf, at_root) if self.full else mi.Spectrum(0), u)
         u = dr.select(at_root & self.is_last(bsdf, at_root), 1, u)
         node = self.node(si, bsdf, mask & (vertex > self.first))
@@ -360,11 +386,11 @@ class OptimalWeights:
             )
             tau = dr.select(here, carried, tau)
             share = dr.select(here, self.direct_weight(remaining, r, node), share)
-        return [drive, r, u, tau], share
+        return [drive, r, u, tau, *found], share
 
     def scatter(self, state, si, bsdf, bs, vertex, mask):
         """State after a smooth scattering into `bs.wo`."""
-        drive, r, u, tau = state
+        drive, r, u, tau, *found = state
         mask = mask & (vertex >= self.first)
         f, p = self.scattering(si, bsdf, bs.wo, mask)
         at_root = mask & (vertex == self.first)
@@ -372,7 +398,7 @@ class OptimalWeights:
         inner_drive, inner_r = self.step(u, tau, r, f, p)
         drive = dr.select(at_root, root_drive, dr.select(mask, inner_drive, drive))
         r = dr.select(at_root, root_r, dr.select(mask, inner_r, r))
-        return [drive, r, u, tau]
+        return [drive, r, u, tau, *found]
 
     def root_step(self, offset, f, p):
         """Drive and r of the vertex after the first strategy's, which scattered with value f and
@@ -394,7 +420,7 @@ class OptimalWeights:
 
     def stored(self, state):
         """What the photons merged at a vertex need of its state: u (or the offset), tau, r."""
-        _, r, u, tau = state
+        _, r, u, tau = state[:4]
         return [u, tau, r]
 
     # ------------------------------------------------------------------ photons
@@ -445,7 +471,7 @@ class LightState:
         self.layout = Layout(
             {
                 (node, field): type(value)
-                for node, fields in enumerate(self.init())
+                for node, fields in enumerate(self._split(self.init())[0])
                 for field, value in enumerate(fields)
             }
         )
@@ -500,33 +526,54 @@ class LightState:
                 )
             )
 
-        return [[type(x)(x) for x in nothing()] for _ in range(self.whole)] + [
-            [type(x)(x) for x in nothing()[:FIELDS_OF_THE_LAST]]
-        ]
+        nodes = [[type(x)(x) for x in nothing()] for _ in range(self.whole)]
+        nodes.append([type(x)(x) for x in nothing()[:FIELDS_OF_THE_LAST]])
+        return nodes + ([[mi.Float(0)]] if self.weights.weighs_points_of_lights else [])
 
-    @staticmethod
-    def first_vertex(state, si, source, straight):
-        return state
+    def _split(self, state):
+        """The vertices, and what there is with media only: density of direct light's photons at the
+        first vertex, over that of next-event estimation [1/m^2]."""
+        return state[: self.whole + 1], state[self.whole + 1 :]
+
+    def first_vertex(self, state, si, source, straight):
+        nodes, others = self._split(state)
+        if not others:
+            return state
+        ds = seen_from(si, source, straight)
+        ratio = self.weights.lights.emission_over_nee_pdf(si, ds, straight)
+        return [*nodes, [dr.select(straight, ratio, others[0][0])]]
 
     def scatter(self, state, si, bsdf, wo, mask):
         view = mi.SurfaceInteraction3f(si)
         view.wi = mi.Vector3f(wo)
         f, p = self.weights.scattering(view, bsdf, si.wi, mask) if self.whole else (None, None)
         node = self.weights.node(view, bsdf, mask, f, p)
-        node.indirectly = state[0][0][0] >= 0
+        nodes, others = self._split(state)
+        node.indirectly = nodes[0][0][0] >= 0
         new = self._fields(node)
         result = []
-        for old in state:
+        for old in nodes:
             result.append([dr.select(mask, a, b) for a, b in zip(new, old)])
             new = old
-        return result
+        return result + others
 
     def volume_words(self, state):
-        """As `words`, of photons in media."""
-        return self.words(state)
+        """As `words`, of photons in media: those that come straight from a light have what
+        `first_vertex` found, less one, below zero, in the place of a radiance."""
+        (nearest, *others), *found = self._split(state)
+        if not found[0]:
+            return self.words(state)
+        direct, *fields = nearest
+        direct = dr.select(direct[0] < 0, -1 - found[0][0][0], direct)
+        return self.words([[direct, *fields], *others])
+
+    def straight_from_light(self, mis_words, index, active):
+        """What `first_vertex` found of photons that come straight from a light."""
+        first = next(iter(self.layout.fields))
+        return -1 - self.layout.read(mis_words, index, active, (first,))[first][0]
 
     def words(self, state):
-        values = [field for fields in state for field in fields]
+        values = [field for fields in self._split(state)[0] for field in fields]
         return self.layout.flat(dict(zip(self.layout.fields, values)))
 
     def read(self, level, mis_words, index, active):

@@ -98,7 +98,7 @@ class MergeState(Protocol):
 
     weighs_points_of_lights: bool
     """Whether the weight of direct light depends on the point of the light: then
-    `next_event_weight` gives it, else `propagate`."""
+    `next_event_weight` gives a factor, beside that of `propagate`."""
 
     def init(self, width: int) -> State:
         """A state before the first vertex."""
@@ -115,8 +115,8 @@ class MergeState(Protocol):
         """After a smooth scattering into the local direction `bs.wo`."""
 
     def next_event_weight(self, state: State, ref: Any, ds: Any, mask: Array) -> Array:
-        """Weight of the light of `ds` at the vertex `ref` (a spectrum); `state`: after leaving
-        `ref` for the light."""
+        """Factor of the weight of the light of `ds` at the vertex `ref` (a spectrum); `state`:
+        after leaving `ref` for the light."""
 
     def ends(self, bsdf: Any, vertex: Array, mask: Array) -> Array:
         """Whether no strategy goes on beyond the vertex, although there are more."""

@@ -246,7 +246,7 @@ class QueryVisitor:
         later = shown & met
         light_pdf = self.lights.pdf_direct(origin, ds, later)
         if self.by_light:
-            share_here = self.weights.next_event_weight(sums, origin, ds, later)
+            share_here = share_here * self.weights.next_event_weight(sums, origin, ds, later)
         share = dr.select(met, mis_power(scatter_pdf, light_pdf) * share_here, mi.Spectrum(1))
         light = at.throughput * share * ds.emitter.eval(at.si, shown)
         if self.classes is not None:
@@ -305,7 +305,7 @@ class QueryVisitor:
         response, response_pdf = scattering.eval_pdf(mi.BSDFContext(), si, wo, lit)
         if self.by_light:
             left = weights.scatter(sums, si, scattering, mi.BSDFSample3f(wo), vertex, reached)
-            share_here = weights.next_event_weight(left, si, ds, reached)
+            share_here = share_here * weights.next_event_weight(left, si, ds, reached)
         share = dr.select(ds.delta, 1, mis_power(light_pdf, response_pdf)) * share_here
         return dr.select(smooth, at.throughput * share * response * light, 0)
 

@@ -9,7 +9,6 @@ from mis_integrators.photons.points import (
     Points,
     ball_volume,
     gather_in_balls,
-    point_layout,
 )
 from mis_integrators.photons.queries import STATE
 from mis_integrators.photons.volume import (
@@ -59,7 +58,8 @@ class OptimalPaths(JointPaths):
     """The same paths, under optimal weights, whose photons in media are merged in balls."""
 
     def camera(self, weights):
-        """What a camera path stores at each vertex, and the weight of direct light there."""
+        """What a camera path stores at each vertex, the weight of direct light there, and the state
+        after leaving the last one."""
         state, stored, shares = weights.init(COUNT), [], []
         for number, (_, _, si, scattering, bs) in enumerate(self.vertices):
             vertex = dr.full(mi.UInt32, number, COUNT)
@@ -68,14 +68,15 @@ class OptimalPaths(JointPaths):
             shares.append(share)
             state = weights.scatter(state, si, scattering, bs, vertex, self.valid)
             dr.eval(state, stored, shares)
-        return stored, shares
+        return stored, shares, state
 
-    def in_ball(self, weights, stored, share, level, caustic):
+    def in_ball(self, weights, stored, share, level, caustic, straight=False):
         """Weight of a photon in the medium, by the code of the gather."""
         ray, _, si, _, _ = self.vertices[level]
         place, power = new_volume_photons(COUNT)
         index = dr.arange(mi.UInt32, COUNT)
         photon = {**self._photon(level), "caustic": mi.Bool(caustic)}
+        photon["depth"] = mi.UInt32(1 if straight else 2)
         write_volume_photon(place, power, index, photon, True)
         words = self._words(weights.light_state(), level, not caustic)
         radius = dr.opaque(mi.Float, NEAR)
@@ -94,18 +95,26 @@ class OptimalPaths(JointPaths):
         weigh = weights.session.point_weigher(weights.weights, level, points, record, photon_map)
         found = []
         for each in (weigh, lambda index, landing, scattering, active: mi.Float(1)):
-            (radiance,) = gather_in_balls(photon_map, points, [radius], 1, -1, each)
+            (radiance,) = gather_in_balls(
+                photon_map, points, [radius], 1, -1, each, straight=straight
+            )
             dr.eval(radiance)
             found.append(np.array(dr.mean(radiance)))
         self.valid &= mi.Bool(found[1] > 0)
         return found[0] / np.maximum(found[1], 1e-30)
 
 
+def direct_light(paths, weights, left, share):
+    """Weight of next-event estimation at the last vertex."""
+    si = paths.vertices[-1][2]
+    return np.array(dr.mean(share * weights.next_event_weight(left, si, paths.light, paths.valid)))
+
+
 def weights_found(paths, weights, strategies, straight):
     """Weights of all strategies that can make the paths, by the code of each: merging at z_0, z_1,
-    ..., and direct light (or a caustic photon) at the last vertex."""
+    ..., at the last vertex direct light and in a medium its photon, or a caustic photon."""
     last = len(paths.kinds) - 1
-    stored, shares = paths.camera(weights)
+    stored, shares, left = paths.camera(weights)
     found = []
     for level in range(min(last, strategies)):
         if paths.kinds[level] == "M":
@@ -118,10 +127,15 @@ def weights_found(paths, weights, strategies, straight):
             paths.valid &= plain > 0
             found.append(np.array(weighed / plain))
     if last < strategies:
-        if straight or paths.kinds[last] == "S":
+        in_ball = (weights, stored[last], shares[last], last)
+        if straight:
+            found.append(direct_light(paths, weights, left, shares[last]))
+            if paths.kinds[last] == "M":
+                found.append(paths.in_ball(*in_ball, False, True))
+        elif paths.kinds[last] == "S":
             found.append(np.array(dr.mean(shares[last])))
         else:
-            found.append(paths.in_ball(weights, stored[last], shares[last], last, True))
+            found.append(paths.in_ball(*in_ball, True))
     valid = np.array(paths.valid)
     assert valid.sum() > 100
     return np.array([np.broadcast_to(weight, COUNT)[valid] for weight in found])
@@ -213,13 +227,16 @@ def _one(index, landing, scattering, active):
 
 
 class SmallRadius(SmallRadiusBatches):
-    """As that, of `bdpm_opt`."""
+    """As that, of `bdpm_opt`. What photons have of direct light goes with the number that a ball
+    holds, and their bias with that: so there are as many in the smaller ball."""
 
     def __init__(self, scene, strategies, **parameters):
         self.blocks, self.batches = 2, []
         self.sessions = [
-            opt(strategies, initial_radius=radius, **parameters).session(scene, seed=1, spp=0)
-            for radius in (2 * RADIUS, RADIUS)
+            opt(strategies, initial_radius=radius, photon_count=count, **parameters).session(
+                scene, seed=1, spp=0
+            )
+            for radius, count in ((2 * RADIUS, 5000), (RADIUS, 40000))
         ]
 
 
@@ -247,23 +264,23 @@ def test_agrees_in_other_variants(variant_name):
 
 
 def noise_of(integrator, scene, count=40):
-    """Variance of an iteration, over the squared mean of the picture, the mean over pixels."""
+    """Relative variance of an iteration: the mean over pixels, and the median."""
     session = integrator.session(scene, seed=5, spp=0)
     images = np.array([picture[:, :, :3].mean(axis=2) for picture in pictures(session, count)])
-    return images.var(axis=0, ddof=1).mean() / images.mean() ** 2
+    variance = images.var(axis=0, ddof=1)
+    return variance.mean() / images.mean() ** 2, np.median(variance / images.mean(axis=0) ** 2)
 
 
 def test_less_noise_than_single_strategies(rgb):
     """Merging in balls at the first vertex alone, at the second alone, and at both under optimal
-    weights, all with the same paths: the mixture has 0.9 of the noise of the better one at most.
-    (0.6 is what was seen; the ratio of two variances of 40 iterations over 256 pixels has a standard
-    deviation of a few percent.)"""
+    weights: the mixture has half of the noise of the better one at most (an eighth is seen; most of
+    that is next-event estimation's near the lamp), and in the median pixel no more."""
     scene = room("area")
-    common = {"initial_radius": 0.15, "camera_paths": 4}
-    single = [
-        noise_of(opt(1, first_vertex=first, **common), scene) for first in (0, 1)
-    ]
-    assert noise_of(opt(2, **common), scene) < 0.9 * min(single)
+    common = {"initial_radius": 0.3, "camera_paths": 4}
+    single = [noise_of(opt(1, first_vertex=first, **common), scene) for first in (0, 1)]
+    mixed = noise_of(opt(2, **common), scene)
+    assert mixed[0] < 0.5 * min(mean for mean, _ in single)
+    assert mixed[1] < 1.1 * min(median for _, median in single)
 
 
 def test_diffuse_scenes_are_those_of_bdpm(rgb):

@@ -114,8 +114,8 @@ def residuals(world, weights):
     Voloboy 2021); linear in the weights.
 
     The merging strategies' kernel costs (1/n_F) w^2 kappa_i rho_l, kappa_0 = N_B f_0, kappa_i = T_i
-    f_i, at the last vertex T b/L, each times the vertex's cost; and the camera path's variance, P (X - <X>)^2 with X = sum of T_i
-    times what is gathered at z_i, averaged over light paths.
+    f_i, at the last vertex T b/L, each times the vertex's cost; and the camera path's variance, P
+    (X - <X>)^2 with X = sum of T_i times what is gathered at z_i, averaged over light paths.
     """
     K, measure, f = world.K, world.measure, world.f
     # per level: T, P, f_0 ... f_j dmu_1 ... dmu_{j+1}
