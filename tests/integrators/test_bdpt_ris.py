@@ -53,7 +53,20 @@ from test_against_path import MONO, RGB, SPECTRAL, caustic_scene
 from test_analytic import inside_sphere, series
 from test_bdpm import box_scene, glossy_box, last_words
 from test_bdpt import JointPaths, room
-from worlds import EMITTERS, POINT_LIKE, T, diffuse, film, has_delta, look, path, ptracer, tray
+from worlds import (
+    EMITTERS,
+    POINT_LIKE,
+    T,
+    diffuse,
+    film,
+    floor_in_a_beam,
+    has_delta,
+    index_matched_pane,
+    look,
+    path,
+    ptracer,
+    tray,
+)
 
 SCENES = Path(__file__).parents[2] / "scenes"
 
@@ -622,6 +635,59 @@ def test_agrees(name, emitter, family, sensor, variant_name, parameters):
     )
 
 
+@pytest.mark.parametrize(
+    "name, emitter, family, sensor",
+    [
+        ("bdpt_ris", "rectangle", "mixed0", "thinlens"),
+        *extended(("pcbpt", "spot", "smooth1", "perspective")),
+    ],
+)
+def test_merging_agrees(rgb, name, emitter, family, sensor):
+    """Connections and merges together."""
+    agree(
+        plugin(name, camera_paths=8, merging=True, initial_radius=0.03),
+        path(rr_depth=50),
+        tray(family, emitter, sensor),
+        whole=0.03,
+        block=0.12,
+        most=400,
+    )
+
+
+@pytest.mark.parametrize("name", ["bdpt_ris", *extended("pcbpt")])
+def test_light_that_only_merging_makes(rgb, name):
+    """A floor under a pane without refraction, seen through it, in a parallel beam: L = rho E / pi,
+    all of it by merges, in films that are rendered in parts, too."""
+    scene = floor_in_a_beam(1, pane=index_matched_pane(0.25))
+    batches = SessionBatches(plugin(name, merging=True, initial_radius=0.05), scene, 2)
+    batches.add(8)
+    exact = Estimate.exact(np.full((5, 3), 0.6 / np.pi))
+    assert_same(*collect_until(batches, exact, 0.01, 0.03), 0.01, 0.03, 1e-3)
+    dark = np.array(mi.render(scene, integrator=plugin(name), spp=16))
+    assert dark.max() == 0
+
+
+@pytest.mark.parametrize("rounds", [1, *extended(2)])
+def test_merges_in_parts(rgb, monkeypatch, rounds):
+    """The film in parts, each with light sub-paths of its own in one round or two: the same light
+    as all at once, merged once."""
+    from mis_integrators.integrators import resampled
+
+    scene = floor_in_a_beam(1, pane=index_matched_pane(0.25))
+    monkeypatch.setattr(resampled, "CHUNK", 600)
+    monkeypatch.setattr(resampled, "KNOWN_PATHS", 50)
+    integrator = plugin(
+        "bdpt_ris", merging=True, initial_radius=0.08, light_paths=50, light_tracing=rounds
+    )
+    session = integrator.session(scene, 0, 1, 0)
+    session.start()
+    assert session.chunks > 1 and session.light_rounds == rounds
+    batches = SessionBatches(integrator, scene, 2)
+    batches.add(8)
+    exact = Estimate.exact(np.full((5, 3), 0.6 / np.pi))
+    assert_same(*collect_until(batches, exact, 0.02, 0.06), 0.02, 0.06, 1e-3)
+
+
 @pytest.mark.full
 def test_agrees_in_spectral_variants():
     mi.set_variant(SPECTRAL)
@@ -803,6 +869,7 @@ def test_same_seed_same_image(rgb):
     [
         {"light_paths": 30},
         {"light_paths": 30, "weights": "published"},
+        {"light_paths": 30, "merging": True, "alpha": 0.7},
         *extended({"light_paths": 300}),
     ],
 )
@@ -980,6 +1047,9 @@ def test_kernels_know_neither_seed_nor_room(rgb, name):
         ({"target": "f"}, ("target", "f_y_rho_g_v")),
         ({"weights": "best"}, ("weights", "bounded", "published")),
         ({"light_tracing": 9}, ("light_tracing", "0.125")),
+        ({"merging": True, "alpha": 0.0}, ("alpha", "(0, 1]")),
+        ({"merging": True, "weights": "published"}, ("merging", "bounded")),
+        ({"initial_radius": 0.1}, ("initial_radius", "merging")),
         ({"beta": 2.0}, ("beta", "unknown", "light_paths")),
     ],
 )
