@@ -3,6 +3,8 @@ points."""
 
 from __future__ import annotations
 
+from functools import partial
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -54,7 +56,7 @@ from ..resampling.light_vertices import END, LightVertices, list_light_vertices
 from ..resampling.proposals import Proposals, arriving, cumulative_sums
 from ..weights import resampling
 from .common import IterativeIntegrator, IterativeSession
-from .merging import automatic_radius, map_of_surfaces, merged_light, with_merged
+from .merging import automatic_radius, merged_light, with_merged
 from .schedule import read_radius, shrunk
 
 CHUNK = 1 << 18
@@ -387,7 +389,7 @@ class ResampledSession(IterativeSession):
             places,
             found,
             dr.select(end < dr.gather(mi.UInt32, ends.count, 0), sent.vertices, 0),
-            guessed_weight(self.traits, z, sent, weights.eta_at(z["n"])),
+            guessed_weight(self.traits, z, sent, weights.eta_at(z)),
         )
 
     def _seen(self, scene, ends, z, sent, spectral, rng, active):
@@ -564,7 +566,7 @@ class ResampledSession(IterativeSession):
             back,
             segments,
             weights.kernels_of_vertex(z["row"], z["p"], vertex_bsdf, sent.d, active),
-            weights.eta_at(z["n"]),
+            weights.eta_at(z),
         )
         nearer = sum_before(camera, z, z["parent"], end, weights, active)
         return own * dr.rcp(dr.maximum(own + forward * cosine * sent.mis_sum + nearer, 1e-20))
@@ -593,21 +595,21 @@ class ResampledSession(IterativeSession):
     def _merge_vertices(self, scene, tables, radiance, camera, count, light, spectral, entries):
         """Radiance of camera paths with that of merges with the light sub-paths `light` added, and
         the entries of its classes."""
-        weights, radius = self.weights(spectral), spectral["radius"]
-        photon_map = map_of_surfaces(self.traits, light, self.capacity["light"], radius, END)
+        weights = self.weights(spectral)
         index = lanes(self.capacity["camera"])
         active = index < dr.gather(mi.UInt32, count, 0)
         z = read_vertices(camera, index, active, states=STEP)
         if self.integrator.splits_light:
             z["mark"] = z["parent"] == NO_PARENT
-
-        parts, active = merged_light(
+        parts = merged_light(
             self.traits,
-            photon_map,
+            light,
+            self.capacity["light"],
+            END,
             z,
             active,
-            self._merge_weigher(weights, camera, z, photon_map),
-            radius,
+            partial(self._merge_weigher, weights, camera, z),
+            spectral["radius"],
             self.merged_paths,
             self.integrator.max_depth,
             spectral,

@@ -8,12 +8,12 @@ import mitsuba as mi
 from ..core.recording import lanes
 from ..core.untrusted import Fields
 from ..mis.vertex_merging import ConnectionWeights
-from ..paths.subpaths import read_vertices
+from ..paths.subpaths import STATES, read_vertices
 from ..photons.vertex_map import state_of
 from ..pilot.run import PILOT_INDEX
 from .bdpt import BDPT, CAMERA, BDPTSession
 from .common import MOST_LIGHT_PATHS
-from .merging import automatic_radius, map_of_surfaces, merged_light, with_merged
+from .merging import automatic_radius, merged_light, merging_of, with_merged
 from .schedule import LARGEST_RADIUS, SMALLEST_RADIUS, read_radius, shrunk
 
 
@@ -50,8 +50,9 @@ class VCM(BDPT):
     by Veach's heuristic, with the density of merges as Georgiev et al. 2012 have it, which takes
     each light sub-path for a sample of its own.
 
-    Consistent: the bias of merging vanishes with the radius. In participating media the techniques
-    of :monosp:`bdpt` make vertices, and surfaces alone merge; media of flakes and ``hide_emitters``
+    Consistent: the bias of merging vanishes with the radius. In participating media vertices are
+    joined and merged as on surfaces, within balls of four times the radius; media of flakes and
+    ``hide_emitters``
     are refused there. Polarised variants, gradients and the film ``specfilm`` are refused by name.
 
     .. tabs::
@@ -151,28 +152,31 @@ class VCMSession(BDPTSession):
 
     def weights(self, spectral):
         plain = super().weights(spectral)
-        eta = dr.pi * dr.square(spectral["radius"]) * self.light_chunk
-        return ConnectionWeights(self.lights, plain.beta, plain.ratio, eta, plain.media)
+        merging = merging_of(self.traits, spectral["radius"], self.light_chunk)
+        return ConnectionWeights(self.lights, plain.beta, plain.ratio, merging, plain.media)
 
     def _merge_vertices(self, scene, tables, radiance, camera, count, light, spectral, entries):
-        radius = spectral["radius"]
-        photon_map = map_of_surfaces(self.traits, light, self.capacity["light"], radius)
         index = lanes(self.capacity["camera"])
         active = index < dr.gather(mi.UInt32, count, 0)
         z = read_vertices(camera, index, active)
         weights = self.weights(spectral)
 
-        def weigh(index, landing, scattering, active):
-            state = state_of(photon_map, index, active)
-            return weights.merged(z, state, scattering.p, scattering.back())
+        def weigher(photon_map):
+            def weigh(index, landing, scattering, active):
+                state = state_of(photon_map, index, active)
+                return weights.merged(z, state, scattering.p, scattering.back())
 
-        parts, active = merged_light(
+            return weigh
+
+        parts = merged_light(
             self.traits,
-            photon_map,
+            light,
+            self.capacity["light"],
+            STATES,
             z,
             active,
-            weigh,
-            radius,
+            weigher,
+            spectral["radius"],
             self.light_chunk,
             self.integrator.max_depth,
             spectral,

@@ -97,8 +97,8 @@ class PublishedWeights(ResampledWeights):
     def init_light(self, si, source, reachable, active, flux):
         return [*super().init_light(si, source, reachable, active, flux), si, mi.Float(0)]
 
-    def scatter(self, state, p_forward, p_back, delta, scattered, n):
-        after = super().scatter(state, p_forward, p_back, delta, scattered, n)
+    def scatter(self, state, p_forward, p_back, delta, scattered, vertex):
+        after = super().scatter(state, p_forward, p_back, delta, scattered, vertex)
         return [*after[:-1], state[2]]
 
     def gain_of_start(self, si, ds, made, strength, active):

@@ -33,7 +33,7 @@ from ..resampling.light_vertices import END
 from ..resampling.proposals import BLIND_SHARE, uniform_share
 from ..weights import bidirectional as theory
 from ..weights import resampling
-from .vertex_merging import eta_on_surfaces
+from .vertex_merging import eta_at
 
 LENGTHS = 16
 """Tuned: lengths of light sub-paths whose shares are told apart; longer ones count with the
@@ -52,27 +52,25 @@ class ResampledWeights:
     `LENGTHS` a row), M light sub-paths, N draws; `aware`: whether the weights know of the
     resampling (else every technique has the density of its path alone); `ratio`: N_t, light
     sub-paths that are joined to the sensor over camera paths, of all the film; `traits`: a
-    `SceneTraits`; `eta` [m^2]: pi R^2 times the light sub-paths that each camera path merges with,
-    or 0.
+    `SceneTraits`; `merging`: a `vertex_merging.Merging`, or None.
 
-    Merging is one more technique at each vertex on a surface, with the density of both sub-paths up
-    to there times eta (Georgiev et al. 2012). It takes all light sub-paths, and nothing is
-    resampled."""
+    Merging is one more technique at each vertex, with the density of both sub-paths up to there
+    times eta (`vertex_merging.eta_at`; Georgiev et al. 2012). It takes all light sub-paths, and
+    nothing is resampled."""
 
     states = END
     kernels: tuple[str, ...] = ()
     light_kernels: tuple[str, ...] = ()
     """What vertices and hits keep besides (`paths.camera_vertices`): nothing."""
 
-    def __init__(self, lights, grid, records, shares, M, N, aware, ratio, traits, eta=0.0):
+    def __init__(self, lights, grid, records, shares, M, N, aware, ratio, traits, merging=None):
         self.lights, self.grid, self.records, self.shares = lights, grid, records, shares
         self.M, self.N, self.aware, self.ratio = M, N, aware, ratio
-        self.traits, self.eta = traits, eta
-        self.merges = not (isinstance(eta, float) and eta == 0)
+        self.traits, self.merging = traits, merging
 
-    def eta_at(self, n):
-        """`eta` at vertices with the normals `n`."""
-        return eta_on_surfaces(self.eta, n, self.traits.has_media)
+    def eta_at(self, vertex):
+        """As of `vertex_merging.eta_at`."""
+        return eta_at(self.merging, vertex)
 
     # ------------------------------------------------------------------ resampling
 
@@ -163,11 +161,11 @@ class ResampledWeights:
     def depart(state, si, mask):
         return state
 
-    def scatter(self, state, p_forward, p_back, delta, scattered, n):
+    def scatter(self, state, p_forward, p_back, delta, scattered, vertex):
         d_vcm, d_vc, strength, *others = state
         return [
             d_vcm,
-            dr.select(delta, d_vc, theory.d_vc_of(self._nearer(state, p_back, n), p_forward)),
+            dr.select(delta, d_vc, theory.d_vc_of(self._nearer(state, p_back, vertex), p_forward)),
             dr.select(
                 delta,
                 strength,
@@ -182,16 +180,16 @@ class ResampledWeights:
         better = self.gain_of_vertex(state, density, si, squared, depth)
         return [dr.select(density > 0, better * theory.reciprocal(density), 0), *state[1:]]
 
-    def _nearer(self, state, p_back, n):
+    def _nearer(self, state, p_back, vertex):
         """A_i, of all techniques nearer to the light than joining the vertex with that state."""
         d_vcm, d_vc = state[:2]
-        return d_vcm + p_back * d_vc + self.eta_at(n)
+        return d_vcm + p_back * d_vc + self.eta_at(vertex)
 
     # ------------------------------------------------------------------ techniques
 
     def seen_by_sensor(self, connection, light):
         """Weight of a `LensConnection` of a light vertex (t = 1)."""
-        a_light = self._nearer([light["d_vcm"], light["d_vc"]], connection.back, light["n"])
+        a_light = self._nearer([light["d_vcm"], light["d_vc"]], connection.back, light)
         return theory.connection(connection.density * (1 / self.ratio), a_light, 0, 0, 1)
 
     def merged(self, camera, z, state, f, back_at_light, back_at_camera, segments, active):
@@ -199,10 +197,10 @@ class ResampledWeights:
         vertices of that `state`, on paths of so many segments. `f` [1/sr]: the BSDF, channel mean;
         `back_at_light`, `back_at_camera`: densities per projected solid angle with which the
         camera's side goes on to the vertex before the light's, and the light's to the camera's."""
-        d_vcm, d_vc, strength = state
-        end = LightEnd(mi.Float(1), strength, f, back_at_camera, segments, [], self.eta)
+        (d_vcm, d_vc, strength), eta = state, self.eta_at(z)
+        end = LightEnd(mi.Float(1), strength, f, back_at_camera, segments, [], eta)
         from_here_on = sum_before(camera, z, z["parent"], end, self, active)
-        return self.eta * dr.rcp(from_here_on + d_vcm + back_at_light * d_vc)
+        return eta * dr.rcp(from_here_on + d_vcm + back_at_light * d_vc)
 
 
 def guessed_weight(traits, z, joined, eta=0.0):

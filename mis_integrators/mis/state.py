@@ -63,12 +63,12 @@ class ConnectionState(Protocol):
         p_back: Array,
         delta: Array,
         scattered: Array,
-        n: Array,
+        vertex: Any,
     ) -> State:
         """After scattering. `p_forward`, `p_back`: densities per projected solid angle with which
         this side goes on, and with which the other side would go back; `delta`: a delta function
-        scattered; `scattered` [1/sr]: mean of the BSDF over the channels; `n`: normal of the vertex
-        (zero in media)."""
+        scattered; `scattered` [1/sr]: mean of the BSDF over the channels; `vertex`: its `n`
+        and `density` (a `VertexBSDF`, or a record)."""
 
     def depart(self, state: State, si: Any, mask: Array) -> State:
         """After `scatter`, of light sub-paths: the state may keep the vertex that they leave."""
@@ -86,11 +86,11 @@ class ConnectionState(Protocol):
         sampled: Array,
         p_back: Array,
         delta: Array,
-        n: Array,
+        vertex: Any,
     ) -> Array:
         """Weight of next-event estimation. Arguments as of `hit_emitter`, but `emission` [1/m^2]
-        is an area density at the vertex; `delta`: the light cannot be met; `n`: as of
-        `scatter`."""
+        is an area density at the vertex; `delta`: the light cannot be met; `vertex`: as
+        of `scatter`."""
 
 
 class MergeState(Protocol):

@@ -7,6 +7,8 @@ delta surfaces, taken as alike from both sides. They cost noise, never light.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import drjit as dr
 import mitsuba as mi
 
@@ -16,19 +18,35 @@ from ..paths.vertex import in_medium
 from ..weights import bidirectional as theory
 
 
-def eta_on_surfaces(eta, n, media: bool):
-    """`eta` [m^2] at vertices with the normals `n`: surfaces merge, vertices in media do not."""
-    if not media or (isinstance(eta, float) and eta == 0):
-        return eta
-    return dr.select(in_medium(n), 0, eta)
+@dataclass
+class Merging:
+    """Merge radii in terms of densities: `disk` [m^2], the area of a disk on surfaces times the
+    light sub-paths that each camera path merges with, and in scenes with media `ball` [m^3], that
+    of the volume of a ball (else None)."""
+
+    disk: mi.Float
+    ball: mi.Float | None = None
+
+
+def eta_at(merging: Merging | None, vertex):
+    """eta [m^2] at a vertex (`n` and `density` of a `VertexBSDF` or of a kept one): merges there
+    over the density with which one side makes it. Volume photons lie as densely as light sub-paths
+    scatter, so that in media it is `ball` times the extinction. Zero where nothing merges."""
+    if merging is None:
+        return 0.0
+    n, density = (
+        (vertex["n"], vertex["density"]) if isinstance(vertex, dict) else (vertex.n, vertex.density)
+    )
+    if merging.ball is None:
+        return merging.disk
+    return dr.select(in_medium(n), merging.ball * density, merging.disk)
 
 
 class ConnectionWeights:
     """The state of sub-paths (`mis.state.ConnectionState`), and the weights of joined sub-paths.
 
     `beta`: Veach's exponent; `ratio`: light sub-paths over camera paths, of the whole crop window;
-    `eta` [m^2]: pi R^2 N of merging, or 0; `media`: vertices may lie in media, where nothing is
-    merged.
+    `merging`: a `Merging`, or None.
 
     In media densities per volume hold the extinction at the vertex. That stands in both densities
     of each ratio p>(x_s) / p<(x_s) and cancels, so the equations are those of surfaces, with
@@ -38,8 +56,8 @@ class ConnectionWeights:
 
     states = STATES
 
-    def __init__(self, lights, beta, ratio, eta=0.0, media=False):
-        self.lights, self.beta, self.ratio, self.eta = lights, beta, ratio, eta
+    def __init__(self, lights, beta, ratio, merging=None, media=False):
+        self.lights, self.beta, self.ratio, self.merging = lights, beta, ratio, merging
         self.media = media
 
     @staticmethod
@@ -71,12 +89,10 @@ class ConnectionWeights:
             mi.Float(0),
         ]
 
-    def scatter(self, state, p_forward, p_back, delta, scattered, n):
+    def scatter(self, state, p_forward, p_back, delta, scattered, vertex):
         d_vcm, d_vc = state
-        return [
-            d_vcm,
-            dr.select(delta, d_vc, theory.d_vc_of(self._nearer(state, p_back, n), p_forward)),
-        ]
+        nearer = self._nearer(state, p_back, vertex)
+        return [d_vcm, dr.select(delta, d_vc, theory.d_vc_of(nearer, p_forward))]
 
     @staticmethod
     def depart(state, si, mask):
@@ -89,23 +105,20 @@ class ConnectionWeights:
         ratio = dr.select(sampled > 0, direct * theory.reciprocal(sampled), 0)
         return theory.hit_emitter(ratio, direct * emission, state[1], self.beta)
 
-    def next_event(self, state, direct, emission, sampled, p_back, delta, n):
+    def next_event(self, state, direct, emission, sampled, p_back, delta, vertex):
         ratio = dr.select(delta, 0, sampled * theory.reciprocal(direct))
-        return theory.connection(ratio, 1, emission, self._nearer(state, p_back, n), self.beta)
+        nearer = self._nearer(state, p_back, vertex)
+        return theory.connection(ratio, 1, emission, nearer, self.beta)
 
     # ------------------------------------------------------------------ joined sub-paths
 
-    def eta_at(self, n):
-        """`eta` at vertices with the normals `n`."""
-        return eta_on_surfaces(self.eta, n, self.media)
-
-    def _nearer(self, state, p_back, n):
-        return theory.nearer(*state, p_back, self.beta, self.eta_at(n))
+    def _nearer(self, state, p_back, vertex):
+        return theory.nearer(*state, p_back, self.beta, eta_at(self.merging, vertex))
 
     def connected(self, connection, camera, light):
         """Weight of a `Connection` of two kept vertices."""
         a_light, a_camera = (
-            self._nearer([vertex[name] for name in self.states], back, vertex["n"])
+            self._nearer([vertex[name] for name in self.states], back, vertex)
             for vertex, back in (
                 (light, connection.back_at_light),
                 (camera, connection.back_at_camera),
@@ -121,10 +134,10 @@ class ConnectionWeights:
         to the vertex before it, and the light's side to the camera's."""
         a_light = theory.nearer(*state, back_at_light, self.beta)
         a_camera = theory.nearer(camera["d_vcm"], camera["d_vc"], back_at_camera, self.beta)
-        return theory.merge_weight(a_light, a_camera, self.eta, self.beta)
+        return theory.merge_weight(a_light, a_camera, eta_at(self.merging, camera), self.beta)
 
     def seen_by_sensor(self, connection, light):
         """Weight of a `LensConnection` of a light vertex."""
         state = [light[name] for name in self.states]
-        a_light = self._nearer(state, connection.back, light["n"])
+        a_light = self._nearer(state, connection.back, light)
         return theory.connection(connection.density * (1 / self.ratio), a_light, 0, 0, self.beta)

@@ -177,7 +177,8 @@ class StepVisitor:
             of_rays = cosine * self.lens.density(si.p, si.time, self.aperture, seen)
             of_rays = dr.select(of_rays > 0, self.ratio * dr.rcp(dr.maximum(of_rays, 1e-20)), 0)
             step[0] = dr.select(first, of_rays, step[0])
-        at.vertex_bsdf = VertexBSDF.at(self.traits, si, at.bsdf, smooth, at.medium)
+        merges = self.soften.merging is not None
+        at.vertex_bsdf = VertexBSDF.at(self.traits, si, at.bsdf, smooth, at.medium, merges)
         wanted = smooth & (dr.max(at.throughput) > 0)
         at.slot = keep_vertex(
             self.store, at, at.throughput, number, parent, dict(zip(self.steps, step)), wanted
@@ -258,10 +259,10 @@ def sum_before(vertices, step, parent, end: LightEnd, weights, active):
     `step`, `parent`: those of the vertex, or hit, at the camera's end. `weights.gain(r, row, s,
     active)`: what resampling makes of the technique that joins a light sub-path of s vertices,
     which sends r = q*/p (`weights.sent`), to a vertex of that row. Joining to the sensor (the last
-    step, without a parent) has the gain one. If `weights.merges`, each vertex may also be merged
-    with light sub-paths that end there: `weights.eta_at(n)` [m^2] of them have the density of one.
+    step, without a parent) has the gain one. With `weights.merging` each vertex may also be merged
+    with light sub-paths that end there, `weights.eta_at` [m^2] times as likely as it is made.
     """
-    names, merges = (*STEP, *weights.kernels), weights.merges
+    names, merges = (*STEP, *weights.kernels), weights.merging is not None
     count = len(weights.kernels)
     layout = vertex_layout(names)
     d_vcm, geometry, forward, back_there, scattered_there, row = (
@@ -292,8 +293,8 @@ def sum_before(vertices, step, parent, end: LightEnd, weights, active):
         active &= joined & (ratio > 0)
         record = layout.read(vertices["words"], parent, active, names)
         if dr.hint(merges, mode="scalar"):
-            n = layout.read(vertices["words"], parent, active, ("n",))["n"]
-            eta = mi.Float(weights.eta_at(n))
+            there = layout.read(vertices["words"], parent, active, ("n", "density"))
+            eta = mi.Float(weights.eta_at(there))
         for number in dr.hint(range(count), mode="scalar"):
             kernels[number] = mi.Float(kernels_there[number])
             kernels_there[number] = record[names[number - count]]

@@ -259,7 +259,9 @@ class VertexVisitor:
             weights.propagate(sums, arrival, si, squared, at.depth),
         )
         smooth = smooth_at(at, active)
-        at.vertex_bsdf = VertexBSDF.at(self.traits, si, at.bsdf, smooth, at.medium)
+        at.vertex_bsdf = VertexBSDF.at(
+            self.traits, si, at.bsdf, smooth, at.medium, self.weights.merging is not None
+        )
         slot = keep_vertex(
             self.store, at, at.flux, number, parent, dict(zip(weights.states, sums)), smooth, *mark
         )
@@ -272,7 +274,7 @@ class VertexVisitor:
         si, away = at.si, at.si.to_world(wo)
         value, p_back, p_forward = at.vertex_bsdf.f_and_pdfs(away, at.towards, active & ~delta)
         mean = at.vertex_bsdf.scattered_mean(value, at.towards, active)
-        left = self.weights.scatter(sums, p_forward, p_back, delta, mean, si.n)
+        left = self.weights.scatter(sums, p_forward, p_back, delta, mean, at.vertex_bsdf)
         sums = self.weights.depart(_either(active, left, sums), si, active)
         density = dr.select(delta, 0, p_forward * facing(self.traits, si.n, away))
         mark = [dr.select(at.first, delta, before) for before in mark]
@@ -375,7 +377,9 @@ class CameraVertexVisitor:
             weights.init_camera(of_rays, first),
             weights.propagate(sums, arrival, si, squared, at.depth),
         )
-        at.vertex_bsdf = VertexBSDF.at(self.traits, si, at.bsdf, smooth, at.medium)
+        at.vertex_bsdf = VertexBSDF.at(
+            self.traits, si, at.bsdf, smooth, at.medium, self.weights.merging is not None
+        )
         direct = mi.Spectrum(0)
         if not self.lights.dark:
             direct = self._direct(sums, at, rng, smooth)
@@ -412,7 +416,7 @@ class CameraVertexVisitor:
             p_camera * cosine,
             p_light,
             ds.delta,
-            si.n,
+            at.vertex_bsdf,
         )
         light = at.throughput * response * light
         if self.ledger is not None:
@@ -424,7 +428,7 @@ class CameraVertexVisitor:
         si, wo = at.si, at.si.to_world(bs.wo)
         value, p_forward, p_back = at.vertex_bsdf.f_and_pdfs(at.towards, wo, active & ~delta)
         mean = at.vertex_bsdf.scattered_mean(value, wo, active)
-        left = self.weights.scatter(sums, p_forward, p_back, delta, mean, si.n)
+        left = self.weights.scatter(sums, p_forward, p_back, delta, mean, at.vertex_bsdf)
         sums = _either(active, left, sums)
         density = dr.select(delta, 0, p_forward * facing(self.traits, si.n, wo))
         history = scattered_history(history, delta, active) if history else []

@@ -105,7 +105,8 @@ class VertexBSDF:
 
     Attributes: `n`, `ns` geometric and shading normal; `value` (a spectrum, BSDF without cosine)
     and `density` (per projected solid angle) of Lambertian surfaces on the side from which they
-    were described; `si`, `bsdf` where there are others; `sides` (`Sides`) in scenes with media.
+    were described (in media, where photons merge, `density` is the extinction [1/m]); `si`, `bsdf`
+    where there are others; `sides` (`Sides`) in scenes with media.
     """
 
     def __init__(self, traits, n, ns, value, density, si=None, bsdf=None, sides=None):
@@ -121,9 +122,9 @@ class VertexBSDF:
         self.sides = sides
 
     @classmethod
-    def at(cls, traits, si, bsdf, active, medium=None):
+    def at(cls, traits, si, bsdf, active, medium=None, merges=False):
         """The vertex at an interaction, described from the side of `si.wi`; `medium`: the one
-        through which it was reached, in scenes with media."""
+        through which it was reached, in scenes with media; `merges`: photons are merged there."""
         sides = None
         if traits.has_media:
             sides = Sides.at(si, medium)
@@ -142,7 +143,11 @@ class VertexBSDF:
             value, density = bsdf.eval_pdf(mi.BSDFContext(), si, upright, lambertian)
             density = dr.select(lambertian, density, ROUGH)
         if traits.has_media:
-            density = dr.select(inside, 0, density)
+            extinction = mi.Float(0)
+            if merges:
+                within = dr.select(inside, medium, dr.zeros(mi.MediumPtr))
+                extinction = scattered_share(within, si.p, si.wavelengths, inside)[-1]
+            density = dr.select(inside, extinction, density)
         n, ns = mi.Vector3f(si.n), mi.Vector3f(si.sh_frame.n)
         return cls(traits, n, ns, value, density, si, bsdf, sides)
 

@@ -7,8 +7,10 @@ import mitsuba as mi
 
 from ..core.records import Layout
 from ..paths.subpaths import STATES, read_vertices
+from ..paths.vertex import in_medium
 from .grid import build_photon_map
 from .photon import new_photons, write_photon
+from .volume import build_volume_map, new_volume_photons, write_volume_photon
 
 
 def state_layout(states):
@@ -41,6 +43,33 @@ def vertex_map(vertices, count, capacity: int, bounds, cell, states=STATES):
     state_layout(states).write(mis_words, y, index, active)
     dr.eval(surface, power, mis_words)
     return build_photon_map(surface, power, count, bounds, cell, capacity, "all", mis_words)
+
+
+def vertex_map_in_media(vertices, count, capacity: int, radius, states=STATES):
+    """The same, a `VolumeMap`, of those that lie in media."""
+    index = dr.arange(mi.UInt32, capacity)
+    active = index < dr.gather(mi.UInt32, count, 0)
+    fields = ("p", "n", "depth", "towards", "throughput", "mark", "media", *states)
+    y = read_vertices(vertices, index, active, fields, states)
+    keep = active & in_medium(y["n"])
+    found = dr.zeros(mi.UInt32, 1)
+    slot = dr.scatter_inc(found, mi.UInt32(0), keep)
+    photon = {
+        "p": y["p"],
+        "towards": dr.select(active, y["towards"], mi.Vector3f(0, 0, 1)),
+        "flux": y["throughput"],
+        "depth": y["depth"],
+        "caustic": mi.Bool(False),
+        "medium": y["above"],
+    }
+    if "mark" in y:
+        photon["delta_at_light"] = y["mark"]
+    place, power = new_volume_photons(capacity)
+    mis_words = state_layout(states).room(capacity)
+    write_volume_photon(place, power, slot, photon, keep)
+    state_layout(states).write(mis_words, y, slot, keep)
+    dr.eval(place, power, mis_words, found)
+    return build_volume_map(place, power, found, radius, capacity, mis_words)
 
 
 def state_of(photon_map, index, active, states=STATES):

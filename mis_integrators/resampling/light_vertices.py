@@ -54,7 +54,7 @@ class LightVertices:
     def __init__(self, traits, lights, starts, paths, vertices, places, count, reach, eta_at=None):
         self.traits, self.lights, self.starts, self.paths = traits, lights, starts, paths
         self.vertices, self.places, self.count, self.reach = vertices, places, count, reach
-        self.eta_at = eta_at or (lambda n: 0)
+        self.eta_at = eta_at or (lambda vertex: 0)
 
     def send(self, p, index, time, wavelengths, active):
         """What the ends `index` send to points `p`: a `LightConnection`."""
@@ -75,7 +75,7 @@ class LightVertices:
             value * y["throughput"] * (leaving * dr.rcp(landing)),
             y["strength"] * vertex_bsdf.scattered_mean(value, y["towards"], surface) * leaving,
             forward * leaving,
-            leaving * (y["d_vcm"] + back * y["d_vc"] + self.eta_at(y["n"])),
+            leaving * (y["d_vcm"] + back * y["d_vc"] + self.eta_at(y)),
             y["depth"] + 1,
         )
 

@@ -13,7 +13,7 @@ from mis_integrators.core.traits import SceneTraits
 from mis_integrators.integrators.pyramid import technique_names
 from mis_integrators.lights.environment_guide import EnvironmentGuide
 from mis_integrators.lights.lights import Lights
-from mis_integrators.mis.vertex_merging import ConnectionWeights
+from mis_integrators.mis.vertex_merging import ConnectionWeights, Merging
 from mis_integrators.paths.connect import join, join_sensor
 from mis_integrators.paths.media import (
     begin_flights,
@@ -26,14 +26,13 @@ from mis_integrators.paths.sensor import Lens
 from mis_integrators.paths.setting import CameraPass, LightPass, Limits, World
 from mis_integrators.paths.subpaths import (
     NO_PARENT,
+    STATES,
     read_vertices,
     trace_camera_subpaths,
     trace_light_subpaths,
-    vertex_layout,
 )
-from mis_integrators.paths.vertex import VertexBSDF, facing, in_medium
-from mis_integrators.photons.gather import KeptVertices, gather_photons
-from mis_integrators.photons.vertex_map import state_of, vertex_map
+from mis_integrators.paths.vertex import VertexBSDF, facing
+from mis_integrators.photons.vertex_map import state_of
 
 import drjit as dr
 import mitsuba as mi
@@ -50,6 +49,7 @@ from comparing import (
     in_one_thread,
     pictures,
 )
+from merging import weights_of_merges
 from selection import extended
 from test_against_path import MONO, RGB, SPECTRAL, caustic_scene
 from test_analytic import block_average, floor_from_above, inside_sphere, point_irradiance, series
@@ -179,7 +179,7 @@ class JointPaths:
 
     def vertex_bsdf(self, number):
         _, si, bsdf, *_ = self.vertices[number]
-        return VertexBSDF.at(self.traits, si, bsdf, self.valid, self.media[number])
+        return VertexBSDF.at(self.traits, si, bsdf, self.valid, self.media[number], True)
 
     def densities(self, number):
         """(p_camera, p_light) at a vertex."""
@@ -205,8 +205,8 @@ class JointPaths:
             states.append(state)
             p_camera, p_light = self.densities(number)
             delta = self.vertices[number][-1]
-            n = self.vertices[number][1].n
-            left = weights.scatter(state, p_camera, p_light, delta, None, n)
+            vertex = self.vertex_bsdf(number)
+            left = weights.scatter(state, p_camera, p_light, delta, None, vertex)
             if number < self.length - 1:
                 near, far, squared = self.segment(number, number + 1)
                 state = weights.propagate(
@@ -227,8 +227,8 @@ class JointPaths:
         for number in range(self.length - 1, 0, -1):
             p_camera, p_light = self.densities(number)
             delta = self.vertices[number][-1]
-            n = self.vertices[number][1].n
-            left = weights.scatter(states[number], p_light, p_camera, delta, None, n)
+            vertex = self.vertex_bsdf(number)
+            left = weights.scatter(states[number], p_light, p_camera, delta, None, vertex)
             near, far, squared = self.segment(number, number - 1)
             states[number - 1] = weights.propagate(
                 left, dr.select(delta, 0, p_light * near * far / squared)
@@ -242,7 +242,9 @@ class JointPaths:
         towards = to_camera if side == "camera" else to_light
         seen = mi.SurfaceInteraction3f(si)
         seen.wi = si.to_local(towards)
-        vertex_bsdf = VertexBSDF.at(self.traits, seen, si.bsdf(), self.valid, self.media[number])
+        vertex_bsdf = VertexBSDF.at(
+            self.traits, seen, si.bsdf(), self.valid, self.media[number], True
+        )
         sides = vertex_bsdf.sides
         hit = mi.PreliminaryIntersection3f(hit)
         return {
@@ -287,7 +289,7 @@ class JointPaths:
                 p_camera * cosine,
                 p_light,
                 self.light.delta,
-                last.n,
+                self.vertex_bsdf(self.length - 1),
             )
         )
         for z in range(self.length - 2, -1, -1):
@@ -313,7 +315,7 @@ class JointPaths:
             if self.lens.connects
             else 0 * result[0]
         )
-        if weights.eta:
+        if weights.merging:
             for number in range(self.length):
                 result["merge", number] = (
                     self.merged(weights, camera, light, number) * ~delta[number]
@@ -322,43 +324,26 @@ class JointPaths:
         return {s: w[valid] for s, w in result.items()}
 
     def merged(self, weights, camera, light, number):
-        """Weight of a merge at a vertex: what a gather of just this light vertex brings, over what
-        it would bring without weights; zero in media."""
+        """Weight of a merge at a vertex."""
         y, z = (
             self.record(number, "light", light[number]),
             self.record(number, "camera", camera[number]),
         )
-        inside = in_medium(y["n"])
-        y["n"] = dr.select(inside, mi.Vector3f(0, 0, 1), y["n"])
-        index = dr.arange(mi.UInt32, self.COUNT)
         zero = dr.zeros(mi.UInt32, self.COUNT)
-        words = vertex_layout().room(self.COUNT)
-        vertex_layout().write(
-            words, {**y, "path": zero, "depth": zero, "number": zero}, index, True
-        )
+        y |= {"path": zero, "depth": zero, "number": zero}
         z["depth"] = zero
-        dr.eval(words, z)
-        photons = vertex_map(
-            {"words": words}, mi.UInt32(self.COUNT), self.COUNT, self.traits.bounds, mi.Float(0.01)
-        )
-        brought = []
+        dr.eval(z)
 
-        def merged(index, landing, scattering, active):
-            state = state_of(photons, index, active)
-            return weights.merged(z, state, scattering.p, scattering.back())
+        def weigher(photons):
+            def weigh(index, landing, scattering, active):
+                state = state_of(photons, index, active)
+                return weights.merged(z, state, scattering.p, scattering.back())
 
-        for weigh in (merged, None):
-            (radiance,) = gather_photons(
-                photons,
-                KeptVertices(self.traits, z, [], self.valid & ~inside),
-                [dr.opaque(mi.Float, 1e-4)],
-                1,
-                -1,
-                weigh,
-            )
-            brought.append(np.array(dr.mean(radiance)))
-        self.valid &= mi.Bool(brought[1] > 0) | inside
-        return brought[0] / np.maximum(brought[1], 1e-30)
+            return weigh
+
+        merged, found = weights_of_merges(self.traits, y, z, self.valid, weigher, STATES)
+        self.valid &= found
+        return merged
 
     def joined(self, camera, light, z):
         a, b = self.record(z, "camera", camera[z]), self.record(z + 1, "light", light[z + 1])
@@ -382,7 +367,8 @@ def test_weights_sum_to_one(rgb, bsdf, light, sensor, length, beta, eta):
     """Each technique's weight for the same joint path, from its own code, merges (eta = pi R^2 N)
     among them; some in a thousand lose by rounding at grazing angles."""
     paths = JointPaths(room(bsdf, light, sensor), length)
-    by_technique = paths.weights(ConnectionWeights(paths.lights, beta, 0.7, eta))
+    merging = Merging(dr.opaque(mi.Float, eta)) if eta else None
+    by_technique = paths.weights(ConnectionWeights(paths.lights, beta, 0.7, merging))
     total = sum(by_technique.values())
     assert len(total) > 100
     assert np.mean(np.abs(total - 1) < 2e-3) > 0.995, np.sort(np.abs(total - 1))[-20:]
@@ -429,7 +415,7 @@ def test_states_of_traced_subpaths(rgb, kind):
     _, p_camera, p_light = VertexBSDF.at(traits, si, si.bsdf(), later).f_and_pdfs(*sides, later)
     forward, back = (p_camera, p_light) if kind == "camera" else (p_light, p_camera)
     state = [before["d_vcm"], before["d_vc"]]
-    left = weights.scatter(state, forward, back, mi.Bool(False), None, before["n"])
+    left = weights.scatter(state, forward, back, mi.Bool(False), None, before)
     geometry = dr.abs(dr.dot(before["n"], d) * dr.dot(here["n"], d)) / dr.squared_norm(
         here["p"] - before["p"]
     )

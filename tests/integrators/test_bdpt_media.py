@@ -8,7 +8,7 @@ a quarter is seen with a probability of 0.95, where a test says nothing else (`c
 from mis_integrators.core.sequences import SampleSequence
 from mis_integrators.core.traits import SceneTraits
 from mis_integrators.lights.lights import Lights
-from mis_integrators.mis.vertex_merging import ConnectionWeights
+from mis_integrators.mis.vertex_merging import ConnectionWeights, Merging
 from mis_integrators.paths.setting import CameraPass, LightPass, Limits, World
 from mis_integrators.paths.subpaths import (
     NO_PARENT,
@@ -343,10 +343,12 @@ def foggy_room(light, sensor="perspective"):
     ],
 )
 def test_weights_sum_to_one(rgb, light, sensor, length, beta, eta):
-    """Each technique's weight for the same joint path through the fog, from its own code, merges on
-    surfaces (eta = pi R^2 N) among them."""
+    """Each technique's weight for the same joint path through the fog, from its own code, merges
+    among them: on surfaces (pi R^2 N) and in the fog (half of that, for the extinction 1)."""
     paths = JointPaths(foggy_room(light, sensor), length)
-    by_technique = paths.weights(ConnectionWeights(paths.lights, beta, 0.7, eta, media=True))
+    disk, ball = (dr.opaque(mi.Float, size) for size in (eta, 0.5 * eta))
+    merging = Merging(disk, ball) if eta else None
+    by_technique = paths.weights(ConnectionWeights(paths.lights, beta, 0.7, merging, media=True))
     total = sum(by_technique.values())
     assert len(total) > 100
     assert np.mean(np.abs(total - 1) < 2e-3) > 0.995, np.sort(np.abs(total - 1))[-20:]
@@ -385,7 +387,7 @@ def test_states_behind_half_transparent_surfaces(rgb, kind):
     _, p_camera, p_light = vertex_bsdf_of(traits, before, [], later).f_and_pdfs(*sides, later)
     forward, back = (p_camera, p_light) if kind == "camera" else (p_light, p_camera)
     state = [before["d_vcm"], before["d_vc"]]
-    left = weights.scatter(state, forward, back, mi.Bool(False), None, before["n"])
+    left = weights.scatter(state, forward, back, mi.Bool(False), None, before)
     squared = dr.squared_norm(here["p"] - before["p"])
     near, far = weights.propagate(left, forward * facing(traits, here["n"], d) / squared)
     mask = np.array(later) & (np.array(here["depth"]) == np.array(before["depth"]) + 1)
@@ -396,15 +398,6 @@ def test_states_behind_half_transparent_surfaces(rgb, kind):
 
 
 # --- What is refused ----------------------------------------------------------
-
-REFUSING = "bdpm_opt", "bdpm_opt2", "bdpm_opt3"
-
-
-@pytest.mark.parametrize("plugin", REFUSING)
-def test_other_plugins_refuse_media(rgb, plugin):
-    with pytest.raises(Exception) as error:
-        mi.render(fog_scene(homogeneous()), integrator=mi.load_dict({"type": plugin}), spp=2)
-    assert last_words(error.value).startswith(f"{plugin}: participating media")
 
 
 def test_hidden_emitters_are_refused(rgb):

@@ -30,9 +30,7 @@ from mis_integrators.paths.subpaths import (
     vertex_bsdf_of,
     vertex_layout,
 )
-from mis_integrators.paths.vertex import VertexBSDF, facing, in_medium
-from mis_integrators.photons.gather import KeptVertices, gather_photons
-from mis_integrators.photons.vertex_map import vertex_map
+from mis_integrators.paths.vertex import VertexBSDF, facing
 from mis_integrators.resampling.light_vertices import END, LightVertices
 
 import drjit as dr
@@ -48,6 +46,7 @@ from comparing import (
     kernels_of,
     pictures,
 )
+from merging import weights_of_merges
 from selection import extended
 from test_against_path import MONO, RGB, SPECTRAL, caustic_scene
 from test_analytic import inside_sphere, series
@@ -99,7 +98,9 @@ class ResampledPaths(JointPaths):
         seen.wi = si.to_local(towards)
         depth = number + 1 if side == "camera" else self.length - number
         slot = dr.arange(mi.UInt32, self.COUNT) + number * self.COUNT
-        vertex_bsdf = VertexBSDF.at(self.traits, seen, si.bsdf(), self.valid, self.media[number])
+        vertex_bsdf = VertexBSDF.at(
+            self.traits, seen, si.bsdf(), self.valid, self.media[number], True
+        )
         values = {
             "p": si.p,
             "n": vertex_bsdf.n,
@@ -179,7 +180,7 @@ class ResampledPaths(JointPaths):
                 vertex_bsdf = self.vertex_bsdf(number)
                 value, *_ = vertex_bsdf.f_and_pdfs(to_camera, to_light, self.valid)
                 mean = vertex_bsdf.scattered_mean(value, to_light, self.valid)
-                left = weights.scatter(state, p_light, p_camera, delta, mean, si.n)
+                left = weights.scatter(state, p_light, p_camera, delta, mean, vertex_bsdf)
                 left_from = mi.SurfaceInteraction3f(si)
                 left_from.wi = si.to_local(to_light)
                 left = weights.depart(left, left_from, self.valid)
@@ -275,7 +276,7 @@ class ResampledPaths(JointPaths):
             )
             blocked = delta[z] if z == self.length - 1 else delta[z] | delta[z + 1]
             result[self.length - z] = np.array(share) * ~blocked
-            if weights.merges:
+            if weights.merging:
                 result[f"merged at {z}"] = (
                     self.merged(weights, camera, camera_slots[z], light, light_slots[z]) * ~delta[z]
                 )
@@ -301,36 +302,13 @@ class ResampledPaths(JointPaths):
         return {s: np.broadcast_to(w, self.COUNT)[valid] for s, w in result.items()}
 
     def merged(self, weights, camera, camera_slot, light, light_slot):
-        """Weight of a merge at a vertex: what a gather of just this light vertex brings, over what
-        it would bring without weights; zero in media."""
+        """Weight of a merge at a vertex."""
         z = read_vertices(camera, camera_slot, self.valid, states=STEP)
         y = read_vertices(light, light_slot, self.valid, states=END)
-        inside, index = in_medium(z["n"]), dr.arange(mi.UInt32, self.COUNT)
-        words = vertex_layout(END).room(self.COUNT)
-        y["n"] = dr.select(inside | ~self.valid, mi.Vector3f(0, 0, 1), y["n"])
-        vertex_layout(END).write(words, y, index, True)
-        dr.eval(words)
-        photons = vertex_map(
-            {"words": words},
-            mi.UInt32(self.COUNT),
-            self.COUNT,
-            self.traits.bounds,
-            mi.Float(0.01),
-            END,
-        )
-        brought = []
-        for weigh in (self.session._merge_weigher(weights, camera, z, photons), None):
-            (radiance,) = gather_photons(
-                photons,
-                KeptVertices(self.traits, z, [], self.valid & ~inside),
-                [dr.opaque(mi.Float, 1e-4)],
-                1,
-                -1,
-                weigh,
-            )
-            brought.append(np.array(dr.mean(radiance)))
-        self.valid &= mi.Bool(brought[1] > 0) | inside
-        return brought[0] / np.maximum(brought[1], 1e-30)
+        weigher = partial(self.session._merge_weigher, weights, camera, z)
+        merged, found = weights_of_merges(self.traits, y, z, self.valid, weigher, END)
+        self.valid &= found
+        return merged
 
     def own_gain(self, weights, vertex, ends, sent, place):
         """The gain of joining `ends` to the camera `vertex`: of published weights from what the

@@ -87,9 +87,9 @@ def test_light_that_only_merging_makes(rgb):
     assert dark.max() == 0
 
 
-def assert_merged(scene, expected, whole, block):
+def assert_merged(scene, expected, whole, block, integrator=None):
     """All of the image has this value."""
-    batches = SessionBatches(vcm(max_depth=4, initial_radius=0.05), scene, 2)
+    batches = SessionBatches(integrator or vcm(initial_radius=0.05), scene, 2)
     batches.add(8)
     exact = Estimate.exact(np.full((5, 3), expected))
     assert_same(*collect_until(batches, exact, whole, block), whole, block, 1e-3)
@@ -107,6 +107,26 @@ def test_light_that_only_merging_makes_in_media(rgb):
     }
     scene = floor_in_a_beam(1, floor=9, tank=tank)
     assert_merged(scene, 0.6 / np.pi * np.exp(-2 * height * sigma_t), 0.02, 0.05)
+
+
+@pytest.mark.parametrize("plugin", [{"type": "vcm"}, {"type": "bdpt_ris", "merging": True}])
+def test_fog_that_only_merging_lights(rgb, plugin):
+    """The same tank full of fog: what scatters once, straight back, and the floor, both through the
+    surface of the tank. Balls are 0.016 wide, and lose 2 % of the fog's light at its boundaries."""
+    sigma_t, albedo, height = 3.0, 0.9, 0.25
+    tank = {
+        "type": "cube",
+        "to_world": T().scale([1, 1, height]),
+        "bsdf": {"type": "dielectric", "int_ior": 1.0, "ext_ior": 1.0},
+        "interior": {"type": "homogeneous", "sigma_t": sigma_t, "albedo": albedo},
+    }
+    scene = floor_in_a_beam(1, floor=1, tank=tank)
+    left = np.exp(-2 * height * sigma_t)
+    floor, fog = 0.6 / np.pi * left, albedo / (8 * np.pi) * (1 - left)
+    assert 0.3 < fog / (floor + fog) < 0.5
+    common = {"max_depth": 4, "camera_paths": 8, "initial_radius": 0.004}
+    integrator = mi.load_dict({**common, **plugin})
+    assert_merged(scene, floor + fog, 0.03, 0.09, integrator)
 
 
 @pytest.mark.parametrize(
