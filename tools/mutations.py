@@ -52,6 +52,8 @@ LONG = "tests/app/test_long_renders.py"
 TIERS = "tests/photons/test_tiers.py"
 VOLUME_RADII = "tests/photons/test_volume_radii.py"
 LOBES = "tests/integrators/test_narrow_lobes.py"
+VCM = "tests/integrators/test_vcm.py"
+OPT_FOG = "tests/integrators/test_opt_media.py"
 
 MUTATIONS = [
     # ------------------------------------------------------------------ weights
@@ -113,11 +115,39 @@ MUTATIONS = [
         f"{BDPT}::test_weights_sum_to_one",
     ),
     Mutation(
-        "mis/vertex_merging.py",
-        "return dr.select(in_medium(n), 0, self.eta)",
-        "return self.eta",
-        "weights count merges in media, which nothing makes",
-        f"{FOG}::test_weights_sum_to_one",
+        "paths/camera_vertices.py",
+        "            here += eta",
+        "            here += 0 * eta",
+        "weights forget merges nearer to the camera",
+        f"{RIS}::test_weights_sum_to_one",
+    ),
+    Mutation(
+        "photons/vertex_map.py",
+        "    keep = active & in_medium(y[\"n\"])",
+        "    keep = active",
+        "vertices on surfaces are merged in media, too",
+        f"{VCM}::test_fog_that_only_merging_lights",
+    ),
+    Mutation(
+        "photons/points.py",
+        "value = flux * scattering.value / points.scattering_around(landing.p, hit)",
+        "value = flux * scattering.value",
+        "light in balls is not divided by how densely photons are left",
+        f"{OPT_FOG}::test_a_ball_finds_what_brute_force_finds",
+    ),
+    Mutation(
+        "mis/optimal.py",
+        "return f, dr.select(inside, phase_pdf * scale, p)",
+        "return f, dr.select(inside, phase_pdf, p)",
+        "densities in media are not in units of what a ball costs",
+        f"{OPT_FOG}::test_weights_of_a_path_sum_to_one",
+    ),
+    Mutation(
+        "mis/optimal.py",
+        "found = [self.found_photons(si, bsdf, merged) for _ in found]",
+        "found = [self.found_photons(si, bsdf, mask) for _ in found]",
+        "direct light gives way to photons that are merged nowhere",
+        f"{OPT_FOG}::test_agrees_beyond_the_first_vertex",
     ),
     Mutation(
         "mis/resampling.py",
@@ -400,8 +430,8 @@ MUTATIONS = [
     ),
     Mutation(
         "resampling/light_vertices.py",
-        'leaving * (y["d_vcm"] + back * y["d_vc"]),',
-        'leaving * y["d_vcm"],',
+        'leaving * (y["d_vcm"] + back * y["d_vc"] + self.eta_at(y)),',
+        'leaving * (y["d_vcm"] + self.eta_at(y)),',
         "techniques farther along the light sub-path are left out of the weights",
         f"{RIS}::test_weights_sum_to_one "
         f"{RIS}::test_guessed_weight_is_the_weight_where_nothing_is_guessed",

@@ -114,11 +114,9 @@ class ResampledIntegrator(IterativeIntegrator):
         self.merging = parameters.boolean("merging", False)
         if self.merging and self.published:
             parameters.refuse("merging", 'the papers\' weights know none; use "weights" = bounded')
-        self.initial_radius, self.alpha = 0.0, 1.0
-        if self.merging:
-            self.initial_radius, self.alpha = read_radius(parameters)
-        for name in ("initial_radius", "alpha"):
-            if not self.merging:
+        self.initial_radius, self.alpha = read_radius(parameters)
+        if not self.merging:
+            for name in ("initial_radius", "alpha"):
                 parameters.refuse(name, 'nothing is merged; set "merging" = true')
 
     def settings(self):

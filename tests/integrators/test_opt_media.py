@@ -254,8 +254,10 @@ def test_agrees_with_volpath(rgb, name, strategies):
     assert_same(*collect_until(mine, oracle, *visible, most=600), *visible, slack=2 * SLACK)
 
 
-@pytest.mark.parametrize("variant_name", extended("llvm_ad_mono"))
-def test_agrees_in_other_variants(variant_name):
+@pytest.mark.parametrize("variant_name", ["llvm_ad_mono", *extended("llvm_ad_rgb")])
+def test_agrees_beyond_the_first_vertex(variant_name):
+    """The first strategy is that of the second vertex: direct light at the first is next-event
+    estimation's alone."""
     mi.set_variant(variant_name)
     scene = SCENES["pockets"]()
     mine = SmallRadius(scene, 2, first_vertex=1)
