@@ -123,7 +123,7 @@ MUTATIONS = [
     ),
     Mutation(
         "photons/vertex_map.py",
-        "    keep = active & in_medium(y[\"n\"])",
+        '    keep = active & in_medium(y["n"])',
         "    keep = active",
         "vertices on surfaces are merged in media, too",
         f"{VCM}::test_fog_that_only_merging_lights",

@@ -56,7 +56,7 @@ from ..resampling.light_vertices import END, LightVertices, list_light_vertices
 from ..resampling.proposals import Proposals, arriving, cumulative_sums
 from ..weights import resampling
 from .common import IterativeIntegrator, IterativeSession
-from .merging import automatic_radius, merged_light, with_merged
+from .merging import automatic_radius, merged_light, merging_of, with_merged
 from .schedule import read_radius, shrunk
 
 CHUNK = 1 << 18
@@ -128,13 +128,10 @@ class ResampledIntegrator(IterativeIntegrator):
             "target": self.target,
             "weights": self.weights,
             "light_tracing": self.light_tracing,
-            **self._merging_settings(),
+            "merging": self.merging,
+            "initial_radius": self.initial_radius,
+            "alpha": self.alpha,
         }
-
-    def _merging_settings(self):
-        if not self.merging:
-            return {}
-        return {"merging": True, "initial_radius": self.initial_radius, "alpha": self.alpha}
 
     MEDIA = True
 
@@ -288,10 +285,14 @@ class ResampledSession(IterativeSession):
             integrator.aware and not integrator.published,
             self.ratio,
             self.traits,
-            dr.pi * dr.square(spectral["radius"]) * self.merged_paths
-            if integrator.merging
-            else 0.0,
+            self._merging(spectral),
         )
+
+    def _merging(self, spectral):
+        """The `Merging` of an iteration; None where nothing is merged."""
+        if not self.integrator.merging:
+            return None
+        return merging_of(self.traits, spectral["radius"], self.merged_paths)
 
     # ------------------------------------------------------------------ passes
 

@@ -470,7 +470,7 @@ def test_pmfs_are_made_of_what_weights_ask(rgb):
     _, starts, places, found, pmfs = session._proposals(0, spectral, light)
     _, totals, r = pmfs
     points, width = dr.width(totals), dr.width(r) // dr.width(totals)
-    ends = session._ends(starts, light[0], places, found)
+    ends = session._ends(starts, light[0], places, found, session.weights(spectral))
     index = dr.arange(mi.UInt32, points * width)
     active = index % width < ends.count[0]
     z = session._cache_targets([]).read(index // width, active)
