@@ -180,7 +180,7 @@ def test_radii(rgb):
         radii.append(session.settings["radius"])
     assert 0.002 < radii[0] < 0.05 and radii[1] == pytest.approx(radii[0], rel=0.05)
     weights = session.weights(session._spectral(3))
-    assert weights.eta[0] == pytest.approx(
+    assert weights.merging.disk[0] == pytest.approx(
         np.pi * session.radius_at(3) ** 2 * 24 * 24 * 8, rel=1e-5
     )
     assert session.radius_at(0) == session.radius and session.radius_at(15) == pytest.approx(
