@@ -38,7 +38,7 @@ METHODS = {
     "integrators.resampled": "bdpt_ris",
     "integrators.choice": "bdpm_auto",
     "integrators.media_choice": "bdpm_auto",
-    "integrators.vcm": "vcm",
+    "integrators.merging": "vcm",
 }
 """What judges a constant, or those of a module or of a folder; others are judged by `USUAL`."""
 USUAL = "bdpm:bdd=0"

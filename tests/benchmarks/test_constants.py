@@ -3,7 +3,7 @@ it."""
 
 import ast
 
-from mis_integrators.photons import gather, irradiance_cache
+from mis_integrators.photons import gather, frozen
 from mis_integrators.pilot import radius
 
 from common import tuned
@@ -27,11 +27,11 @@ def test_constants_are_found_with_their_meaning():
 
 
 def test_every_importer_sees_a_change():
-    """`irradiance_cache` imports what `gather` defines."""
+    """`frozen` imports what `gather` defines."""
     before = gather.SAME_SURFACE_COSINE
     with tuned.changed({"photons.gather.SAME_SURFACE_COSINE": 0.25}):
-        assert gather.SAME_SURFACE_COSINE == irradiance_cache.SAME_SURFACE_COSINE == 0.25
-    assert gather.SAME_SURFACE_COSINE == irradiance_cache.SAME_SURFACE_COSINE == before
+        assert gather.SAME_SURFACE_COSINE == frozen.SAME_SURFACE_COSINE == 0.25
+    assert gather.SAME_SURFACE_COSINE == frozen.SAME_SURFACE_COSINE == before
 
 
 def test_nothing_is_computed_from_them_before_they_can_change():
