@@ -4,6 +4,7 @@ weights."""
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
@@ -185,6 +186,16 @@ class BDPMOptSession(WeightedSession):
     @property
     def points(self):
         return self._weighted and self.has_volume
+
+    def _take(self, choice):
+        """Balls are no wider than the disks of surfaces, where these gather, too: the pilot renders
+        under weights for one radius, which let direct light's photons make too much noise in the
+        smaller balls that it tries, and takes too wide ones."""
+        disks = [radius for kind, radius in choice.radii.items() if kind != "volume"]
+        if self.points and disks:
+            volume = min(choice.radii["volume"], max(disks))
+            choice = replace(choice, radii={**choice.radii, "volume": volume})
+        super()._take(choice)
 
     def mixes(self):
         if not (self.traits.has_rough or self.integrator.mix_diffuse):

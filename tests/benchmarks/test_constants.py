@@ -3,7 +3,7 @@ it."""
 
 import ast
 
-from mis_integrators.photons import gather, frozen
+from mis_integrators.photons import frozen, gather
 from mis_integrators.pilot import radius
 
 from common import tuned
