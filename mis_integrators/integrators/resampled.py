@@ -675,16 +675,12 @@ class ResampledSession(IterativeSession):
         """Begins the first iteration: traces its light, and draws the cache points from its first
         part. All sessions of a render see the same here."""
         spectral = self._spectral(0)
-        traced = self._camera(0, 0, spectral)
+        traced, M = self._camera(0, 0, spectral), self.integrator.resampled_light_paths
+        vertices = min(int(traced[4][0]), self.capacity["camera"])
         if self.integrator.merging and not self.integrator.initial_radius:
-            found = min(int(traced[4][0]), self.capacity["camera"])
-            self.radius = automatic_radius(self.traits, traced[3], found, STEP)
+            self.radius = automatic_radius(self.traits, traced[3], vertices, STEP)
             spectral = self._spectral(0)
         light = self._light(0, 0, spectral)
-        vertices, M = (
-            min(int(traced[4][0]), self.capacity["camera"]),
-            self.integrator.resampled_light_paths,
-        )
         wanted = min(max(FEWEST_CACHE_POINTS, int(vertices * CACHE_SHARE)), max(vertices, 1))
         self.capacity |= {
             "ends": ends_room(np.array(light[2]), M),

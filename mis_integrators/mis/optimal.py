@@ -560,12 +560,12 @@ class LightState:
     def volume_words(self, state):
         """As `words`, of photons in media: those that come straight from a light have what
         `first_vertex` found, less one, below zero, in the place of a radiance."""
-        (nearest, *others), *found = self._split(state)
-        if not found[0]:
+        nodes, others = self._split(state)
+        if not others:
             return self.words(state)
-        direct, *fields = nearest
-        direct = dr.select(direct[0] < 0, -1 - found[0][0][0], direct)
-        return self.words([[direct, *fields], *others])
+        ((direct, *fields), *farther), ((ratio,),) = nodes, others
+        direct = dr.select(direct[0] < 0, -1 - ratio, direct)
+        return self.words([[direct, *fields], *farther])
 
     def straight_from_light(self, mis_words, index, active):
         """What `first_vertex` found of photons that come straight from a light."""

@@ -30,6 +30,14 @@ def by_class(number, value):
     return [dr.select(number == place, value, 0) for place in range(len(CLASSES))]
 
 
+def by_class_of_photons(value, depth, first, delta_at_light):
+    """`by_class` of what photons of that `depth` in segments bring to camera vertices, `first`
+    where nothing has scattered smoothly before."""
+    alone = (depth == 1) & first
+    smooth = dr.select(alone, mi.UInt32(1), mi.UInt32(2))
+    return by_class(class_of(smooth, delta_at_light), value)
+
+
 def start_of_camera_path():
     """What a camera sub-path carries for `class_of`: vertices that have scattered smoothly (two
     stand for more), and whether the last one scattered by a delta function."""

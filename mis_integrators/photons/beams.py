@@ -25,7 +25,7 @@ from ..core.packing import read_mark, unpack_direction
 from ..core.recording import lanes
 from ..core.records import Layout
 from ..core.spectra import channel_mean
-from ..paths.light_classes import CLASSES, by_class, class_of
+from ..paths.light_classes import CLASSES, by_class_of_photons
 from ..paths.media import point_in
 from .grid import Query, visit_hits
 from .photon import read_power
@@ -276,9 +276,7 @@ def gather_along(
             value = channel_mean(value * beams.throughput)
         values = [value]
         if split:
-            alone = (landing.depth == 1) & beams.first
-            smooth = dr.select(alone, mi.UInt32(1), mi.UInt32(2))
-            values = by_class(class_of(smooth, delta_at_light), value)
+            values = by_class_of_photons(value, landing.depth, beams.first, delta_at_light)
         share = dr.square(landing.share)
         inside = [hit & (distance_squared < dr.square(radius) * share) for radius in radii]
         found = [dr.select(i, value / share, 0) for i in inside for value in values]

@@ -13,7 +13,7 @@ import mitsuba as mi
 from ..core.packing import read_mark
 from ..core.spectra import channel_mean
 from ..core.traits import lookup
-from ..paths.light_classes import CLASSES, by_class, class_of
+from ..paths.light_classes import CLASSES, by_class_of_photons
 from ..paths.subpaths import vertex_bsdf_of
 from .grid import for_each_photon
 from .photon import read_power
@@ -202,9 +202,7 @@ def gather_photons(
             value = channel_mean(value * vertices.factor)
         values = [value]
         if split:
-            alone = (landing.depth == 1) & vertices.first
-            smooth = dr.select(alone, mi.UInt32(1), mi.UInt32(2))
-            values = by_class(class_of(smooth, delta_at_light), value)
+            values = by_class_of_photons(value, landing.depth, vertices.first, delta_at_light)
         # The largest radius is tested again, too: without, kernels are slower by some per cent.
         inside = [hit & within_disk(offset, distance_squared, vertices.n, r, height) for r in radii]
         found = [dr.select(i, value, 0) for i in inside for value in values]

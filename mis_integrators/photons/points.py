@@ -19,7 +19,7 @@ from ..core.packing import read_mark
 from ..core.recording import lanes
 from ..core.records import Layout
 from ..core.spectra import channel_mean
-from ..paths.light_classes import CLASSES, by_class, class_of
+from ..paths.light_classes import CLASSES, by_class_of_photons
 from ..paths.media import point_in, scattered_share
 from .grid import DiskQuery, visit_hits
 from .photon import read_power
@@ -169,9 +169,7 @@ def gather_in_balls(
             value = channel_mean(value * points.throughput)
         values = [value]
         if split:
-            alone = (landing.depth == 1) & points.first
-            smooth = dr.select(alone, mi.UInt32(1), mi.UInt32(2))
-            values = by_class(class_of(smooth, delta_at_light), value)
+            values = by_class_of_photons(value, landing.depth, points.first, delta_at_light)
         inside = [hit & (distance_squared < dr.square(radius)) for radius in radii]
         found = [dr.select(i, value, 0) for i in inside for value in values]
         return tuple(total + value for total, value in zip(totals, found))
