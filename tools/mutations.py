@@ -615,4 +615,11 @@ MUTATIONS = [
         "a second interrupt does not stop at once",
         "tests/app/test_cli.py::test_second_interrupt_stops_at_once",
     ),
+    Mutation(
+        "integrators/common.py",
+        "    @under_render_lock\n    def session(",
+        "    def session(",
+        "renders are set up while another thread renders",
+        "tests/integrators/test_hard_use.py::test_threads_take_turns",
+    ),
 ]

@@ -4,6 +4,8 @@ Python."""
 import contextlib
 import functools
 import gc
+import sys
+import time
 
 import drjit as dr
 import mitsuba as mi
@@ -20,6 +22,25 @@ def no_garbage_collection():
     finally:
         if enabled:
             gc.enable()
+
+
+UNDISTURBED = 0.05
+"""Seconds that Python leaves a recorded call its turn when other threads ask for it, in place of
+five thousandths: longer than such a call traverses its arguments."""
+
+
+@contextlib.contextmanager
+def undisturbed():
+    """Other threads of Python run before and after, not in between. Dr.Jit 1.5 holds its own lock
+    while a recorded call traverses its arguments with Python; a thread that gets its turn then, and
+    touches an array (of a finished image, say), never hands it back."""
+    time.sleep(0)  # who waits already has its turn now
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(max(before, UNDISTURBED))
+    try:
+        yield
+    finally:
+        sys.setswitchinterval(before)
 
 
 def recorder():
@@ -79,7 +100,7 @@ def frozen(function, tidy=gc.collect):
     fresh, plain = True, False
 
     def attempt(args):
-        with no_garbage_collection():
+        with no_garbage_collection(), undisturbed():
             return recorded(anchor, *args)
 
     def call(*args):

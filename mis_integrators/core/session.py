@@ -100,6 +100,7 @@ class Session(Protocol):
         is not what such a session can have learned."""
 
 
+@under_render_lock
 def make_session(
     integrator: mi.Integrator,
     scene: mi.Scene,

@@ -14,7 +14,7 @@ from ..core.film import Accumulator, direct_channels, shared_wavelengths, varian
 from ..core.packing import with_reserve
 from ..core.random import mix, reversed_bits
 from ..core.recording import settle
-from ..core.render_lock import RENDER_LOCK, under_render_lock
+from ..core.render_lock import render_lock, under_render_lock
 from ..core.sequences import SampleSequence
 from ..core.traits import (
     UnsupportedScene,
@@ -152,6 +152,7 @@ class IterativeIntegrator(mi.AdjointIntegrator):
             "sampler": self.sampler,
         }
 
+    @under_render_lock
     def session(self, scene, sensor=0, seed=0, spp=0):
         """Prepares a rendering of `scene` with `spp` camera paths a pixel, or without a planned end
         if `spp` is 0."""
@@ -250,12 +251,13 @@ class IterativeIntegrator(mi.AdjointIntegrator):
             self.say_sampler([sensor])
             for _ in range(session.iterations_planned):
                 session.iterate()
-            with RENDER_LOCK:
+            with render_lock():
                 self.say_unfinite(session)
                 session.fill_film()
+                del session
                 if not develop:
                     return mi.TensorXf()
-                image = session.sensor.film().develop()
+                image = sensor.film().develop()
                 if evaluate:
                     dr.eval(image)
                 return image
@@ -311,11 +313,13 @@ class IterativeSession:
         """From the first iteration on, keeps what `estimate` needs."""
         self.accumulator.with_variance = True
 
+    @under_render_lock
     def estimate(self):
         """Mean colour so far and its estimated variance: float64, (height, width, 3) each. Needs
         two iterations at least, and `keep_variance`."""
         return self.accumulator.estimate()
 
+    @under_render_lock
     def unfinite_pixels(self):
         """How many pixels had values that are not finite in some iteration; those values are left
         out."""

@@ -12,7 +12,7 @@ import numpy as np
 from ..core.film import colour_channels, colour_matrix
 from ..core.random import mix
 from ..core.recording import recorder
-from ..core.render_lock import under_render_lock
+from ..core.render_lock import render_lock, under_render_lock
 from ..core.traits import UnsupportedScene, check_film, check_variant
 from ..lights.lights import Lights
 from ..volume.films import OWN, SHARED, ViewAccumulator, own_values, splat, write_film
@@ -139,10 +139,12 @@ class VolpathMultiview(IterativeIntegrator):
             "add_nulls": self.add_nulls,
         }
 
+    @under_render_lock
     def session(self, scene, sensor=0, seed=0, spp=0):
         sensor = self._sensor(scene, sensor)
         return self._session(scene, [sensor], seed, spp)
 
+    @under_render_lock
     def views_session(self, scene, seed=0, spp=0):
         """Prepares a rendering of all views of a scene; see `render_views`."""
         check_variant(scene, self.plugin)
@@ -553,5 +555,8 @@ def render_views(scene, integrator=None, spp=0, seed=0):
         integrator.say_sampler(session.views.groups)
         for _ in range(session.iterations_planned):
             session.iterate()
-        integrator.say_unfinite(session)
-        return session.view_tensors()
+        with render_lock():
+            integrator.say_unfinite(session)
+            images = session.view_tensors()
+            del session
+            return images

@@ -303,24 +303,29 @@ def test_variants_in_turn(rgb):
 
 def test_threads_take_turns(rgb, monkeypatch):
     """Two threads that render one scene at the same time get their own images, and no two
-    iterations overlap."""
+    iterations or set-ups overlap: who sets up outside the lock meets another's recorded pass."""
     scene = small_world()
     expected = [picture("bdpm", seed, scene) for seed in range(2)]
     inside, most = 0, 0
     session_class = sys.modules[
         "mis_integrators.integrators.common"
     ].IterativeSession  # that of the active variant
-    run = session_class._run
 
-    def watched(self, iteration):
-        nonlocal inside, most
-        inside += 1
-        most = max(most, inside)
-        time.sleep(0.002)
-        run(self, iteration)
-        inside -= 1
+    def watched(function):
+        def watch(*arguments):
+            nonlocal inside, most
+            inside += 1
+            most = max(most, inside)
+            time.sleep(0.002)
+            try:
+                return function(*arguments)
+            finally:
+                inside -= 1
 
-    monkeypatch.setattr(session_class, "_run", watched)
+        return watch
+
+    for name in ("__init__", "_run", "fill_film"):
+        monkeypatch.setattr(session_class, name, watched(getattr(session_class, name)))
     found, errors = {0: [], 1: []}, []
 
     def work(seed):
