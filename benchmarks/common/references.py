@@ -12,8 +12,9 @@ from pathlib import Path
 import mis_integrators
 from mis_integrators.analysis.metrics import References
 from mis_integrators.app.output import write_exr
-from mis_integrators.core.traits import has_media
+from mis_integrators.core.traits import SceneTraits
 
+import mitsuba as mi
 import numpy as np
 import OpenEXR
 
@@ -41,8 +42,8 @@ def add_options(command: argparse.ArgumentParser) -> None:
         "--reference-method",
         type=parse_method,
         metavar="PLUGIN[:...]",
-        help="what renders them (default: path, or for the scenes that it cannot do bdpm "
-        "with a radius below the pixels' size)",
+        help="what renders them (default: path, or for light that it cannot "
+        "find vcm or bdpm with a radius below the pixels' size, in media bdpt)",
     )
 
 
@@ -59,11 +60,19 @@ def add_folder(command: argparse.ArgumentParser) -> None:
 
 def recipe(opened: OpenScene) -> dict:
     """How the references of a scene are made, ``method``, and the methods that must agree,
-    ``opinions``: path, where there are media volpath, unless `references.json` knows better. Under
-    the better sampler: at the edges of bright lamps references by independent numbers would be
-    noisier than what they judge."""
-    plugin = "volpath" if has_media(opened.scene) else "path"
-    return RECIPE.get(opened.name, {"method": f"{plugin}:sampler=multijitter", "opinions": []})
+    ``opinions``: as ``method`` says, unless `references.json` knows better."""
+    return RECIPE.get(opened.name) or {"method": method(opened.scene), "opinions": []}
+
+
+def method(scene: mi.Scene) -> str:
+    """What renders all light of a scene: path, where there are media volpath. Under the better
+    sampler: at the edges of bright lamps references by independent numbers would be noisier than
+    what they judge. Where mirrors or glass are lit by lamps that no ray can meet, camera paths lack
+    the caustics; then vcm with a small radius does, in media bdpt."""
+    traits = SceneTraits(scene)
+    if traits.has_delta and traits.has_unmet_lights:
+        return "bdpt" if traits.has_media else f"vcm:initial_radius={traits.extent / 1000:.2g}"
+    return f"{'volpath' if traits.has_media else 'path'}:sampler=multijitter"
 
 
 def find_references(

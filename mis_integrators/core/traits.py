@@ -138,6 +138,7 @@ class SceneTraits:
     null scattering somewhere), `has_mixed` (BSDFs with both a smooth and a delta part), `has_rough`
     (smooth scattering that is not Lambertian), `has_lambertian`, `has_perturbed` (bump or normal
     maps), `has_light_surfaces` (emitters that a ray can meet: area lights, environments),
+    `has_unmet_lights` (emitters that no ray can meet: points, spots, directions),
     `lambertian`, `perturbed` (registry tables for BSDF pointers), `has_media`, and with media those
     of `MediaTraits`.
     """
@@ -165,7 +166,8 @@ class SceneTraits:
         )
         self.lambertian = registry_table(bsdfs, mi.BSDFPtr, lambertian, mi.Bool)
         delta = mi.EmitterFlags.DeltaPosition | mi.EmitterFlags.DeltaDirection
-        self.has_light_surfaces = any(not (e.flags() & delta) for e in scene.emitters())
+        unmet = [bool(e.flags() & delta) for e in scene.emitters()]
+        self.has_light_surfaces, self.has_unmet_lights = not all(unmet), any(unmet)
         self.has_media = has_media(scene, sensor)
         if self.has_media:
             self.__dict__.update(MediaTraits(scene, [sensor] if sensor else []).__dict__)

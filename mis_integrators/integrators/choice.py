@@ -182,9 +182,7 @@ def no_photons(integrator, session):
 
 def camera_paths_are_blind(session):
     """Whether there may be caustics that camera paths alone cannot make."""
-    lights = session.lights
-    unseen = not session.traits.has_light_surfaces or lights.needs_photons_for_direct_light()
-    return session.has_caustics and unseen
+    return session.has_caustics and session.traits.has_unmet_lights
 
 
 def why_not_camera_paths(plugin, session, prediction):

@@ -271,6 +271,24 @@ TINY = """<scene version="3.0.0">
     <emitter type="point"><point name="position" x="1" y="2" z="4"/></emitter></scene>"""
 
 
+@pytest.mark.parametrize(
+    "bsdf, lamp, fog, expected",
+    [
+        ("dielectric", "point", False, "vcm"),
+        ("dielectric", "point", True, "bdpt"),
+        ("dielectric", "constant", False, "path"),
+        ("diffuse", "point", False, "path"),
+        ("diffuse", "point", True, "volpath"),
+    ],
+)
+def test_references_show_all_light(module, rgb, bsdf, lamp, fog, expected):
+    """Camera paths make no references where lamps that they cannot meet shine on glass."""
+    outside = {"exterior": {"type": "homogeneous"}} if fog else {}
+    ball = {"type": "sphere", "bsdf": {"type": bsdf}, **outside}
+    scene = mi.load_dict({"type": "scene", "ball": ball, "lamp": {"type": lamp}})
+    assert module("common.references").method(scene).partition(":")[0] == expected
+
+
 def test_path_under_another_sampler(module, tmp_path):
     """One pass takes the whole time, with the scene's film; the scene's own sampler stays."""
     file = tmp_path / "tiny.xml"

@@ -166,9 +166,9 @@ def test_delta_surfaces_under_point_like_lights_full(rgb, emitter, bdd):
     strategies_agree(emitter, 0, bdd, most=8192)
 
 
-def caustic_scene(emitter):
+def caustic_scene(emitter, **more):
     """A floor on which a mirror and a glass sphere outside the picture throw caustics; the camera
-    sees the floor alone."""
+    sees the floor alone. `more`: what else is in the scene."""
     T = mi.ScalarTransform4f
     lights = {
         "point": {"type": "point", "position": [0, 0, 3.5], "intensity": 10.0},
@@ -207,6 +207,7 @@ def caustic_scene(emitter):
                 "to_world": look((0, 0, 3), (0, 0, 0), (0, 1, 0)),
                 "film": film(48),
             },
+            **more,
         }
     )
 

@@ -251,10 +251,19 @@ def test_no_light(rgb):
     assert session.image().max() == 0
 
 
-@pytest.mark.parametrize("emitter", ["point", *extended("directional")])
-def test_path_is_not_chosen_where_it_is_blind(rgb, emitter):
-    """However cheap `path` were: caustics of lights without extent it cannot see."""
-    settings = decided(caustic_scene(emitter)).settings
+@pytest.mark.parametrize(
+    "emitter, lamp", [("point", True), *extended(("point", False), ("directional", False))]
+)
+def test_path_is_not_chosen_where_it_is_blind(rgb, emitter, lamp):
+    """However cheap `path` were: caustics of lights without extent it cannot see, and be there a
+    `lamp` that it can meet."""
+    area = {
+        "type": "rectangle",
+        "to_world": look((1.5, 1.5, 3.4), (1.5, 1.5, 0)) @ mi.ScalarTransform4f().scale(0.5),
+        "emitter": {"type": "area", "radiance": 60.0},
+    }
+    scene = caustic_scene(emitter, **({"lamp": area} if lamp else {}))
+    settings = decided(scene).settings
     assert settings["choice"] != "path"
     assert any(
         "cannot see" in reason
