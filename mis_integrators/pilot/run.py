@@ -148,5 +148,5 @@ def ladder_on_surfaces(
         photons = count(radii)
     if most > MOST_PHOTONS:
         radii = radii * (MOST_PHOTONS / most) ** 0.5
-        photons = count(radii)
+        photons = {kind: n * MOST_PHOTONS / most for kind, n in photons.items()}
     return dict.fromkeys(kinds, radii), photons
