@@ -60,15 +60,15 @@ def add_folder(command: argparse.ArgumentParser) -> None:
 
 def recipe(opened: OpenScene) -> dict:
     """How the references of a scene are made, ``method``, and the methods that must agree,
-    ``opinions``: as ``method`` says, unless `references.json` knows better."""
-    return RECIPE.get(opened.name) or {"method": method(opened.scene), "opinions": []}
+    ``opinions``: a `complete` one and none, unless `references.json` knows better."""
+    return RECIPE.get(opened.name) or {"method": complete(opened.scene), "opinions": []}
 
 
-def method(scene: mi.Scene) -> str:
-    """What renders all light of a scene: path, where there are media volpath. Under the better
-    sampler: at the edges of bright lamps references by independent numbers would be noisier than
-    what they judge. Where mirrors or glass are lit by lamps that no ray can meet, camera paths lack
-    the caustics; then vcm with a small radius does, in media bdpt."""
+def complete(scene: mi.Scene) -> str:
+    """The method that renders all light of a scene: path, where there are media volpath. Under the
+    better sampler: at the edges of bright lamps references by independent numbers would be noisier
+    than what they judge. Where mirrors or glass are lit by lamps that no ray can meet, camera paths
+    lack the caustics; then vcm with a small radius does, in media bdpt."""
     traits = SceneTraits(scene)
     if traits.has_delta and traits.has_unmet_lights:
         return "bdpt" if traits.has_media else f"vcm:initial_radius={traits.extent / 1000:.2g}"

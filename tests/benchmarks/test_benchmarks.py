@@ -286,7 +286,7 @@ def test_references_show_all_light(module, rgb, bsdf, lamp, fog, expected):
     outside = {"exterior": {"type": "homogeneous"}} if fog else {}
     ball = {"type": "sphere", "bsdf": {"type": bsdf}, **outside}
     scene = mi.load_dict({"type": "scene", "ball": ball, "lamp": {"type": lamp}})
-    assert module("common.references").method(scene).partition(":")[0] == expected
+    assert module("common.references").complete(scene).partition(":")[0] == expected
 
 
 def test_path_under_another_sampler(module, tmp_path):
