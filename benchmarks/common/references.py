@@ -68,9 +68,10 @@ def complete(scene: mi.Scene) -> str:
     """The method that renders all light of a scene: path, where there are media volpath. Under the
     better sampler: at the edges of bright lamps references by independent numbers would be noisier
     than what they judge. Where mirrors or glass are lit by lamps that no ray can meet, camera paths
-    lack the caustics; then vcm with a small radius does, in media bdpt."""
+    lack the caustics, and from some lamps direct light; then vcm with a small radius does, in media
+    bdpt."""
     traits = SceneTraits(scene)
-    if traits.has_delta and traits.has_unmet_lights:
+    if traits.has_unsampled_lights or (traits.has_delta and traits.has_unmet_lights):
         return "bdpt" if traits.has_media else f"vcm:initial_radius={traits.extent / 1000:.2g}"
     return f"{'volpath' if traits.has_media else 'path'}:sampler=multijitter"
 

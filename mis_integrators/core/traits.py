@@ -139,6 +139,7 @@ class SceneTraits:
     (smooth scattering that is not Lambertian), `has_lambertian`, `has_perturbed` (bump or normal
     maps), `has_light_surfaces` (emitters that a ray can meet: area lights, environments),
     `has_unmet_lights` (emitters that no ray can meet: points, spots, directions),
+    `has_unsampled_lights` (emitters whose light no connection can make either: `directionalarea`),
     `lambertian`, `perturbed` (registry tables for BSDF pointers), `has_media`, and with media those
     of `MediaTraits`.
     """
@@ -166,8 +167,12 @@ class SceneTraits:
         )
         self.lambertian = registry_table(bsdfs, mi.BSDFPtr, lambertian, mi.Bool)
         delta = mi.EmitterFlags.DeltaPosition | mi.EmitterFlags.DeltaDirection
-        unmet = [bool(e.flags() & delta) for e in scene.emitters()]
+        lights = [e.flags() for e in scene.emitters()]
+        unmet = [bool(f & delta) for f in lights]
         self.has_light_surfaces, self.has_unmet_lights = not all(unmet), any(unmet)
+        self.has_unsampled_lights = any(
+            f & mi.EmitterFlags.Surface and f & mi.EmitterFlags.DeltaDirection for f in lights
+        )
         self.has_media = has_media(scene, sensor)
         if self.has_media:
             self.__dict__.update(MediaTraits(scene, [sensor] if sensor else []).__dict__)

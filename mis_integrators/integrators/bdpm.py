@@ -211,9 +211,8 @@ class BDPMSession(PilotedSession):
             film_sample_count(sensor), MOST_LIGHT_PATHS
         )  # the latter are fewer in a pilot, and where so many do not pay
         depth = integrator.max_depth
-        unreachable = self.lights.needs_photons_for_direct_light()
         self.has_caustics = not self.lights.dark and (
-            (unreachable and (depth < 0 or depth >= 2))
+            (self.traits.has_unsampled_lights and (depth < 0 or depth >= 2))
             or (self.traits.has_delta and (depth < 0 or depth >= 3))
         )
         self.has_indirect = not self.lights.dark and (depth < 0 or depth >= integrator.bdd + 3)

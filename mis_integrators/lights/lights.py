@@ -195,11 +195,6 @@ class Lights:
             arrays += self.nearby.tables()
         return arrays + (self.guide.tables() if self.guide is not None else [])
 
-    def needs_photons_for_direct_light(self):
-        """Whether some emitter's direct light is out of reach of next-event estimation
-        (`directionalarea`)."""
-        return "directionalarea" in self.kinds
-
     @staticmethod
     def _kind(emitter, plugin):
         name = emitter.class_name()

@@ -165,7 +165,7 @@ class OptimalWeights:
         )
         self.albedo = neighbour_radiance.albedo if neighbour_radiance else None
         self.camera_paths = camera_paths if first == 0 else 1
-        self.has_caustics = traits.has_delta or lights.needs_photons_for_direct_light()
+        self.has_caustics = traits.has_delta or traits.has_unsampled_lights
         self.context = mi.BSDFContext()
         self.smooth = mi.BSDFContext()
         self.smooth.type_mask = mi.BSDFFlags.Smooth

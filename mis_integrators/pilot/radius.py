@@ -2,8 +2,8 @@
 
 A pilot estimates a few thousand pixels in a few independent iterations, at a ladder of radii R that
 double from one to the next, all from the same photons. Let x(R) be the estimate of a pixel in one
-iteration, and <.> the weighted mean over pixels (`noise.MEASURES`; radii are chosen by relative
-errors).
+iteration, and <.> the weighted mean over pixels, by two measures of error, relative and absolute
+(`noise.MEASURES`).
 
 Measured
     V(R) = <Var[x(R)]>, the noise of one iteration (`noise.py`), or what a denoiser leaves of it
@@ -22,12 +22,13 @@ Corrected estimates
 Minimised
     bias^2(R) + V(R) / n(R), over R and over plain or corrected estimates, where n(R) is the number
     of iterations that there will be: larger disks and probe rays make an iteration dearer
-    (`cost.py`).
+    (`cost.py`). It is the product of both measures that is least: close to a bright lamp a disk may
+    be off by little of all pixels' relative error, and by most of the absolute one.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -91,6 +92,11 @@ class ErrorByRadius(NamedTuple):
         variance = between(np.array([radius]), self.ladder, self.noise[corrected].at(light_share))
         return float(bias[0]), float(variance[0])
 
+    def after(self, iterations: np.ndarray, corrected: bool, light_share: float) -> np.ndarray:
+        """The mean squared errors of so many iterations with each of the fine radii."""
+        variance = between(self.fine, self.ladder, self.noise[corrected].at(light_share))
+        return self.squared_bias[corrected] + variance / iterations
+
 
 def error_by_radius(
     radii: np.ndarray,
@@ -150,35 +156,34 @@ class RadiusChoice(NamedTuple):
 
 
 def best_radius(
-    errors: ErrorByRadius,
+    errors: Sequence[ErrorByRadius],
     iterations: Callable[[np.ndarray, bool], np.ndarray],
     used: tuple[float, bool] | None = None,
     reluctance: float = 0.0,
     light_share: float = 1.0,
 ) -> RadiusChoice:
-    """The `RadiusChoice` with the least bias^2 + V / n. Where the pilot found no photon it is a
-    middling radius.
+    """The `RadiusChoice` with the least product of the `errors`, bias^2 + V / n, one for each
+    measure. Where the pilot found no photon it is a middling radius.
 
     Parameters
     ----------
     iterations
         n: how many iterations of given radii (fine) and correction there will be.
     used : (radius, corrected)
-        A choice that is kept unless the least error is below its by more than the share
-        `reluctance`.
+        A choice that is kept unless the errors fall by more than the share `reluctance`.
     light_share
         Of the light sub-paths, those that an iteration has.
     """
-    radii, fine = errors.ladder, errors.fine
+    radii, fine = errors[0].ladder, errors[0].fine
     choices = []
-    for corrected, bias in errors.squared_bias.items():
-        variance = between(fine, radii, errors.noise[corrected].at(light_share))
-        predicted = bias + variance / iterations(fine, corrected)
+    for corrected in errors[0].squared_bias:
+        n = iterations(fine, corrected)
+        predicted = np.prod([each.after(n, corrected, light_share) for each in errors], axis=0)
         at = int(np.argmin(predicted))
         candidates = [(float(predicted[at]), float(fine[at]))]
         if used is not None and used[1] == corrected:
             at = int(np.argmin(np.abs(np.log(fine / used[0]))))
-            candidates.append((float(predicted[at]) * (1 - reluctance), used[0]))
+            candidates.append((float(predicted[at]) * (1 - reluctance) ** len(errors), used[0]))
         choices += [(error, RadiusChoice(radius, corrected)) for error, radius in candidates]
     if not choices:
         return RadiusChoice(float(radii[middle_index(radii)]), False)

@@ -104,14 +104,14 @@ class PilotResult:
     caustic_share: float
 
     def choose(self, count: float, kept: Choice | None = None, reluctance: float = 0.0) -> Choice:
-        """The choice with the least predicted relative error.
+        """The choice with the least product of the predicted errors, relative and absolute.
 
         Parameters
         ----------
         count
             Iterations of usual cost that there is time for.
         kept
-            A choice that is kept, kind by kind, unless the error falls by more than the share
+            A choice that is kept, kind by kind, unless the errors fall by more than the share
             `reluctance`; and so is its share of the light sub-paths.
 
         Where there is a time limit, only whole iterations count, so that one fits if any share of
@@ -123,20 +123,21 @@ class PilotResult:
             choice = self._choose(share, count, used, reluctance)
             error = self._error(choice)
             if used is not None:
-                error = error * (1 - reluctance) if reluctance < 1 else 0.0
+                error = error * (1 - reluctance) ** len(MEASURES) if reluctance < 1 else 0.0
             if error < least or least == math.inf:  # as long as none fits, the shortest
                 best, least = choice, error
         assert best is not None
         return best
 
     def _error(self, choice: Choice) -> float:
-        """The predicted relative error of a choice; infinite where no iteration fits."""
+        """The product of a choice's predicted errors; infinite where no iteration fits."""
         if choice.prediction is None:
             return 0.0
         count = choice.prediction.iterations
         if self.setting.seconds is not None:
             count = math.floor(count)
-        return choice.prediction.errors["relmse"].after(count) if count > 0 else math.inf
+        errors = choice.prediction.errors.values()
+        return math.prod(error.after(count) for error in errors) if count > 0 else math.inf
 
     def _choose(self, share: float, count: float, kept: Choice | None, reluctance: float) -> Choice:
         """The same with this `share` of the light sub-paths."""
@@ -172,7 +173,8 @@ class PilotResult:
             return np.maximum(count / self._cost(kind, radius, corrected, share), 1)
 
         used = None if kept is None else (kept.radii[kind], kept.corrected[kind])
-        return best_radius(self.errors["relmse"][kind], iterations, used, reluctance, share)
+        errors = [by_kind[kind] for by_kind in self.errors.values()]
+        return best_radius(errors, iterations, used, reluctance, share)
 
     def _predict(self, choice: Choice, count: float) -> Prediction:
         """The `Prediction` for a choice."""

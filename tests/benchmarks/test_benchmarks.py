@@ -279,13 +279,18 @@ TINY = """<scene version="3.0.0">
         ("dielectric", "constant", False, "path"),
         ("diffuse", "point", False, "path"),
         ("diffuse", "point", True, "volpath"),
+        ("diffuse", "directionalarea", False, "vcm"),
     ],
 )
 def test_references_show_all_light(module, rgb, bsdf, lamp, fog, expected):
-    """Camera paths make no references where lamps that they cannot meet shine on glass."""
+    """Camera paths make no references where lamps that they cannot meet shine on glass, or where
+    connections make no light of theirs."""
     outside = {"exterior": {"type": "homogeneous"}} if fog else {}
     ball = {"type": "sphere", "bsdf": {"type": bsdf}, **outside}
-    scene = mi.load_dict({"type": "scene", "ball": ball, "lamp": {"type": lamp}})
+    lamp = {"type": lamp}
+    if lamp["type"] == "directionalarea":
+        lamp = {"type": "rectangle", "emitter": lamp}
+    scene = mi.load_dict({"type": "scene", "ball": ball, "lamp": lamp})
     assert module("common.references").complete(scene).partition(":")[0] == expected
 
 
