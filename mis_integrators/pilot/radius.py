@@ -22,8 +22,9 @@ Corrected estimates
 Minimised
     bias^2(R) + V(R) / n(R), over R and over plain or corrected estimates, where n(R) is the number
     of iterations that there will be: larger disks and probe rays make an iteration dearer
-    (`cost.py`). It is the product of both measures that is least: close to a bright lamp a disk may
-    be off by little of all pixels' relative error, and by most of the absolute one.
+    (`cost.py`). Where the camera sees the vertices that gather it is the product of both measures
+    that is least: close to a bright lamp blur may be little of all pixels' relative error, and most
+    of the absolute one.
 """
 
 from __future__ import annotations

@@ -104,7 +104,7 @@ class PilotResult:
     caustic_share: float
 
     def choose(self, count: float, kept: Choice | None = None, reluctance: float = 0.0) -> Choice:
-        """The choice with the least product of the predicted errors, relative and absolute.
+        """The choice with the least product of the predicted errors, see `_measures`.
 
         Parameters
         ----------
@@ -123,7 +123,8 @@ class PilotResult:
             choice = self._choose(share, count, used, reluctance)
             error = self._error(choice)
             if used is not None:
-                error = error * (1 - reluctance) ** len(MEASURES) if reluctance < 1 else 0.0
+                less = (1 - reluctance) ** len(self._measures)
+                error = error * less if reluctance < 1 else 0.0
             if error < least or least == math.inf:  # as long as none fits, the shortest
                 best, least = choice, error
         assert best is not None
@@ -136,8 +137,10 @@ class PilotResult:
         count = choice.prediction.iterations
         if self.setting.seconds is not None:
             count = math.floor(count)
-        errors = choice.prediction.errors.values()
-        return math.prod(error.after(count) for error in errors) if count > 0 else math.inf
+        errors = choice.prediction.errors
+        if count <= 0:
+            return math.inf
+        return math.prod(errors[measure].after(count) for measure in self._measures)
 
     def _choose(self, share: float, count: float, kept: Choice | None, reluctance: float) -> Choice:
         """The same with this `share` of the light sub-paths."""
@@ -160,6 +163,13 @@ class PilotResult:
         return replace(choice, prediction=self._predict(choice, count))
 
     @property
+    def _measures(self) -> list[str]:
+        """The measures of error that decide: both, or relative errors alone where gathers are at
+        deeper vertices. These are spread over the scene, and blur close to a lamp averages out;
+        absolute errors are then rare noise, of which a pilot knows too little."""
+        return list(MEASURES) if self.setting.at_first_vertex else ["relmse"]
+
+    @property
     def _met(self) -> list[str]:
         """The kinds of photons that camera paths gather."""
         return list(self.errors["relmse"])
@@ -173,7 +183,7 @@ class PilotResult:
             return np.maximum(count / self._cost(kind, radius, corrected, share), 1)
 
         used = None if kept is None else (kept.radii[kind], kept.corrected[kind])
-        errors = [by_kind[kind] for by_kind in self.errors.values()]
+        errors = [self.errors[measure][kind] for measure in self._measures]
         return best_radius(errors, iterations, used, reluctance, share)
 
     def _predict(self, choice: Choice, count: float) -> Prediction:
