@@ -244,7 +244,7 @@ class BDPMOptSession(WeightedSession):
                 self.lights,
                 photons,
                 paths,
-                self.traits.bounds,
+                self.traits,
                 spectral["wavelengths"],
             )
 

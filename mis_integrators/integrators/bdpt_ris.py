@@ -15,8 +15,8 @@ class PCBPT(ResampledIntegrator):
     .. pluginparameters::
 
      * - light_paths, resamples, cache_neighbors, target, weights, light_tracing, merging,
-         initial_radius, alpha, camera_paths, variance, aovs, max_depth, rr_depth, hide_emitters,
-         sampler
+         guided_lights, initial_radius, alpha, camera_paths, variance, aovs, max_depth, rr_depth,
+         hide_emitters, sampler
        -
        - As of :monosp:`bdpt_ris`.
 
@@ -81,6 +81,10 @@ class BDPTRIS(ResampledIntegrator):
        - Merges camera vertices with the light sub-paths that end near them, as :monosp:`vcm` does:
          those that are joined to the sensor. Not with ``published`` weights. (Default: no, i.e.
          |false|)
+     * - guided_lights
+       - |bool|
+       - Whether light sub-paths of suns, skies and environment maps start mostly where they light
+         what the camera sees, as a pilot of camera paths tells. (Default: yes, i.e. |true|)
      * - initial_radius
        - |float|
        - With ``merging``: merge radius of the first iteration, in scene units; 0 stands for 0.4 %

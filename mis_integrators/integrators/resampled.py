@@ -114,6 +114,7 @@ class ResampledIntegrator(IterativeIntegrator):
         self.merging = parameters.boolean("merging", False)
         if self.merging and self.published:
             parameters.refuse("merging", 'the papers\' weights know none; use "weights" = bounded')
+        self.guided_lights = parameters.boolean("guided_lights", True)
         self.initial_radius, self.alpha = read_radius(parameters)
         if not self.merging:
             for name in ("initial_radius", "alpha"):
@@ -129,6 +130,7 @@ class ResampledIntegrator(IterativeIntegrator):
             "weights": self.weights,
             "light_tracing": self.light_tracing,
             "merging": self.merging,
+            "guided_lights": self.guided_lights,
             "initial_radius": self.initial_radius,
             "alpha": self.alpha,
         }
@@ -168,7 +170,7 @@ class ResampledSession(IterativeSession):
     def __init__(self, integrator, scene, sensor, seed, iterations):
         super().__init__(integrator, scene, sensor, seed, iterations)
         self.traits = SceneTraits(scene, sensor)
-        self.lights = Lights.seen_by(scene, sensor, integrator.plugin)
+        self.lights = Lights.seen_by(scene, sensor, integrator.plugin, integrator.guided_lights)
         if self.traits.has_media:
             self.lights.find_media(sensor, integrator.plugin)
         self.world = World(scene, self.lights, self.traits)

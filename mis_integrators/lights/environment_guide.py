@@ -168,7 +168,8 @@ class EnvironmentGuide:
     the lit places that the pilot met; `portals` of the light of environments (`None` where the
     pilot saw next to none); `direction_share`, the share of environment sub-paths whose direction
     comes from the emitter's own sampler; `aims`, whether next-event estimation in the box around
-    the lit places aims at the entrances.
+    the lit places aims at the entrances. Without a `sensor` (None) there is no pilot, and all
+    densities are the plain ones.
     """
 
     def __init__(self, scene, sensor):
@@ -186,7 +187,10 @@ class EnvironmentGuide:
         self.direction_share = 1.0
         self.portals = None
         self.aims = False
-        self._learn(sensor)
+        if sensor is None:
+            self._keep(np.zeros((self.row_count, POSITION_CELLS**2)), np.zeros(0, np.uint32))
+        else:
+            self._learn(sensor)
 
     def _set_sphere(self, center, radius):
         self.center, self.radius = mi.Point3f([float(x) for x in center]), float(radius) * 1.001
@@ -228,7 +232,6 @@ class EnvironmentGuide:
         p, d, row, weight, density, own = (
             x[..., useful] for x in (p, d, row, weight, density, own)
         )
-        of_sky = self._environment_rows()
         cells = POSITION_CELLS**2
         pmf = np.zeros((self.row_count, cells))
         if len(row) >= FEWEST_RECORDS:
@@ -249,7 +252,7 @@ class EnvironmentGuide:
             pmf += np.bincount((row * cells + cell)[inside], weight[inside], pmf.size).reshape(
                 pmf.shape
             )
-            entering = of_sky[row]
+            entering = self._environment_rows()[row]
             if np.count_nonzero(entering) >= FEWEST_RECORDS:
 
                 def portals(records):
@@ -265,6 +268,12 @@ class EnvironmentGuide:
                     portals(entering & odd),
                     *(x[..., entering & ~odd & (own > 0)] for x in (p, d, light, density, own)),
                 )
+        self._keep(pmf, row)
+
+    def _keep(self, pmf, row):
+        """Makes the tables. `pmf`: weights of the records by table row and position cell; `row`:
+        the records' rows."""
+        cells = POSITION_CELLS**2
         seen = pmf.any(axis=1)
         found = pmf[seen].reshape(-1, POSITION_CELLS, POSITION_CELLS)
         pmf[seen] = smoothed(found, LEVEL_SHARES).reshape(-1, cells)
@@ -276,7 +285,9 @@ class EnvironmentGuide:
         if self.portals is not None:
             met = np.bincount(row, minlength=self.row_count)
             entering = np.where(
-                of_sky, (1 - DEFENSIVE_SHARE) * ENOUGH_RECORDS / (ENOUGH_RECORDS + met), 0.0
+                self._environment_rows(),
+                (1 - DEFENSIVE_SHARE) * ENOUGH_RECORDS / (ENOUGH_RECORDS + met),
+                0.0,
             )
             guided -= np.where(guided > 0, entering, 0)
             self._entering = from_numpy(mi.Float, entering)

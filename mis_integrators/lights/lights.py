@@ -143,15 +143,12 @@ class Lights:
             self.nearby = NearbyChoice(self, power > 0, sensor)
 
     @classmethod
-    def seen_by(cls, scene, sensor, plugin):
+    def seen_by(cls, scene, sensor, plugin, guided=True):
         """The lights of a scene; its environments, if any, send their light sub-paths where
-        `sensor` will see something of them."""
-        return cls(
-            scene,
-            plugin,
-            EnvironmentGuide(scene, sensor) if infinite_emitters(scene) else None,
-            sensor=sensor,
-        )
+        `sensor` will see something of them, unless they are not to be `guided`."""
+        seer = sensor if guided else None
+        guide = EnvironmentGuide(scene, seer) if infinite_emitters(scene) else None
+        return cls(scene, plugin, guide, sensor=sensor)
 
     def find_media(self, sensor, plugin):
         """Finds the media in which emitters stand, for `medium_at`."""

@@ -20,6 +20,7 @@ from ..core.packing import (
 )
 from ..core.random import streams
 from ..core.spectra import channel_mean
+from ..paths.media import transmittance
 from ..paths.vertex import in_medium
 from .frozen import FrozenPhotons
 
@@ -92,11 +93,13 @@ class IrradianceCache:
         lights,
         photons: FrozenPhotons,
         light_path_count,
-        bounds,
+        traits,
         wavelengths,
     ):
         """`photons`: those of a light pass, direct light's included; `light_path_count`: how many
-        sub-paths made them, all of the same `wavelengths` (empty in rgb and mono variants)."""
+        sub-paths made them, all of the same `wavelengths` (empty in rgb and mono variants);
+        `traits`: the scene's `SceneTraits`."""
+        self.traits, bounds = traits, traits.bounds
         self.origin, self.wavelengths = mi.Point3f(bounds.min), wavelengths
         self.words = 12 if colours() == 1 else 16
         all_photons = photons.all()
@@ -210,7 +213,7 @@ class IrradianceCache:
                 *irradiance,
                 *direction,
                 _pack_light(light, visible_share),
-                self._direct_noise(lights),
+                self._direct_noise(scene, lights),
                 caustic_share,
             )
         ):
@@ -244,15 +247,23 @@ class IrradianceCache:
         for index in near[:MOST_LIGHTS]:
             ds, value = lights.unoccluded(si, mi.UInt32(index), mi.Bool(True))
             value *= _cosine(ds.d, self.facing)
-            value = dr.select(
-                (value > 0) & ~scene.ray_test(si.spawn_ray_to(ds.p), value > 0), value, 0
-            )
+            value *= self._let_through(scene, si.spawn_ray_to(ds.p), value > 0)
             light = dr.select(value > best, mi.UInt32(index), light)
             best = dr.maximum(best, value)
             dr.eval(best, light)
         return light, dr.select(best > 0, dr.minimum(direct / dr.maximum(best, 1e-30), 2), 0)
 
-    def _direct_noise(self, lights):
+    def _let_through(self, scene, shadow, active):
+        """Share of light on shadow rays, which the boundaries of media do not block. What lies
+        before the first boundary is not known, and taken to be empty."""
+        if not self.traits.has_media:
+            return dr.select(active & ~scene.ray_test(shadow, active), mi.Float(1), 0)
+        nowhere = dr.zeros(mi.MediumPtr, dr.width(shadow.o))
+        rng = streams(dr.arange(mi.UInt32, dr.width(shadow.o)), mi.UInt32(OWN_STREAM))
+        kept, _ = transmittance(scene, self.traits, shadow, nowhere, rng, active)
+        return channel_mean(kept)
+
+    def _direct_noise(self, scene, lights):
         """Relative variance of next-event estimation at each cell's center, from `DIRECT_SAMPLES`
         samples."""
         cells = dr.width(self.center)
@@ -261,10 +272,12 @@ class IrradianceCache:
         si = self._facing_surface(
             dr.gather(mi.Point3f, self.center, number // DIRECT_SAMPLES), facing
         )
-        ds, weight, _ = lights.sample_direct(
+        ds, weight, _ = lights.propose_direct(
             si, streams(number, mi.UInt32(OWN_STREAM)), mi.Bool(True)
         )
         value = channel_mean(weight) * _cosine(ds.d, facing)
+        shadow = lights.shadow_ray(si, ds, lights.guide is not None)
+        value *= self._let_through(scene, shadow, value > 0)
         mean, square = (
             dr.block_sum(value, DIRECT_SAMPLES) / DIRECT_SAMPLES,
             dr.block_sum(dr.square(value), DIRECT_SAMPLES) / DIRECT_SAMPLES,

@@ -592,6 +592,7 @@ ROWS = [
             MONO,
             {"resamples": 4, "target": "f_y_f_yz"},
         ),
+        ("bdpt_ris", "several", "smooth0", "perspective", RGB, {"guided_lights": False}),
     ),
 ]
 
