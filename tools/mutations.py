@@ -622,4 +622,18 @@ MUTATIONS = [
         "renders are set up while another thread renders",
         "tests/integrators/test_hard_use.py::test_threads_take_turns",
     ),
+    Mutation(
+        "photons/irradiance_cache.py",
+        "        if not self.traits.has_media:\n            return dr.select(active & ~scene",
+        "        if True:\n            return dr.select(active & ~scene",
+        "boundaries of media block light where its noise is measured",
+        "tests/integrators/test_opt_media.py::test_least_noise_in_a_sphere_full_of_fog",
+    ),
+    Mutation(
+        "pilot/radius.py",
+        "for each in errors], axis=0)",
+        "for each in errors[:1]], axis=0)",
+        "radii are chosen by relative error alone",
+        "tests/pilot/test_radius.py::test_bright_spots_count",
+    ),
 ]

@@ -218,7 +218,8 @@ def _compare(
             failure.code, f"--compare {options.compare}: {failure}; {options.output} is written"
         ) from error
     if not options.quiet:
-        for line in (*(entry.line for row in rows for entry in row), f"side by side: {path}"):
+        told = [entry.line for row in rows for entry in row if entry.effort or entry.quality]
+        for line in (*told, f"side by side: {path}"):
             complain(line, "")
     if interrupt.requested:
         complain(f"interrupted: {options.compare} had less time")

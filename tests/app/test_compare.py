@@ -145,6 +145,13 @@ def test_denoised_ones_have_a_row_of_their_own(scene, tmp_path, capfd):
     assert png(tmp_path / "a.compare.png").shape[0] == 2 * (408 + 60)
 
 
+def test_nothing_is_said_of_denoised_ones_without_a_reference(scene, capfd):
+    pytest.importorskip("mitsuba_oidn")
+    assert render(scene, "--spp", 1, "--compare", "path", "--denoise") == 0
+    said = capfd.readouterr().err
+    assert "path: " in said and "denoised: " not in said
+
+
 # --- What is refused -----------------------------------------------------------------------------
 
 
