@@ -359,8 +359,8 @@ MUTATIONS = [
     ),
     Mutation(
         "pilot/radius.py",
-        "predicted = bias + variance / iterations(fine, corrected)",
-        "predicted = bias + variance",
+        "return self.squared_bias[corrected] + variance / iterations",
+        "return self.squared_bias[corrected] + variance",
         "the radius does not know how long a render will be",
         RADIUS,
     ),
