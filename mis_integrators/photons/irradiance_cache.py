@@ -20,7 +20,7 @@ from ..core.packing import (
 )
 from ..core.random import streams
 from ..core.spectra import channel_mean
-from ..paths.media import transmittance
+from ..paths.media import SHADOW_SALT, transmittance
 from ..paths.vertex import in_medium
 from .frozen import FrozenPhotons
 
@@ -259,7 +259,8 @@ class IrradianceCache:
         if not self.traits.has_media:
             return dr.select(active & ~scene.ray_test(shadow, active), mi.Float(1), 0)
         nowhere = dr.zeros(mi.MediumPtr, dr.width(shadow.o))
-        rng = streams(dr.arange(mi.UInt32, dr.width(shadow.o)), mi.UInt32(OWN_STREAM))
+        number = dr.arange(mi.UInt32, dr.width(shadow.o))
+        rng = streams(number, mi.UInt32(OWN_STREAM ^ SHADOW_SALT))
         kept, _ = transmittance(scene, self.traits, shadow, nowhere, rng, active)
         return channel_mean(kept)
 

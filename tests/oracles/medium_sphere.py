@@ -128,7 +128,7 @@ class MediumSphere:
     def _from(self, r, on_wall, radius, light_paths):
         """For one z_0: noise, for the three kinds of weights, and the mean."""
         far, wall, chance = self.next_vertices(r, on_wall)
-        throughput, f = self.albedos(on_wall), self.scattering(far * 0 + wall)
+        throughput, f = self.albedos(on_wall), self.scattering(wall)
         direct = self.once(far, wall)
         second, second_flux = self.twice(far, wall)
         # Of photons at z_0 and at z_1, (paths of three segments, of four).
