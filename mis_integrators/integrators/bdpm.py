@@ -16,13 +16,20 @@ from ..paths.camera import film_sample_count, film_size
 from ..paths.layers import CHANNELS, SPLIT
 from ..paths.light_classes import LightClasses
 from ..paths.lobes import is_narrow, narrow_bsdfs
+from ..paths.ray_cones import cones_of
 from ..paths.setting import World
 from ..photons.beams import Beams, gather_along, read_beams
 from ..photons.coverage import covered_share
 from ..photons.gather import QueryVertices, gather_photons
 from ..photons.grid import PhotonMap, build_photon_map
 from ..photons.points import read_points
-from ..photons.queries import Queries, read_queries, trace_camera_paths
+from ..photons.queries import (
+    Queries,
+    pixel_disk,
+    read_queries,
+    takes_photons,
+    trace_camera_paths,
+)
 from ..photons.tiers import TieredMap, build_tiered_map, gather_tiers
 from ..photons.trace import trace_light_paths
 from ..photons.volume import VolumeMap, build_volume_map
@@ -197,6 +204,9 @@ class BDPMSession(PilotedSession):
     """Whether caustic photons have radii of their own where the radius is automatic."""
     narrows_volume = True
     """Whether volume photons have, too. (Weights know one radius for all.)"""
+    narrows_seen = True
+    """Whether caustic photons have disks of a pixel's size where the camera sees them, in images
+    that will be denoised. (Weights know one radius for all.)"""
     points = False
     """Whether volume photons are gathered at vertices in media, and not along beams."""
 
@@ -221,6 +231,9 @@ class BDPMSession(PilotedSession):
             and not self.lights.dark
             and (self.has_caustics or depth < 0 or depth >= integrator.bdd + 2)
         )
+        self.cones = None
+        if self.narrows_seen and integrator.denoised and self.has_caustics:
+            self.cones = None if integrator.initial_radius else cones_of(sensor)
         self.narrow = None
         if integrator.pass_narrow and self.has_indirect:
             self.narrow = narrow_bsdfs(scene)
@@ -265,7 +278,8 @@ class BDPMSession(PilotedSession):
         return [
             kind
             for kind, needed in (
-                ("caustic", self.has_caustics),
+                ("seen_caustic", self.cones is not None),
+                ("caustic", self.has_caustics and (self.cones is None or self.last_vertex > 0 or self.narrow is not None)),
                 ("indirect", self.has_indirect),
                 ("volume", self.has_volume),
             )
@@ -425,6 +439,8 @@ class BDPMSession(PilotedSession):
         ]
         if self.narrow is not None:
             self._tables.append(self.narrow)
+        if self.cones is not None:
+            self._tables += self.cones.tables()
         self._light_pass = self.recorded(self._trace_light)
         self._map_pass = self.recorded(self._build_maps)
         self._record_camera_pass()
@@ -462,6 +478,7 @@ class BDPMSession(PilotedSession):
             0 if self.points else beams,
             self.narrow,
             self.points,
+            self.cones,
         )
         return trace_camera_paths(
             self.world,
@@ -491,9 +508,10 @@ class BDPMSession(PilotedSession):
 
     def _merge(self, photon_map, record, kind, radii, spectral, grey=False, weigh=None, scale=1):
         """`gather_photons` of one kind at vertices as of `read_queries`."""
-        vertices = QueryVertices(
-            self.traits, record, spectral["wavelengths"], kind == "indirect", scale
-        )
+        takes = takes_photons(record, kind)
+        vertices = QueryVertices(self.traits, record, spectral["wavelengths"], takes, scale)
+        if kind == "seen_caustic":
+            radii = [dr.minimum(radius, pixel_disk(record)) for radius in radii]
         light_paths, max_depth = self._light_paths, self.integrator.max_depth
         marked = self.integrator.splits_light
         if isinstance(photon_map, TieredMap):
@@ -555,7 +573,7 @@ class BDPMSession(PilotedSession):
             self.traits.bounds,
             radius,
             self.photon_capacity,
-            kind,
+            "caustic" if kind == "seen_caustic" else kind,
             mis_words,
         )
 

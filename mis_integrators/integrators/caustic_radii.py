@@ -32,7 +32,7 @@ class CausticRadii:
     def most_iterations(self):
         """The largest value that `iterations` may have: 0 where radii never differ."""
         session = self.session
-        differ = session.widens_caustics and session.has_caustics
+        differ = session.widens_caustics and session.has_caustics and session.cones is None
         return MOST_ITERATIONS if differ and not session.integrator.initial_radius else 0.0
 
     def plan(self, iterations):

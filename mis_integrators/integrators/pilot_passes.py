@@ -15,7 +15,7 @@ from ..core.spectra import channel_mean
 from ..photons.beams import Beams, mean_count_along
 from ..photons.gather import mean_photon_count
 from ..photons.points import Points, mean_count_in_balls, read_points
-from ..photons.queries import read_queries
+from ..photons.queries import pixel_disk, read_queries
 
 
 class SubsetPasses:
@@ -34,26 +34,23 @@ class SubsetPasses:
         session, pixels = self.session, self.pixels
         self.capacity, self.beam_capacity = capacity, beams
         stride = pixels.stride * pixels.camera_paths
-        back = (
-            1 - pixels.count * stride
-        ) % 2**32  # from a path of the last pixel to the next one of the first
-        self._camera = session.recorded(
-            lambda scene, sensor, tables, sequence, spectral: session._trace_camera(
-                replace(
-                    session.describe_camera_pass(
-                        sensor, sequence, lanes(pixels.paths) // pixels.count * back, spectral
-                    ),
-                    count=pixels.paths,
-                    camera_paths=pixels.camera_paths,
-                    stride=stride,
-                ),
-                capacity,
-                spectral,
-                0.0,
-                mi.Float(1),
-                beams=beams,
+
+        def trace(scene, sensor, tables, sequence, spectral):
+            number = lanes(pixels.paths) // pixels.count  # of a path through its pixel
+            group = number * pixels.groups // pixels.camera_paths
+            first = number * ((1 - pixels.count * stride) % 2**32)  # back to the first pixel
+            first += group * (pixels.apart * pixels.camera_paths)
+            camera_pass = replace(
+                session.describe_camera_pass(sensor, sequence, first, spectral),
+                count=pixels.paths,
+                camera_paths=pixels.camera_paths,
+                stride=stride,
             )
-        )
+            return session._trace_camera(
+                camera_pass, capacity, spectral, 0.0, mi.Float(1), beams=beams
+            )
+
+        self._camera = session.recorded(trace)
 
     def seen(self):
         """As of `pilot.run.PilotPasses`: what the paths for direct light see."""
@@ -170,6 +167,13 @@ class SubsetIteration(NamedTuple):
         vertices = read_queries(self.vertices)
         points = vertices["ray_o"] + vertices["ray_d"] * vertices["hit"].t
         return np.array(points), np.array(dr.max(vertices["throughput"]))
+
+    def pixel_disks(self):
+        vertices = read_queries(self.vertices)
+        if "pixel" not in vertices:
+            return np.zeros(0)
+        disks = np.array(pixel_disk(vertices))
+        return disks[(disks > 0) & np.array(dr.max(vertices["throughput"]) > 0)]
 
     def mean_photon_count(self, kind, radius):
         return self.passes.mean_photon_count(self.photons, self.vertices, kind, radius)

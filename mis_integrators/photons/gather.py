@@ -39,15 +39,13 @@ class QueryVertices:
     Lambertian ones scatter every photon alike, but for its cosine: their BSDF is evaluated once,
     and in scenes that have no others none is evaluated for a photon.
 
-    `only_last`: the others take no photons; `scale` (a spectrum): a weight that all photons of a
-    vertex have.
+    `takes`: which of them take photons; `scale` (a spectrum): a weight that all photons of a vertex
+    have.
     """
 
-    def __init__(self, traits, record, wavelengths, only_last=False, scale=1):
+    def __init__(self, traits, record, wavelengths, takes=True, scale=1):
         throughput, depth = record["throughput"], record["depth"]
-        active = dr.max(throughput) > 0
-        if only_last:
-            active &= (depth & LAST_VERTEX) != 0
+        active = (dr.max(throughput) > 0) & takes
         ray = mi.Ray3f(record["ray_o"], record["ray_d"], 0, wavelengths)
         si = record["hit"].compute_surface_interaction(ray, mi.RayFlags.All, active)
         self.traits, self.si, self.bsdf, self.active = traits, si, si.bsdf(), active

@@ -27,6 +27,9 @@ from .points import new_points, point_layout
 
 LAST_VERTEX = 1 << 31
 """Bit of a vertex' depth that says that all photons are wanted there, else only caustic ones."""
+PIXEL_DISK = 0.35
+"""Tuned: their radius over the width of a pixel. (With 0.5 the denoised walls of a room lit through
+glass have a texture.)"""
 STATE = ("weights.0", "weights.1", "weights.2")
 """What a vertex buffer calls the state of the weights."""
 
@@ -65,15 +68,18 @@ def weight_layout():
     return Layout(dict.fromkeys((*STATE, "share"), mi.Spectrum))
 
 
-def new_vertex_buffer(capacity, weighted=False, split=False):
+def new_vertex_buffer(capacity, weighted=False, split=False, cones=False):
     """Room for `capacity` camera vertices, a dictionary: `words` (records of `query_layout`; unused
     ones are zero), if `weighted`, `weights` (records of `weight_layout`), and if light is `split`
-    into classes, `first`: whether the path has scattered smoothly nowhere before."""
+    into classes, `first`: whether the path has scattered smoothly nowhere before. With `cones`,
+    `pixel`: how wide a pixel is there; 0 where the path has scattered smoothly before."""
     buffer = {"words": dr.zeros(mi.UInt32, query_layout().words * capacity)}
     if weighted:
         buffer["weights"] = weight_layout().room(capacity)
     if split:
         buffer["first"] = dr.zeros(mi.Bool, capacity)
+    if cones:
+        buffer["pixel"] = dr.zeros(mi.Float, capacity)
     return buffer
 
 
@@ -89,7 +95,25 @@ def read_queries(vertices, first=0, count=None):
         record |= weight_layout().read(vertices["weights"], index)
     if "first" in vertices:
         record["first"] = dr.gather(mi.Bool, vertices["first"], index)
+    if "pixel" in vertices:
+        record["pixel"] = dr.gather(mi.Float, vertices["pixel"], index)
     return record
+
+
+def takes_photons(record, kind):
+    """Which vertices (fields as of `read_queries`) gather photons of a kind: "seen_caustic" those
+    that the camera sees, where a buffer knows these, "caustic" then all others."""
+    if kind == "indirect":
+        return (record["depth"] & LAST_VERTEX) != 0
+    if "pixel" not in record or kind not in ("caustic", "seen_caustic"):
+        return mi.Bool(True)
+    return (record["pixel"] > 0) == (kind == "seen_caustic")
+
+
+def pixel_disk(record):
+    """Radii of disks that near pixels hardly share, at vertices that the camera sees (fields as of
+    `read_queries`)."""
+    return PIXEL_DISK * record["pixel"]
 
 
 @dataclass(frozen=True)
@@ -101,7 +125,8 @@ class Queries:
     there are; `one_vertex`: no path asks twice, and each owns the place of its number; `beams`: how
     many beams of each kind there is room for (0: none are kept); `narrow`: a registry table of
     BSDFs at which none but caustic photons are gathered, and which the `bdd` does not count (None:
-    there are none); `points`: in media, too, photons are asked for at vertices (under weights).
+    there are none); `points`: in media, too, photons are asked for at vertices (under weights);
+    `cones` (`RayCones`, or None): they tell how wide pixels are at vertices that the camera sees.
     """
 
     bdd: int
@@ -112,6 +137,7 @@ class Queries:
     beams: int = 0
     narrow: Any = None
     points: bool = False
+    cones: Any = None
 
 
 class QueryVisitor:
@@ -124,8 +150,8 @@ class QueryVisitor:
     `bdd`-th); whether there was any of these; whether the last vertex scattered by a delta
     function; the density of the last smooth scattering; the last smooth vertex; the weight of
     direct light there; how many times light counts that is found there; the state of `weights`;
-    with `classes` what these carry along; and in scenes with media the share of light that has got
-    through these without being scattered.
+    with `classes` what these carry along; where they are asked for, the path's ray cone; and in
+    scenes with media the share of light that has got through these without being scattered.
 
     In media, paths scatter until they have left `bdd` smooth vertices behind, and go straight on
     from there; where photons are asked for at points, until they have left one more behind.
@@ -140,7 +166,10 @@ class QueryVisitor:
         self.by_light = weights is not None and weights.weighs_points_of_lights
         self.store = Store(
             vertices=new_vertex_buffer(
-                queries.capacity * self.sections, weights is not None, classes is not None
+                queries.capacity * self.sections,
+                weights is not None,
+                classes is not None,
+                queries.cones is not None,
             ),
             room=dr.opaque(mi.UInt32, queries.capacity),
             count=dr.zeros(mi.UInt32, self.sections),
@@ -175,8 +204,9 @@ class QueryVisitor:
         one = mi.Float(1)
         history = [] if self.classes is None else start_of_camera_path()
         begun = [mi.UInt32(0), mi.Bool(False), mi.Bool(False), one, origin, mi.Spectrum(1)]
+        cone = [] if self.queries.cones is None else self.queries.cones.begin()
         clear = [mi.Spectrum(1)] if self.traits.has_media else []
-        return [*begun, mi.Float(self.first), sums, history, clear]
+        return [*begun, mi.Float(self.first), sums, history, cone, clear]
 
     def travel(self, state, ray, flight, numbers, throughput, path, depth, active):
         *others, clear = state
@@ -200,7 +230,7 @@ class QueryVisitor:
         vertices, short ones before."""
         if not self.queries.beams:
             return lambda *piece: None
-        vertex, *_, sums, history, _ = state
+        vertex, *_, sums, history, _, _ = state
         store, wanted = self.store, mi.Bool(True)
         if kind == LONG:
             wanted &= vertex == self.bdd
@@ -238,7 +268,7 @@ class QueryVisitor:
         return keep
 
     def emission(self, state, at, active):
-        _, met, behind_delta, scatter_pdf, origin, share_here, times, sums, history, _ = state
+        _, met, behind_delta, scatter_pdf, origin, share_here, times, sums, history, _, _ = state
         ds = mi.DirectionSample3f(self.scene, at.si, origin)
         shown = active & (~met | ~behind_delta)
         if self.hide_emitters:
@@ -274,6 +304,9 @@ class QueryVisitor:
             sums, share = weights.propagate(sums, at.si, self._scattering(at), vertex, smooth)
             share_here = dr.select(smooth, share, share_here)
             at.ends |= weights.ends(self._scattering(at), vertex, smooth)
+        if self.queries.cones is not None:
+            history, cone, clear = more
+            more = [history, self.queries.cones.arrived(cone, at, active), clear]
         state = [vertex, met, behind_delta, scatter_pdf, origin, share_here, times, sums, *more]
         direct = mi.Spectrum(0)
         if not self.lights.dark:
@@ -311,7 +344,7 @@ class QueryVisitor:
 
     def _ask_in_medium(self, state, at, wants):
         """Stores the vertices in media at which photons are to be gathered."""
-        vertex, _, _, _, _, share_here, _, sums, history, _ = state
+        vertex, _, _, _, _, share_here, _, sums, history, _, _ = state
         store = self.store
         section = dr.select(at.ends, mi.UInt32(self.bdd), vertex)
         slot = dr.scatter_inc(store.point_count, section, wants)
@@ -333,7 +366,7 @@ class QueryVisitor:
 
     def _ask_for_photons(self, state, at, smooth):
         """Stores the vertices at which photons are to be gathered."""
-        vertex, _, _, _, _, share_here, _, sums, history, _ = state
+        vertex, met, _, _, _, share_here, _, sums, history, cone, _ = state
         weights, store, queries = self.weights, self.store, self.queries
         last = at.ends | (weights is not None)
         wants = smooth & (dr.max(at.throughput) > 0)
@@ -359,9 +392,11 @@ class QueryVisitor:
             weight_layout().write(store.vertices["weights"], state, slot, wants)
         if self.classes is not None:
             dr.scatter(store.vertices["first"], history[0] == 0, slot, wants)
+        if cone:
+            dr.scatter(store.vertices["pixel"], dr.select(met, 0, cone[0]), slot, wants)
 
     def leave(self, state, at, rng, bs, weight, delta, active):
-        vertex, met, _, scatter_pdf, origin, share_here, times, sums, history, clear = state
+        vertex, met, _, scatter_pdf, origin, share_here, times, sums, history, cone, clear = state
         if not self.traits.has_light_surfaces:
             active &= delta | ~at.ends
         if self.passes_masks:
@@ -382,12 +417,15 @@ class QueryVisitor:
             times,
             sums,
             scattered_history(history, delta, active) if history else [],
+            cone,
             clear,
         ]
         return state, weight, active
 
     def cross(self, before, after, crosses):
-        return selected(crosses, before, after)
+        chosen = selected(crosses, before, after)
+        chosen[-2] = after[-2]  # the cone has grown on the way
+        return chosen
 
     def alpha(self, state, visible):
         if not self.traits.has_media:

@@ -6,12 +6,12 @@ photons: their noise is alike in near pixels, and stays, as the blur of their di
 
 The law of total variance tells the two apart. Let B be the variance of a camera path's estimate
 with its photons given, mean over photons, and F that of its mean over camera paths. A path has the
-variance F + B; two paths of a pixel that gather the same photons have the covariance F. With
+variance F + B; two paths of near pixels that gather the same photons have the covariance F. With
 half their sum s and half their difference d,
 
-    Var[s] = F + B / 2,    Var[d] = B / 2,
+    Var[s] = F + B / 2,    Var[d] = B / 2
 
-and what counts after the denoiser is F + LEFT B = Var[s] - (1 - 2 LEFT) Var[d].
+(variances over iterations: that the two pixels differ does not matter), and what counts after the denoiser is F + LEFT B = Var[s] - (1 - 2 LEFT) Var[d].
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ LEFT = 1 / 25
 """Tuned: share that Open Image Denoise leaves of the squared error of noise which is independent
 from pixel to pixel (1/7 to 1/34, the less, the noisier the image)."""
 GROUPS = 2
-"""Groups of camera paths through each pixel of a pilot that tells shared noise from other."""
+"""Groups of camera paths, through near pixels, of a pilot that tells shared noise from other."""
 
 
 def variance_left(samples: np.ndarray) -> np.ndarray:

@@ -108,7 +108,8 @@ def error_by_radius(
     alike: bool = False,
     light_paths: float = 1.0,
 ) -> ErrorByRadius:
-    """The `ErrorByRadius` of estimates at the `radii` of the ladder.
+    """The `ErrorByRadius` of estimates at the `radii` of the ladder. A ladder of one radius is
+    given: its disks are so small that they do not blur.
 
     Parameters
     ----------
@@ -139,12 +140,14 @@ def error_by_radius(
         at_edges = {which: between(fine, radii, added * wrong[which]) for which in wrong}
         best = plain + lacking[:, None] * (corrected - plain)
         least *= (LEAST_CORRECTED / LEAST_BIAS) ** min(max(lacking[-1], 0.0), 1.0)
-    difference, error = squared_difference(best, weights)
-    blur = expected_squared_bias(radii, difference, error, len(plain), fine, least)
+    blur: np.ndarray | float = 0.0
+    if len(radii) > 1:
+        difference, error = squared_difference(best, weights)
+        blur = expected_squared_bias(radii, difference, error, len(plain), fine, least)
     return ErrorByRadius(
         radii,
         fine,
-        {which: blur + at_edges[which] for which in noise},
+        {which: np.zeros(len(fine)) + blur + at_edges[which] for which in noise},
         noise,
     )
 

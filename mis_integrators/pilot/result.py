@@ -260,11 +260,11 @@ def measure(
                 by_correction[False],
                 by_correction.get(True),
                 weights[measure],
-                setting.at_first_vertex and not setting.passes_lobes,
+                (setting.at_first_vertex and not setting.passes_lobes) or kind == "seen_caustic",
                 kind == "caustic",
                 setting.light_paths,
             )
-    caustics = np.mean(middle["caustic"]) if "caustic" in middle else 0.0
+    caustics = sum(np.mean(middle[kind]) for kind in ("seen_caustic", "caustic") if kind in middle)
     return PilotResult(
         setting,
         pixels,

@@ -29,6 +29,11 @@ see one point only): then radii so many times larger are tried, up to those that
 scene."""
 
 
+NEARLY_ALL = 0.9
+"""Disks of a pixel's size, the share of them below the largest: few that are far away must not make
+the grid of all too coarse."""
+
+
 class PilotIteration(Protocol):
     """One iteration of a pilot: photons, and the vertices of the camera paths of the pilot's
     pixels."""
@@ -36,6 +41,9 @@ class PilotIteration(Protocol):
     def points(self) -> tuple[np.ndarray, np.ndarray]:
         """Where the vertices lie, (3, n), and the weights of their paths, (n,): zero where there is
         none."""
+
+    def pixel_disks(self) -> np.ndarray:
+        """Radii of the disks of a pixel's size at the vertices that the camera sees."""
 
     def mean_photon_count(self, kind: str, radius: float) -> float:
         """Photons of a kind within `radius` of a vertex, on average; volume photons along beams: of
@@ -114,10 +122,15 @@ def choose_ladder(
     """By kind the radii to try, and the photons within the largest of a vertex, on average. No
     radii for kinds that no camera path gathers.
 
-    Photons on surfaces share their radii; volume photons have their own.
+    Photons on surfaces share their radii; volume photons have their own. Where photons have disks
+    of a pixel's size, a single one is the largest of nearly all of these.
     """
-    on_surfaces = [kind for kind in setting.kinds if kind != "volume"]
+    on_surfaces = [kind for kind in setting.kinds if kind not in ("volume", "seen_caustic")]
     radii, photons = ladder_on_surfaces(setting, on_surfaces, iteration)
+    if "seen_caustic" in setting.kinds and len(disks := iteration.pixel_disks()):
+        radius = float(np.quantile(disks, NEARLY_ALL))
+        radii["seen_caustic"] = np.array([radius])
+        photons["seen_caustic"] = iteration.mean_photon_count("seen_caustic", radius)
     if "volume" in setting.kinds:
         largest = largest_radius(setting.extent)
         probe = largest / PROBED_SHARE

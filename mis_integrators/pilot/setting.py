@@ -28,6 +28,11 @@ UNPLANNED_ITERATIONS = 64
 """Tuned: iterations that a render without a planned end is taken to have."""
 
 
+APART = 2
+"""Pixels from one to another that a denoiser averages, and which do not share the photons of disks
+as small as a pixel."""
+
+
 @dataclass(frozen=True)
 class PilotSetting:
     """What a pilot must know of the render that it is for."""
@@ -39,7 +44,7 @@ class PilotSetting:
     extent: float
     """Diagonal of the scene's bounding box."""
     kinds: tuple[str, ...]
-    """Photon maps: `caustic`, `indirect`, or both."""
+    """Of photons that are gathered apart: `seen_caustic`, `caustic`, `indirect`, `volume`."""
     at_first_vertex: bool
     """Whether photons are gathered at the first smooth vertex, which the camera sees."""
     passes_lobes: bool
@@ -100,6 +105,8 @@ class PilotPixels:
     the render, up to `MOST_CAMERA_PATHS`."""
     groups: int = 1
     """Of camera paths: more than one where a pilot tells shared noise from other."""
+    apart: int = 0
+    """How many pixels beyond those of the first group the next one's are."""
 
     @property
     def paths(self) -> int:
@@ -114,7 +121,9 @@ def pilot_pixels(setting: PilotSetting) -> PilotPixels:
     stride = max(setting.pixels * camera_paths // PILOT_PATHS, 1)
     while math.gcd(stride, setting.width) > 1:
         stride += 1
-    return PilotPixels(stride, -(-setting.pixels // stride), camera_paths, groups)
+    apart = min(APART, setting.pixels - 1) if groups > 1 else 0
+    count = -(-(setting.pixels - apart) // stride)
+    return PilotPixels(stride, count, camera_paths, groups, apart)
 
 
 def neighbourhoods(width: int, pixels: PilotPixels) -> np.ndarray:
