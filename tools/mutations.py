@@ -50,6 +50,7 @@ OPTIMAL = "tests/integrators/test_weights_in_renders.py"
 ANALYTIC = "tests/integrators/test_analytic.py"
 LONG = "tests/app/test_long_renders.py"
 TIERS = "tests/photons/test_tiers.py"
+PIXEL_DISKS = "tests/integrators/test_pixel_disks.py"
 VOLUME_RADII = "tests/photons/test_volume_radii.py"
 LOBES = "tests/integrators/test_narrow_lobes.py"
 VCM = "tests/integrators/test_vcm.py"
@@ -635,5 +636,40 @@ MUTATIONS = [
         "for each in errors[:1]], axis=0)",
         "radii are chosen by relative error alone",
         "tests/pilot/test_radius.py::test_bright_spots_count",
+    ),
+    Mutation(
+        "photons/queries.py",
+        'return PIXEL_DISK * record["pixel"]',
+        'return 8 * PIXEL_DISK * record["pixel"]',
+        "near pixels share the photons of a caustic that a denoiser sees",
+        f"{PIXEL_DISKS}::test_near_pixels_share_no_noise",
+    ),
+    Mutation(
+        "photons/queries.py",
+        'return (record["pixel"] > 0) == (kind == "seen_caustic")',
+        "return mi.Bool(True)",
+        "caustics that the camera sees count twice",
+        f"{PIXEL_DISKS}::test_light_counts_once",
+    ),
+    Mutation(
+        "paths/ray_cones.py",
+        "self.spread * cosine * dr.sqrt(cosine)",
+        "mi.Float(self.spread)",
+        "pixels at the border of the film are taken to be as wide as those in its middle",
+        f"{PIXEL_DISKS}::test_cones_are_as_wide_as_pixels",
+    ),
+    Mutation(
+        "integrators/pilot_passes.py",
+        "first += group * (pixels.apart * pixels.camera_paths)",
+        "first += group * 0",
+        "the pilot takes noise within a pixel for noise that near pixels share",
+        f"{PIXEL_DISKS}::test_groups_of_a_pilot_look_through_near_pixels",
+    ),
+    Mutation(
+        "photons/tiers.py",
+        "number = dr.select(number > left, number, 0)",
+        "number = mi.UInt32(number)",
+        "photons that a denoiser is to smooth have wide disks",
+        f"{TIERS}::test_tiers_bring_what_brute_force_finds",
     ),
 ]

@@ -30,7 +30,7 @@ from ..photons.queries import (
     takes_photons,
     trace_camera_paths,
 )
-from ..photons.tiers import TieredMap, build_tiered_map, gather_tiers
+from ..photons.tiers import LEFT_TO_DENOISER, TieredMap, build_tiered_map, gather_tiers
 from ..photons.trace import trace_light_paths
 from ..photons.volume import VolumeMap, build_volume_map
 from ..photons.volume_radii import VolumeDensity
@@ -201,7 +201,8 @@ class BDPMSession(PilotedSession):
     """Whether the pilot chooses how many light sub-paths an iteration has. (Weights would have to
     know of it before they are made.)"""
     widens_caustics = True
-    """Whether caustic photons have radii of their own where the radius is automatic."""
+    """Whether caustic photons with little light around have larger radii where the radius is
+    automatic."""
     narrows_volume = True
     """Whether volume photons have, too. (Weights know one radius for all.)"""
     narrows_seen = True
@@ -231,12 +232,16 @@ class BDPMSession(PilotedSession):
             and not self.lights.dark
             and (self.has_caustics or depth < 0 or depth >= integrator.bdd + 2)
         )
-        self.cones = None
-        if self.narrows_seen and integrator.denoised and self.has_caustics:
-            self.cones = None if integrator.initial_radius else cones_of(sensor)
+        self.cones = None  # where the camera sees caustics in disks of a pixel's size, `RayCones`
+        chosen = integrator.denoised and not integrator.initial_radius
+        if chosen and self.has_caustics and self.narrows_seen:
+            self.cones = cones_of(sensor)
         self.narrow = None
         if integrator.pass_narrow and self.has_indirect:
             self.narrow = narrow_bsdfs(scene)
+        self.has_caustics_unseen = self.has_caustics and (
+            self.cones is None or integrator.bdd > 0 or self.narrow is not None
+        )
         self.one_vertex = not self.traits.has_mixed and (
             (integrator.bdd == 0 and self.narrow is None) or not self.has_caustics
         )
@@ -279,7 +284,7 @@ class BDPMSession(PilotedSession):
             kind
             for kind, needed in (
                 ("seen_caustic", self.cones is not None),
-                ("caustic", self.has_caustics and (self.cones is None or self.last_vertex > 0 or self.narrow is not None)),
+                ("caustic", self.has_caustics_unseen),
                 ("indirect", self.has_indirect),
                 ("volume", self.has_volume),
             )
@@ -510,15 +515,19 @@ class BDPMSession(PilotedSession):
         """`gather_photons` of one kind at vertices as of `read_queries`."""
         takes = takes_photons(record, kind)
         vertices = QueryVertices(self.traits, record, spectral["wavelengths"], takes, scale)
+        disk = None
         if kind == "seen_caustic":
-            radii = [dr.minimum(radius, pixel_disk(record)) for radius in radii]
+            disk = pixel_disk(record)
+            radii = [dr.minimum(radius, disk) for radius in radii]
         light_paths, max_depth = self._light_paths, self.integrator.max_depth
         marked = self.integrator.splits_light
         if isinstance(photon_map, TieredMap):
             narrow = False
             if self.narrow is not None:
                 narrow = is_narrow(self.narrow, vertices.bsdf, vertices.si, vertices.active)
-            return gather_tiers(photon_map, vertices, light_paths, max_depth, weigh, marked, narrow)
+            return gather_tiers(
+                photon_map, vertices, light_paths, max_depth, weigh, marked, narrow, disk
+            )
         return gather_photons(
             photon_map, vertices, radii, light_paths, max_depth, weigh, grey, marked
         )
@@ -588,7 +597,7 @@ class BDPMSession(PilotedSession):
     def _build_maps(self, photons, radii, around, density):
         maps = {}
         for kind, radius in radii.items():
-            if kind == "caustic" and around is not None:
+            if kind == self.caustic_radii.kind and around is not None:
                 photon_map = self._tiered_map(photons, radius, around)
             else:
                 photon_map = self._map(photons, kind, radius, density)
@@ -598,7 +607,12 @@ class BDPMSession(PilotedSession):
     def _tiered_map(self, photons, radius, around):
         """The map of caustic photons, with radii by the light around them."""
         return build_tiered_map(
-            *photons[:3], self.traits.bounds, radius, self.photon_capacity, around
+            *photons[:3],
+            self.traits.bounds,
+            radius,
+            self.photon_capacity,
+            around,
+            LEFT_TO_DENOISER if self.cones is not None else 0,
         )
 
     def _render_chunk(self, scene, sensor, tables, maps, sequence, first, spectral, radii, beyond):

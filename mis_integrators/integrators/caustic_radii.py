@@ -29,10 +29,15 @@ class CausticRadii:
         self.session, self.iterations, self._around = session, 0.0, None
 
     @property
+    def kind(self):
+        """Of the photons whose radii differ."""
+        return "caustic" if self.session.cones is None else "seen_caustic"
+
+    @property
     def most_iterations(self):
         """The largest value that `iterations` may have: 0 where radii never differ."""
         session = self.session
-        differ = session.widens_caustics and session.has_caustics and session.cones is None
+        differ = session.widens_caustics and session.has_caustics
         return MOST_ITERATIONS if differ and not session.integrator.initial_radius else 0.0
 
     def plan(self, iterations):
@@ -54,7 +59,7 @@ class CausticRadii:
             surface, power, count = session.trace_photons(number, PURPOSE)[:3]
             if around is None:
                 around = LightAround.empty(
-                    session.radii["caustic"],
+                    session.radii[self.kind],
                     quantum_of(power, count),
                     self.iterations / passes,
                     session.light_path_count * passes,

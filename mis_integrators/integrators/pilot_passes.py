@@ -15,7 +15,7 @@ from ..core.spectra import channel_mean
 from ..photons.beams import Beams, mean_count_along
 from ..photons.gather import mean_photon_count
 from ..photons.points import Points, mean_count_in_balls, read_points
-from ..photons.queries import pixel_disk, read_queries
+from ..photons.queries import read_queries
 
 
 class SubsetPasses:
@@ -168,12 +168,12 @@ class SubsetIteration(NamedTuple):
         points = vertices["ray_o"] + vertices["ray_d"] * vertices["hit"].t
         return np.array(points), np.array(dr.max(vertices["throughput"]))
 
-    def pixel_disks(self):
+    def pixel_widths(self):
         vertices = read_queries(self.vertices)
         if "pixel" not in vertices:
             return np.zeros(0)
-        disks = np.array(pixel_disk(vertices))
-        return disks[(disks > 0) & np.array(dr.max(vertices["throughput"]) > 0)]
+        widths = np.array(vertices["pixel"])
+        return widths[(widths > 0) & np.array(dr.max(vertices["throughput"]) > 0)]
 
     def mean_photon_count(self, kind, radius):
         return self.passes.mean_photon_count(self.photons, self.vertices, kind, radius)

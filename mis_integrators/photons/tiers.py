@@ -29,6 +29,11 @@ AT_NARROW_LOBES = 2.0
 lobe brings as much as many elsewhere."""
 
 
+LEFT_TO_DENOISER = 3
+"""Tuned: photons of tiers up to that one have disks of a pixel's size in images that will be
+denoised: so many lie in a window of as many pixels as a denoiser averages."""
+
+
 class TieredMap:
     """Sorted photons, tier by tier. `arrays`: `start`, `surface` and `power` as of a `PhotonMap`,
     and `tier_radius`, that of the first tier."""
@@ -66,13 +71,15 @@ def tier_grid(bbox, table, radius, number):
     return Grid(bbox, tier_radius(radius, number), table, table.first_entry(number))
 
 
-def build_tiered_map(surface, power, count, bbox, radius, capacity, around):
+def build_tiered_map(surface, power, count, bbox, radius, capacity, around, left=0):
     """The `TieredMap` of the caustic photons, which lie in the tiers that the light `around` them
-    says (a `LightAround`); other arguments as of `build_photon_map`."""
+    says (a `LightAround`), but those of tiers up to `left` in the first; other arguments as of
+    `build_photon_map`."""
     record, active = read_photons(surface, count, capacity)
     landing = landing_of(record)
     active &= landing.caustic
     number = around.tier(landing.p, flux_of(power, active), radius, active)
+    number = dr.select(number > left, number, 0)
     grid = tier_grid(bbox, tier_table(capacity), radius, number)
     start, surface, power, _ = sorted_photons(grid, record, power, active, TIERS)
     arrays = {"start": start, "surface": surface, "power": power, "tier_radius": radius}
@@ -80,21 +87,32 @@ def build_tiered_map(surface, power, count, bbox, radius, capacity, around):
 
 
 def gather_tiers(
-    tiered, vertices, light_path_count, max_depth, weigh=None, marked=False, narrow=False
+    tiered,
+    vertices,
+    light_path_count,
+    max_depth,
+    weigh=None,
+    marked=False,
+    narrow=False,
+    smallest=None,
 ):
     """`gather_photons` of all tiers, each with its radius, which at vertices with `narrow` lobes is
-    `AT_NARROW_LOBES` times as large in all but the first. Other arguments and result as there, but
-    that there is one estimate, not one for each radius."""
+    `AT_NARROW_LOBES` times as large in all but the first. In the first it is the `smallest` where
+    that is given, one a vertex, and less. Other arguments and result as there, but that there is
+    one estimate, not one for each radius."""
     wider = dr.select(narrow, mi.Float(AT_NARROW_LOBES), 1)
 
     def step(number, totals):
         photon_map, radius, count = tiered.tier(number)
         there = copy.copy(vertices)
         there.active = vertices.active & (count > 0)
+        disk = radius * dr.select(number > 0, wider, 1)
+        if smallest is not None:
+            disk = dr.select(number > 0, disk, dr.minimum(disk, smallest))
         parts = gather_photons(
             photon_map,
             there,
-            [radius * dr.select(number > 0, wider, 1)],
+            [disk],
             light_path_count,
             max_depth,
             weigh,

@@ -11,7 +11,8 @@ half their sum s and half their difference d,
 
     Var[s] = F + B / 2,    Var[d] = B / 2
 
-(variances over iterations: that the two pixels differ does not matter), and what counts after the denoiser is F + LEFT B = Var[s] - (1 - 2 LEFT) Var[d].
+(over iterations: that the pixels' means differ does not matter), and what counts after the denoiser
+is F + LEFT B = Var[s] - (1 - 2 LEFT) Var[d].
 """
 
 from __future__ import annotations

@@ -42,8 +42,8 @@ class PilotIteration(Protocol):
         """Where the vertices lie, (3, n), and the weights of their paths, (n,): zero where there is
         none."""
 
-    def pixel_disks(self) -> np.ndarray:
-        """Radii of the disks of a pixel's size at the vertices that the camera sees."""
+    def pixel_widths(self) -> np.ndarray:
+        """How wide a pixel is at the vertices that the camera sees."""
 
     def mean_photon_count(self, kind: str, radius: float) -> float:
         """Photons of a kind within `radius` of a vertex, on average; volume photons along beams: of
@@ -127,8 +127,8 @@ def choose_ladder(
     """
     on_surfaces = [kind for kind in setting.kinds if kind not in ("volume", "seen_caustic")]
     radii, photons = ladder_on_surfaces(setting, on_surfaces, iteration)
-    if "seen_caustic" in setting.kinds and len(disks := iteration.pixel_disks()):
-        radius = float(np.quantile(disks, NEARLY_ALL))
+    if "seen_caustic" in setting.kinds and len(widths := iteration.pixel_widths()):
+        radius = float(np.quantile(widths, NEARLY_ALL))
         radii["seen_caustic"] = np.array([radius])
         photons["seen_caustic"] = iteration.mean_photon_count("seen_caustic", radius)
     if "volume" in setting.kinds:

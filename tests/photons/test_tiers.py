@@ -110,11 +110,14 @@ def test_order_of_photons_does_not_matter(rgb):
     )
 
 
+@pytest.mark.parametrize("left", [0, 1])
 @pytest.mark.parametrize("up", [(0, 0, 1), (0, 1, 0)], ids="zy")
-def test_tiers_bring_what_brute_force_finds(rgb, up, monkeypatch):
+def test_tiers_bring_what_brute_force_finds(rgb, up, left, monkeypatch):
     """Sum over the photons within their own radii, of BSDF x flux over the area of their disks.
-    Where lobes are narrow, at every second vertex, disks are wider, but for the first tier. The
-    scene is a floor: flat along one axis or another, where wide disks reach beyond the grid."""
+    Where lobes are narrow, at every second vertex, disks are wider, but for the first tier. Where
+    photons of a few tiers are `left` to a denoiser, these are all in the first, and each vertex has
+    its own radius there. The scene is a floor: flat along one axis or another, where wide disks
+    reach beyond the grid."""
     from mis_integrators.core.traits import SceneTraits
     from mis_integrators.photons import tiers as module
     from mis_integrators.photons.gather import QueryVertices
@@ -139,12 +142,13 @@ def test_tiers_bring_what_brute_force_finds(rgb, up, monkeypatch):
     around = light_around(points, flux)
     tiers = tiers_of(around, points, flux)
     assert len(np.unique(tiers)) >= 4
+    tiers[tiers <= left] = 0
     surface, power, count = photons_of(points, flux, up)
     box = mi.ScalarBoundingBox3f(
         *(mi.ScalarPoint3f(edge) for edge in (points.min(0), points.max(0)))
     )
     radius = dr.opaque(mi.Float, RADIUS)
-    built = build_tiered_map(surface, power, count, box, radius, n, around)
+    built = build_tiered_map(surface, power, count, box, radius, n, around, left)
     np.testing.assert_array_equal(counts(built), np.bincount(tiers, minlength=TIERS))
     assert TieredMap.has_made(built.arrays())
     queries = on_floor(rng, m)[:, axes]
@@ -159,11 +163,18 @@ def test_tiers_bring_what_brute_force_finds(rgb, up, monkeypatch):
     }
     vertices = QueryVertices(SceneTraits(scene, None), record, [])
     narrow = np.arange(m) % 2 == 1
+    smallest = RADIUS * rng.uniform(0.3, 1.5, m) if left else np.full(m, RADIUS)
     (found,) = gather_tiers(
-        TieredMap(built.arrays(), box, n), vertices, 10.0, -1, narrow=mi.Bool(narrow)
+        TieredMap(built.arrays(), box, n),
+        vertices,
+        10.0,
+        -1,
+        narrow=mi.Bool(narrow),
+        smallest=mi.Float(smallest) if left else None,
     )
     distance = np.linalg.norm(queries[:, None] - points[None], axis=-1)
     radii = RADIUS * 2.0**tiers * np.where(narrow[:, None] & (tiers > 0), 4.0, 1)
+    radii = np.where(tiers == 0, np.minimum(RADIUS, np.float32(smallest))[:, None], radii)
     assert np.abs(distance / radii - 1).min() > 1e-6  # what single precision tells apart
     lit = (distance < radii) * flux / (np.pi * radii**2)
     expected = lit.sum(axis=1) * 0.5 / np.pi / 10

@@ -1,0 +1,232 @@
+"""Caustics that the camera sees, in images that will be denoised: disks of a pixel's size."""
+
+from types import SimpleNamespace
+
+import mis_integrators  # noqa: F401 (registers the plugins)
+from mis_integrators.photons.queries import read_queries
+from mis_integrators.pilot.setting import APART, pilot_pixels
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+SIZE = 24
+FAR = 12.0
+"""Height of the camera above the floor."""
+
+
+@pytest.fixture(autouse=True)
+def _rgb(rgb):
+    pass
+
+
+def sensor_of(kind="perspective", size=SIZE, fov=50):
+    film = {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}}
+    to_world = mi.ScalarTransform4f().look_at([0, 0, FAR], [0, 0, 0], [0, 1, 0])
+    if kind == "orthographic":
+        return {"type": kind, "film": film, "to_world": to_world @ to_world.scale([5, 5, 1])}
+    return {"type": kind, "film": film, "to_world": to_world, "fov": fov}
+
+
+def caustic_scene(**sensor):
+    """A floor lit by nothing but what a mirror above the camera throws back: a spot of light."""
+    transform = mi.ScalarTransform4f
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "floor": {"type": "rectangle", "to_world": transform().scale(8)},
+            "mirror": {
+                "type": "rectangle",
+                "to_world": transform().translate([0, 0, FAR + 2]).rotate([1, 0, 0], 180).scale(30),
+                "bsdf": {"type": "conductor"},
+            },
+            "lamp": {
+                "type": "spot",
+                "to_world": transform().look_at([0, 0, FAR + 1], [0, 0, FAR + 2], [0, 1, 0]),
+                "cutoff_angle": 60,
+                "intensity": 1000.0,
+            },
+            "sensor": sensor_of(**sensor),
+        }
+    )
+
+
+def session_of(scene, photons, iterations=1e6, radii=None, **parameters):
+    """A session that knows its radii. So long a render has no sparse photons."""
+    plugin = {"type": "bdpm", "bdd": 0, "direct_paths": 1, "photon_count": photons}
+    plugin |= {"denoised": True, "max_depth": 3, "sampler": "independent", **parameters}
+    session = mi.load_dict(plugin).session(scene, seed=3)
+    kinds = session.kinds()
+    session.recall(
+        {
+            "radii": radii or dict.fromkeys(kinds, 1.0),
+            "corrected": dict.fromkeys(kinds, False),
+            "light_share": 1.0,
+            "caustic_radii": {"iterations": min(iterations, session.caustic_radii.most_iterations)},
+            "direct_light": {},
+        }
+    )
+    return session
+
+
+def iterations_of(session, count):
+    """The image of so many iterations, each alone, mean over the channels: (count, H, W)."""
+    images, before = [], 0.0
+    for number in range(count):
+        session.iterate()
+        image = session.image()[..., :3].mean(axis=2) * (number + 1)
+        images.append(image - before)
+        before = image
+    return np.array(images, np.float64)
+
+
+@pytest.mark.parametrize("kind", ["perspective", "orthographic"])
+def test_cones_are_as_wide_as_pixels(kind):
+    """Width squared is the area that a pixel has across its ray, here by the rays through two
+    neighbours, and grows with all of the way through mirrors."""
+    from mis_integrators.paths.ray_cones import RayCones
+
+    sensor = mi.load_dict(sensor_of(kind, 64, 80))
+    x, y = (mi.Float(c.ravel()) for c in np.meshgrid(*[np.arange(1, 64, 6) / 64] * 2))
+    rays = [
+        sensor.sample_ray(0, 0.5, mi.Point2f(x + dx / 64, y + dy / 64), 0.5)[0]
+        for dx, dy in ((0, 0), (-0.5, 0), (0.5, 0), (0, -0.5), (0, 0.5))
+    ]
+    ray, *near = rays
+    cones = RayCones(sensor)
+    cone = cones.begin()
+    far = 0.0
+    for depth, t in ((1, 3.0), (2, 2.5)):
+        at = SimpleNamespace(ray=ray, depth=mi.UInt32(depth), si=SimpleNamespace(t=mi.Float(t)))
+        cone = cones.arrived(cone, at, mi.Bool(True))
+        far += t
+        d = np.array(ray.d)
+        # Where the neighbours' rays meet the plane across this one.
+        points = []
+        for other in near:
+            o, e = np.array(other.o) - np.array(ray.o), np.array(other.d)
+            s = (far - (o * d).sum(axis=0)) / (e * d).sum(axis=0)
+            points.append(o + s * e)
+        across, down = points[1] - points[0], points[3] - points[2]
+        area = np.linalg.norm(np.cross(across.T, down.T), axis=1)
+        np.testing.assert_allclose(np.array(cone[0] + 0 * x), np.sqrt(area), rtol=0.01)
+
+
+def test_widths_belong_to_vertices_that_the_camera_sees():
+    """The first that scatter smoothly, seen in mirrors or not; later ones have none."""
+    scene = caustic_scene()
+    session = session_of(scene, 1000, bdd=2, max_depth=6)
+    setting = session.pilot_setting()
+    iteration = session.pilot_passes(setting, pilot_pixels(setting)).trace(0)
+    record = read_queries(iteration.vertices)
+    used = np.array(record["throughput"])[0] > 0
+    pixel, depth = np.array(record["pixel"])[used], np.array(record["depth"])[used] & 0xFF
+    straight = depth == 1
+    width = 2 * np.tan(np.radians(25)) / SIZE * FAR
+    assert straight.any() and (depth > 2).any()
+    assert np.all(pixel[straight] > 0.7 * width) and np.all(pixel[straight] <= 1.001 * width)
+    # From floor to mirror, and down again: the camera does not see these.
+    assert np.all(pixel[~straight] == 0)
+    np.testing.assert_allclose(
+        np.sort(iteration.pixel_widths()), np.sort(pixel[straight]), rtol=1e-6
+    )
+
+
+def test_near_pixels_share_no_noise():
+    """Neighbours' estimates are hardly correlated over iterations, with disks of three pixels they
+    are by more than a half; and their means are the same, within 5 standard errors of a block
+    (36 blocks: a false alarm in 50000 runs), which are 3 % of it."""
+    scene = caustic_scene()
+    small = session_of(scene, 24000)
+    assert small.kinds() == ["seen_caustic", "indirect"]
+    found = {}
+    for name, session in (
+        ("small", small),
+        ("wide", session_of(scene, 24000, denoised=False, initial_radius=1.5)),
+    ):
+        images = iterations_of(session, 200)[:, 6:18, 6:18]
+        noise = images - images.mean(axis=0)
+        alike = (noise[..., 1:] * noise[..., :-1]).mean() / (noise**2).mean()
+        blocks = images.reshape(-1, 6, 2, 6, 2).mean(axis=(2, 4))
+        found[name] = alike, blocks.mean(axis=0), blocks.var(axis=0, ddof=1) / len(blocks)
+    (alike, mean, square), (shared, other, of_other) = found["small"], found["wide"]
+    assert alike < 0.15 and shared > 0.5
+    error = np.sqrt(square + of_other)
+    assert np.abs((mean - other) / error).max() < 5
+    assert error.max() < 0.03 * mean.mean()
+
+
+def test_light_counts_once():
+    """Where paths gather at their second vertex, too, seen caustics and all others are in maps of
+    their own: the mean is that of a render with one map, within 4.9 standard errors (a false alarm
+    in a million), which are 2 % of it."""
+    scene = caustic_scene()
+    sums = []
+    for parameters in ({}, {"denoised": False, "initial_radius": 0.5}):
+        session = session_of(scene, 4000, bdd=1, max_depth=5, **parameters)
+        assert ("seen_caustic" in session.kinds()) is (not parameters)
+        sums.append(iterations_of(session, 100).mean(axis=(1, 2)))
+    error = np.sqrt(sum(np.var(s, ddof=1) / len(s) for s in sums))
+    assert abs(sums[0].mean() - sums[1].mean()) < 4.9 * error
+    assert error < 0.02 * sums[0].mean()
+
+
+def test_sparse_photons_keep_wide_disks():
+    """In a short render of few photons a denoiser would see single dots: they have larger radii."""
+    scene, radii = caustic_scene(), {"seen_caustic": 0.5, "indirect": 1.0}
+    short = session_of(scene, 300, iterations=4.0, radii=radii)
+    long = session_of(scene, 300, iterations=1e6, radii=radii)
+    dark = [np.mean(iterations_of(session, 4).mean(axis=0) == 0) for session in (short, long)]
+    assert dark[0] < 0.1 and dark[1] > 0.4
+
+
+def test_who_has_such_disks():
+    """Images that will be denoised, of scenes with caustics, where the radius is automatic. Paths
+    that gather at later vertices need another map for these."""
+    scene = caustic_scene()
+
+    def kinds(**parameters):
+        return mi.load_dict({"type": "bdpm", **parameters}).session(scene).kinds()
+
+    assert kinds(denoised=True) == ["seen_caustic", "caustic", "indirect"]
+    assert kinds(denoised=True, bdd=0) == ["seen_caustic", "indirect"]
+    assert kinds(denoised=True, initial_radius=0.1) == ["caustic", "indirect"]
+    assert kinds() == ["caustic", "indirect"]
+
+
+def test_groups_of_a_pilot_look_through_near_pixels():
+    """Of each pilot pixel's paths, those of the second group are `APART` pixels further on."""
+    scene = caustic_scene()
+    session = session_of(scene, 1000)
+    setting = session.pilot_setting()
+    pixels = pilot_pixels(setting)
+    assert (pixels.groups, pixels.apart) == (2, APART)
+    record = read_queries(session.pilot_passes(setting, pixels).trace(0).vertices)
+    d, path = np.array(record["ray_d"]), np.array(record["path"])
+    used = np.array(record["throughput"])[0] > 0
+    film = SIZE * (0.5 + 0.5 * d[:2] / -d[2] / np.tan(np.radians(25)))
+    column, row = np.floor(film[0]).astype(int), np.floor(SIZE - film[1]).astype(int)
+    found = (row * SIZE + column)[used]
+    per_group = pixels.camera_paths // pixels.groups
+    number, group = path[used] % pixels.count, path[used] // pixels.count // per_group
+    np.testing.assert_array_equal(found, number * pixels.stride + APART * group)
+    assert set(group) == {0, 1}
+
+
+def test_the_pilot_counts_little_of_their_noise():
+    """What it predicts of them is a denoiser's share of the noise of pixels, measured over
+    iterations, within a factor of two (few photons: rare bright pixels)."""
+    from mis_integrators.pilot.denoiser import LEFT
+
+    scene = caustic_scene()
+    session = mi.load_dict(
+        {"type": "bdpm", "bdd": 0, "denoised": True, "photon_count": 20000, "max_depth": 3}
+    ).session(scene, seed=3, spp=64)
+    session.start()
+    assert session.prediction.caustic_share > 0.9
+    images = iterations_of(session, 32)
+    weights = 1 / (images.mean() ** 2 * 1.1)
+    inner = images[:, 4:20, 4:20]
+    measured = LEFT * (inner.var(axis=0, ddof=1) * weights).mean()
+    predicted = session.prediction.errors["relmse"].variance
+    assert 0.5 * measured < predicted < 2 * measured
