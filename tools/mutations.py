@@ -310,8 +310,8 @@ MUTATIONS = [
     ),
     Mutation(
         "photons/tiers.py",
-        "[radius * dr.select(number > 0, wider, 1)]",
-        "[radius * wider]",
+        "disk = radius * dr.select(number > 0, wider, 1)",
+        "disk = radius * wider",
         "well lit photons, too, have wide disks at narrow lobes",
         TIERS,
     ),

@@ -30,8 +30,8 @@ lobe brings as much as many elsewhere."""
 
 
 LEFT_TO_DENOISER = 3
-"""Tuned: photons of tiers up to that one have disks of a pixel's size in images that will be
-denoised: so many lie in a window of as many pixels as a denoiser averages."""
+"""Tuned: the last tier whose photons have disks of a pixel's size in images that will be denoised.
+They bring at most `MOST_OF_LIGHT` of what falls within eight pixels."""
 
 
 class TieredMap:
