@@ -123,12 +123,13 @@ def choose_ladder(
     radii for kinds that no camera path gathers.
 
     Photons on surfaces share their radii; volume photons have their own. Where photons have disks
-    of a pixel's size, a single one is the largest of nearly all of these.
+    of a pixel's size, a single one is the largest of nearly all of these, but no larger than any
+    radius that suits the scene: a film may have one pixel.
     """
     on_surfaces = [kind for kind in setting.kinds if kind not in ("volume", "seen_caustic")]
     radii, photons = ladder_on_surfaces(setting, on_surfaces, iteration)
     if "seen_caustic" in setting.kinds and len(widths := iteration.pixel_widths()):
-        radius = float(np.quantile(widths, NEARLY_ALL))
+        radius = min(float(np.quantile(widths, NEARLY_ALL)), largest_radius(setting.extent))
         radii["seen_caustic"] = np.array([radius])
         photons["seen_caustic"] = iteration.mean_photon_count("seen_caustic", radius)
     if "volume" in setting.kinds:

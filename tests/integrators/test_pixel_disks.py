@@ -194,6 +194,20 @@ def test_who_has_such_disks():
     assert kinds() == ["caustic", "indirect"]
 
 
+@pytest.mark.parametrize("size", [1, SIZE])
+def test_disks_are_no_larger_than_suits_the_scene(size):
+    """One pixel may show all of it."""
+    from mis_integrators.pilot.radius import largest_radius
+
+    scene = caustic_scene(size=size)
+    session = mi.load_dict({"type": "bdpm", "denoised": True}).session(scene, seed=3, spp=4)
+    session.start()
+    width, largest = 2 * np.tan(np.radians(25)) / size * FAR, largest_radius(session.traits.extent)
+    assert (width > largest) == (size == 1)
+    radius = session.radii["seen_caustic"]
+    assert 0.8 * min(width, largest) < radius < 1.01 * min(width, largest)
+
+
 def test_groups_of_a_pilot_look_through_near_pixels():
     """Of each pilot pixel's paths, those of the second group are `APART` pixels further on."""
     scene = caustic_scene()
