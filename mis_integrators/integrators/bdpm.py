@@ -207,7 +207,8 @@ class BDPMSession(PilotedSession):
     """Whether volume photons have, too. (Weights know one radius for all.)"""
     narrows_seen = True
     """Whether caustic photons have disks of a pixel's size where the camera sees them, in images
-    that will be denoised. (Weights know one radius for all.)"""
+    that will be denoised. (Weights know one radius for all. In media near pixels share volume
+    photons, and nothing would be won.)"""
     points = False
     """Whether volume photons are gathered at vertices in media, and not along beams."""
 
@@ -234,7 +235,7 @@ class BDPMSession(PilotedSession):
         )
         self.cones = None  # where the camera sees caustics in disks of a pixel's size, `RayCones`
         chosen = integrator.denoised and not integrator.initial_radius
-        if chosen and self.has_caustics and self.narrows_seen:
+        if chosen and self.has_caustics and self.narrows_seen and not self.has_volume:
             self.cones = cones_of(sensor)
         self.narrow = None
         if integrator.pass_narrow and self.has_indirect:

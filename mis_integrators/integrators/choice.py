@@ -165,16 +165,12 @@ def new_session(plugin, integrator, scene, sensor, seed, iterations):
         "denoised": integrator.denoised,
         "aovs": written(integrator.layers),
     }
-    own = own_parameters(CANDIDATES, plugin, integrator.denoised)
+    own = CANDIDATES[plugin]
+    if integrator.denoised:
+        own = FOR_DENOISERS.get(plugin, own)
     return mi.load_dict({"type": plugin, **shared, **own}).new_session(
         scene, sensor, seed, iterations
     )
-
-
-def own_parameters(candidates, plugin, denoised):
-    """The parameters of one of the `candidates` that others do not share."""
-    usual = candidates[plugin]
-    return FOR_DENOISERS.get(plugin, usual) if denoised else usual
 
 
 def no_photons(integrator, session):

@@ -27,7 +27,6 @@ from .choice import (
     decide,
     handed_on,
     no_photons,
-    own_parameters,
     parts_of_samples,
     trial_of_photons,
     why_not_camera_paths,
@@ -68,7 +67,7 @@ def new_session(plugin, integrator, scene, sensor, seed, iterations):
         "type": plugin,
         **handed_on(integrator),
         "aovs": written(integrator.layers),
-        **own_parameters(CANDIDATES, plugin, integrator.denoised),
+        **CANDIDATES[plugin],
     }
     if iterations or plugin == PHOTONS:
         parameters["camera_paths"] = integrator.initial_camera_paths
