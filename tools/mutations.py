@@ -310,8 +310,8 @@ MUTATIONS = [
     ),
     Mutation(
         "photons/tiers.py",
-        "disk = radius * dr.select(number > 0, wider, 1)",
-        "disk = radius * wider",
+        "[dr.select(number > 0, radius * wider, first)]",
+        "[dr.select(number > 0, radius * wider, first * wider)]",
         "well lit photons, too, have wide disks at narrow lobes",
         TIERS,
     ),
@@ -653,8 +653,8 @@ MUTATIONS = [
     ),
     Mutation(
         "paths/ray_cones.py",
-        "self.spread * cosine * dr.sqrt(cosine)",
-        "mi.Float(self.spread)",
+        "return cosine * dr.sqrt(cosine)",
+        "return mi.Float(1)",
         "pixels at the border of the film are taken to be as wide as those in its middle",
         f"{PIXEL_DISKS}::test_cones_are_as_wide_as_pixels",
     ),

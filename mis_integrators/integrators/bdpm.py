@@ -204,7 +204,8 @@ class BDPMSession(PilotedSession):
     """Whether caustic photons with little light around have larger radii where the radius is
     automatic."""
     narrows_volume = True
-    """Whether volume photons have, too. (Weights know one radius for all.)"""
+    """Whether volume photons that lie densely have smaller ones. (Weights know one radius for
+    all.)"""
     narrows_seen = True
     """Whether caustic photons have disks of a pixel's size where the camera sees them, in images
     that will be denoised. (Weights know one radius for all. In media near pixels share volume
@@ -516,10 +517,8 @@ class BDPMSession(PilotedSession):
         """`gather_photons` of one kind at vertices as of `read_queries`."""
         takes = takes_photons(record, kind)
         vertices = QueryVertices(self.traits, record, spectral["wavelengths"], takes, scale)
-        disk = None
         if kind == "seen_caustic":
-            disk = pixel_disk(record)
-            radii = [dr.minimum(radius, disk) for radius in radii]
+            radii = [dr.minimum(radius, pixel_disk(record)) for radius in radii]
         light_paths, max_depth = self._light_paths, self.integrator.max_depth
         marked = self.integrator.splits_light
         if isinstance(photon_map, TieredMap):
@@ -527,7 +526,7 @@ class BDPMSession(PilotedSession):
             if self.narrow is not None:
                 narrow = is_narrow(self.narrow, vertices.bsdf, vertices.si, vertices.active)
             return gather_tiers(
-                photon_map, vertices, light_paths, max_depth, weigh, marked, narrow, disk
+                photon_map, vertices, radii[0], light_paths, max_depth, weigh, marked, narrow
             )
         return gather_photons(
             photon_map, vertices, radii, light_paths, max_depth, weigh, grey, marked

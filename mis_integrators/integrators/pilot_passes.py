@@ -169,11 +169,8 @@ class SubsetIteration(NamedTuple):
         return np.array(points), np.array(dr.max(vertices["throughput"]))
 
     def pixel_widths(self):
-        vertices = read_queries(self.vertices)
-        if "pixel" not in vertices:
-            return np.zeros(0)
-        widths = np.array(vertices["pixel"])
-        return widths[(widths > 0) & np.array(dr.max(vertices["throughput"]) > 0)]
+        widths = np.array(self.vertices["pixel"])
+        return widths[widths > 0]
 
     def mean_photon_count(self, kind, radius):
         return self.passes.mean_photon_count(self.photons, self.vertices, kind, radius)

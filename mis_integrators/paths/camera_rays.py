@@ -1,6 +1,12 @@
 """Rays that leave a sensor."""
 
+import drjit as dr
 import mitsuba as mi
+
+
+def axis_of(sensor):
+    """The direction in which a sensor looks."""
+    return dr.normalize(sensor.world_transform() @ mi.Vector3f(0, 0, 1))
 
 
 def sample_camera_ray(sensor, time, wavelength_sample, position, aperture, active=True):

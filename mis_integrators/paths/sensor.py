@@ -11,6 +11,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .camera import behind_emitters
+from .camera_rays import axis_of
 
 CONNECTED = ("PerspectiveCamera", "ThinLensCamera", "OrthographicCamera")
 
@@ -40,7 +41,7 @@ class Lens:
             )
             self.axis, self.reach = corners[0].d, corners[0].maxt
         elif self.connects:
-            self.axis = dr.normalize(sensor.world_transform() @ mi.Vector3f(0, 0, 1))
+            self.axis = axis_of(sensor)
 
     def connect(self, p, time, aperture, active):
         """Joins points `p` to the point of the lens that `aperture` (uniform in [0, 1]^2, as for

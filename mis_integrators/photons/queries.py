@@ -28,8 +28,8 @@ from .points import new_points, point_layout
 LAST_VERTEX = 1 << 31
 """Bit of a vertex' depth that says that all photons are wanted there, else only caustic ones."""
 PIXEL_DISK = 0.35
-"""Tuned: their radius over the width of a pixel. (With 0.5 the denoised walls of a room lit through
-glass have a texture.)"""
+"""Tuned: radius of a `pixel_disk` over the width of a pixel. (With 0.5 the denoised walls of a room
+lit through glass have a texture.)"""
 STATE = ("weights.0", "weights.1", "weights.2")
 """What a vertex buffer calls the state of the weights."""
 
@@ -105,9 +105,9 @@ def takes_photons(record, kind):
     that the camera sees, where a buffer knows these, "caustic" then all others."""
     if kind == "indirect":
         return (record["depth"] & LAST_VERTEX) != 0
-    if "pixel" not in record or kind not in ("caustic", "seen_caustic"):
-        return mi.Bool(True)
-    return (record["pixel"] > 0) == (kind == "seen_caustic")
+    if "pixel" in record:
+        return (record["pixel"] > 0) == (kind == "seen_caustic")
+    return mi.Bool(True)
 
 
 def pixel_disk(record):
@@ -150,8 +150,8 @@ class QueryVisitor:
     `bdd`-th); whether there was any of these; whether the last vertex scattered by a delta
     function; the density of the last smooth scattering; the last smooth vertex; the weight of
     direct light there; how many times light counts that is found there; the state of `weights`;
-    with `classes` what these carry along; where they are asked for, the path's ray cone; and in
-    scenes with media the share of light that has got through these without being scattered.
+    with `classes` what these carry along; with the queries' `cones` the path's; and in scenes with
+    media the share of light that has got through these without being scattered.
 
     In media, paths scatter until they have left `bdd` smooth vertices behind, and go straight on
     from there; where photons are asked for at points, until they have left one more behind.
@@ -423,9 +423,7 @@ class QueryVisitor:
         return state, weight, active
 
     def cross(self, before, after, crosses):
-        chosen = selected(crosses, before, after)
-        chosen[-2] = after[-2]  # the cone has grown on the way
-        return chosen
+        return selected(crosses, before, after)
 
     def alpha(self, state, visible):
         if not self.traits.has_media:

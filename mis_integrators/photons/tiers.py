@@ -27,8 +27,6 @@ from .photon import landing_of
 AT_NARROW_LOBES = 2.0
 """Tuned: how many times larger disks are at surfaces with narrow lobes, where one photon in the
 lobe brings as much as many elsewhere."""
-
-
 LEFT_TO_DENOISER = 3
 """Tuned: the last tier whose photons have disks of a pixel's size in images that will be denoised.
 They bring at most `MOST_OF_LIGHT` of what falls within eight pixels."""
@@ -87,32 +85,22 @@ def build_tiered_map(surface, power, count, bbox, radius, capacity, around, left
 
 
 def gather_tiers(
-    tiered,
-    vertices,
-    light_path_count,
-    max_depth,
-    weigh=None,
-    marked=False,
-    narrow=False,
-    smallest=None,
+    tiered, vertices, first, light_path_count, max_depth, weigh=None, marked=False, narrow=False
 ):
     """`gather_photons` of all tiers, each with its radius, which at vertices with `narrow` lobes is
-    `AT_NARROW_LOBES` times as large in all but the first. In the first it is the `smallest` where
-    that is given, one a vertex, and less. Other arguments and result as there, but that there is
-    one estimate, not one for each radius."""
+    `AT_NARROW_LOBES` times as large, but the first with the radius `first` (of width one, or one a
+    vertex). Other arguments and result as there, but that there is one estimate, not one for each
+    radius."""
     wider = dr.select(narrow, mi.Float(AT_NARROW_LOBES), 1)
 
     def step(number, totals):
         photon_map, radius, count = tiered.tier(number)
         there = copy.copy(vertices)
         there.active = vertices.active & (count > 0)
-        disk = radius * dr.select(number > 0, wider, 1)
-        if smallest is not None:
-            disk = dr.select(number > 0, disk, dr.minimum(disk, smallest))
         parts = gather_photons(
             photon_map,
             there,
-            [disk],
+            [dr.select(number > 0, radius * wider, first)],
             light_path_count,
             max_depth,
             weigh,

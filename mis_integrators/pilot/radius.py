@@ -140,14 +140,14 @@ def error_by_radius(
         at_edges = {which: between(fine, radii, added * wrong[which]) for which in wrong}
         best = plain + lacking[:, None] * (corrected - plain)
         least *= (LEAST_CORRECTED / LEAST_BIAS) ** min(max(lacking[-1], 0.0), 1.0)
-    blur: np.ndarray | float = 0.0
+    blur = np.zeros(len(fine))
     if len(radii) > 1:
         difference, error = squared_difference(best, weights)
         blur = expected_squared_bias(radii, difference, error, len(plain), fine, least)
     return ErrorByRadius(
         radii,
         fine,
-        {which: np.zeros(len(fine)) + blur + at_edges[which] for which in noise},
+        {which: blur + at_edges[which] for which in noise},
         noise,
     )
 

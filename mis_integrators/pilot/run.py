@@ -27,8 +27,6 @@ FEWEST_PHOTONS, WIDER = 1, 4
 """Tuned: photons a vertex within the largest radius, fewer than which tell nothing (the camera may
 see one point only): then radii so many times larger are tried, up to those that suit the whole
 scene."""
-
-
 NEARLY_ALL = 0.9
 """Disks of a pixel's size, the share of them below the largest: few that are far away must not make
 the grid of all too coarse."""
@@ -43,7 +41,8 @@ class PilotIteration(Protocol):
         none."""
 
     def pixel_widths(self) -> np.ndarray:
-        """How wide a pixel is at the vertices that the camera sees."""
+        """How wide a pixel is at the vertices that the camera sees. Not called without photons of
+        the kind `seen_caustic`."""
 
     def mean_photon_count(self, kind: str, radius: float) -> float:
         """Photons of a kind within `radius` of a vertex, on average; volume photons along beams: of

@@ -26,8 +26,6 @@ FEWEST_LIGHT_PATHS = 1 << 12
 time."""
 UNPLANNED_ITERATIONS = 64
 """Tuned: iterations that a render without a planned end is taken to have."""
-
-
 APART = 2
 """Pixels from one to another that a denoiser averages, and which do not share the photons of disks
 as small as a pixel."""

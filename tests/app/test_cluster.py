@@ -18,6 +18,7 @@ from mis_integrators.core.sums import Iterations, Sums
 import numpy as np
 import pytest
 from lamplit import ROOT, command, read, render, run, same, write_scene
+from pilots import learned
 from selection import extended
 
 pytest.importorskip(
@@ -135,13 +136,7 @@ def test_workers_are_told_what_a_pilot_found(scene, client):
     within another radius."""
     request = request_for(scene, "bdpm", 8, bdd=0)
     opened = request.open()
-    told = {
-        "radii": dict.fromkeys(opened.session.kinds(), 0.31),
-        "corrected": dict.fromkeys(opened.session.kinds(), False),
-        "light_share": 1.0,
-        "caustic_radii": {"iterations": 0.0},
-        "direct_light": {},
-    }
+    told = learned(opened.session, 0.31)
     identity = opened.identity()
     opened.session.recall(told)
     opened.session.iterate(2)

@@ -21,6 +21,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from lamplit import LAMP, ROOT, SCENE, command, read, render, run, same, write_scene
+from pilots import learned
 from selection import extended
 from test_auto import set_price_of_path
 
@@ -165,18 +166,12 @@ def test_learned_radii_are_not_learned_again(scene):
     """With a time limit the pilot hangs on the clock, so a resumed render must not have another."""
     loaded = loading.load(scene, {"size": "16"}, "bdpm", {"bdd": 0})
     session = make_session(loaded.integrator, loaded.scene, loaded.scene.sensors()[0], 3, 0)
-    learned = {
-        "radii": dict.fromkeys(session.kinds(), 0.123),
-        "corrected": dict.fromkeys(session.kinds(), False),
-        "light_share": 0.25,
-        "caustic_radii": {"iterations": 0.0},
-        "direct_light": {},
-    }
-    session.recall(learned)
+    told = learned(session, 0.123, light_share=0.25)
+    session.recall(told)
     assert session.light_path_count == 64
     session.plan_time(5.0)
     session.iterate()
-    assert session.learned == learned and len(learned["radii"]) == 2
+    assert session.learned == told and len(told["radii"]) == 2
 
 
 @pytest.mark.parametrize("plugin", ["path", *extended("bdpm")])

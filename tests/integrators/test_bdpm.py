@@ -29,6 +29,7 @@ from comparing import (
     pictures,
     smallest_visible,
 )
+from pilots import learned
 from selection import extended
 from worlds import T, bdpm, diffuse, film, grey, lit_ball, look, path, sensor, tray
 
@@ -215,15 +216,8 @@ def test_same_seed_same_edges(rgb):
         session = bdpm(bdd=0, initial_radius=0.0, photon_count=3000).session(
             glossy_box(size=128), seed=5
         )
-        session.recall(
-            {
-                "radii": dict.fromkeys(session.kinds(), 0.3),
-                "corrected": {"caustic": False, "indirect": True},
-                "light_share": 1.0,
-                "caustic_radii": {"iterations": 0.0},
-                "direct_light": {},
-            }
-        )
+        corrected = {"caustic": False, "indirect": True}
+        session.recall(learned(session, 0.3, corrected=corrected))
         session.iterate()
         images.append(session.image())
     np.testing.assert_allclose(*images, rtol=1e-4, atol=1e-6)

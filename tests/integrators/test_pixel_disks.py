@@ -9,6 +9,8 @@ from mis_integrators.pilot.setting import APART, pilot_pixels
 import mitsuba as mi
 import numpy as np
 import pytest
+from comparing import pictures
+from pilots import learned
 
 SIZE = 24
 FAR = 12.0
@@ -56,28 +58,14 @@ def session_of(scene, photons, iterations=1e6, radii=None, **parameters):
     plugin = {"type": "bdpm", "bdd": 0, "direct_paths": 1, "photon_count": photons}
     plugin |= {"denoised": True, "max_depth": 3, "sampler": "independent", **parameters}
     session = mi.load_dict(plugin).session(scene, seed=3)
-    kinds = session.kinds()
-    session.recall(
-        {
-            "radii": radii or dict.fromkeys(kinds, 1.0),
-            "corrected": dict.fromkeys(kinds, False),
-            "light_share": 1.0,
-            "caustic_radii": {"iterations": min(iterations, session.caustic_radii.most_iterations)},
-            "direct_light": {},
-        }
-    )
+    iterations = min(iterations, session.caustic_radii.most_iterations)
+    session.recall(learned(session, radii or 1.0, iterations))
     return session
 
 
 def iterations_of(session, count):
     """The image of so many iterations, each alone, mean over the channels: (count, H, W)."""
-    images, before = [], 0.0
-    for number in range(count):
-        session.iterate()
-        image = session.image()[..., :3].mean(axis=2) * (number + 1)
-        images.append(image - before)
-        before = image
-    return np.array(images, np.float64)
+    return np.array([picture[..., :3].mean(axis=2) for picture in pictures(session, count)])
 
 
 @pytest.mark.parametrize("kind", ["perspective", "orthographic"])
@@ -169,6 +157,23 @@ def test_light_counts_once():
     error = np.sqrt(sum(np.var(s, ddof=1) / len(s) for s in sums))
     assert abs(sums[0].mean() - sums[1].mean()) < 4.9 * error
     assert error < 0.02 * sums[0].mean()
+
+
+def test_disks_are_no_wider_than_the_map_is_for():
+    """Where pixels are far away and wide all disks have its radius: the image is that of a render
+    with this one radius."""
+    scene, radius = caustic_scene(), 0.06  # 0.35 pixels are 0.16
+    far = session_of(scene, 100000, radii={"seen_caustic": radius, "indirect": 1.0})
+    given = session_of(
+        scene,
+        100000,
+        radii={"caustic": radius, "indirect": 1.0},
+        denoised=False,
+        initial_radius=radius,
+    )
+    one, other = (iterations_of(session, 2) for session in (far, given))
+    assert one.max() > 0
+    np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-5 * one.max())
 
 
 def test_sparse_photons_keep_wide_disks():

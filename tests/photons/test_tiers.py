@@ -9,6 +9,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from comparing import pictures
+from pilots import learned
 
 RADIUS, TIERS = 0.05, 7
 FLOOR = 1.0
@@ -163,18 +165,18 @@ def test_tiers_bring_what_brute_force_finds(rgb, up, left, monkeypatch):
     }
     vertices = QueryVertices(SceneTraits(scene, None), record, [])
     narrow = np.arange(m) % 2 == 1
-    smallest = RADIUS * rng.uniform(0.3, 1.5, m) if left else np.full(m, RADIUS)
+    first = RADIUS * rng.uniform(0.3, 1.5, m) if left else np.full(m, RADIUS)
     (found,) = gather_tiers(
         TieredMap(built.arrays(), box, n),
         vertices,
+        mi.Float(first),
         10.0,
         -1,
         narrow=mi.Bool(narrow),
-        smallest=mi.Float(smallest) if left else None,
     )
     distance = np.linalg.norm(queries[:, None] - points[None], axis=-1)
     radii = RADIUS * 2.0**tiers * np.where(narrow[:, None] & (tiers > 0), 4.0, 1)
-    radii = np.where(tiers == 0, np.minimum(RADIUS, np.float32(smallest))[:, None], radii)
+    radii = np.where(tiers == 0, np.float32(first)[:, None], radii)
     assert np.abs(distance / radii - 1).min() > 1e-6  # what single precision tells apart
     lit = (distance < radii) * flux / (np.pi * radii**2)
     expected = lit.sum(axis=1) * 0.5 / np.pi / 10
@@ -239,28 +241,13 @@ def session_of(scene, iterations, radius, plugin="bdpm", **parameters):
             **parameters,
         }
     ).session(scene, seed=4)
-    kinds = session.kinds()
-    session.recall(
-        {
-            "radii": dict.fromkeys(kinds, radius),
-            "corrected": dict.fromkeys(kinds, False),
-            "light_share": 1.0,
-            "caustic_radii": {"iterations": iterations},
-            "direct_light": {},
-        }
-    )
+    session.recall(learned(session, radius, iterations))
     return session
 
 
 def caustics(session, count):
     """The caustic in so many iterations, each alone: (count, H, W)."""
-    images, before = [], 0.0
-    for number in range(count):
-        session.iterate()
-        image = session.image()[..., -3] * (number + 1)
-        images.append(image - before)
-        before = image
-    return np.array(images, np.float64)
+    return np.array([picture[..., -3] for picture in pictures(session, count)])
 
 
 def test_no_light_is_lost_and_noise_falls(rgb):

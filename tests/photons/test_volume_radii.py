@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 from comparing import Estimate, assert_same, block_means, collect_until, pictures
 from foggy import view
+from pilots import learned
 from selection import extended
 from test_bdpt_media import FOG, POINT, homogeneous, single_scattering
 from test_beams import beams, media, written
@@ -177,15 +178,7 @@ def session_of(scene, radius, uniform=False, **parameters):
     defaults = {"bdd": 0, "max_depth": 2, "photon_count": 60000, "direct_paths": 1}
     session = mi.load_dict({"type": "bdpm", **defaults, **parameters}).session(scene, seed=1, spp=0)
     session.narrows_volume = not uniform
-    session.recall(
-        {
-            "radii": dict.fromkeys(session.kinds(), radius),
-            "corrected": dict.fromkeys(session.kinds(), False),
-            "light_share": 1.0,
-            "caustic_radii": {"iterations": 0.0},
-            "direct_light": {},
-        }
-    )
+    session.recall(learned(session, radius))
     return session
 
 
