@@ -7,21 +7,30 @@ import math
 import drjit as dr
 import mitsuba as mi
 
-from ..core.film import splat_samples
+from ..core.film import (
+    as_camera_weights,
+    colour_channels,
+    expected_weight,
+    splat_channels,
+    splat_samples,
+    with_colour,
+)
 from ..core.packing import with_reserve
 from ..core.recording import recorder
 from ..core.traits import SceneTraits, lookup
 from ..lights.lights import Lights
 from ..paths.camera import film_sample_count, film_size
 from ..paths.layers import CHANNELS, SPLIT
-from ..paths.light_classes import LightClasses
+from ..paths.light_classes import LightClasses, by_class_of_photons
 from ..paths.lobes import is_narrow, narrow_bsdfs
 from ..paths.ray_cones import cones_of
+from ..paths.sensor import Lens
 from ..paths.setting import World
 from ..photons.beams import Beams, gather_along, read_beams
 from ..photons.coverage import covered_share
 from ..photons.gather import QueryVertices, gather_photons
 from ..photons.grid import PhotonMap, build_photon_map
+from ..photons.near_zone import NearZone
 from ..photons.points import read_points
 from ..photons.queries import (
     Queries,
@@ -30,6 +39,7 @@ from ..photons.queries import (
     takes_photons,
     trace_camera_paths,
 )
+from ..photons.sensor_light import join_photons
 from ..photons.tiers import LEFT_TO_DENOISER, TieredMap, build_tiered_map, gather_tiers
 from ..photons.trace import trace_light_paths
 from ..photons.volume import VolumeMap, build_volume_map
@@ -45,7 +55,7 @@ from .pilot_passes import SubsetPasses
 from .piloted import PilotedSession
 from .schedule import read_radius
 
-LIGHT, CAMERA = 0, 1
+LIGHT, CAMERA, SENSOR = 0, 1, 6
 """Purposes of an iteration's random seeds, besides `IterativeSession.WAVELENGTH`,
 `bdpm_opt.FROZEN`, `direct_light.PURPOSE` and `caustic_radii.PURPOSE`."""
 SPARE_PHOTONS = 1 << 20
@@ -206,10 +216,10 @@ class BDPMSession(PilotedSession):
     narrows_volume = True
     """Whether volume photons that lie densely have smaller ones. (Weights know one radius for
     all.)"""
-    narrows_seen = True
-    """Whether caustic photons have disks of a pixel's size where the camera sees them, in images
-    that will be denoised. (Weights know one radius for all. In media near pixels share volume
-    photons, and nothing would be won.)"""
+    suits_denoisers = True
+    """Whether in images that will be denoised near pixels share no photons that the camera sees:
+    caustic ones have disks of a pixel's size there, and volume photons are joined with the sensor.
+    (Weights know one radius for all, and beams only.)"""
     points = False
     """Whether volume photons are gathered at vertices in media, and not along beams."""
 
@@ -229,15 +239,19 @@ class BDPMSession(PilotedSession):
             or (self.traits.has_delta and (depth < 0 or depth >= 3))
         )
         self.has_indirect = not self.lights.dark and (depth < 0 or depth >= integrator.bdd + 3)
-        self.has_volume = (
-            self.traits.has_media
-            and not self.lights.dark
-            and (self.has_caustics or depth < 0 or depth >= integrator.bdd + 2)
+        lit = self.traits.has_media and not self.lights.dark
+        near = integrator.denoised and not integrator.initial_radius and self.suits_denoisers
+        self.near_zone = None  # where volume photons are joined with the sensor, a `NearZone`
+        if near and lit and (depth < 0 or depth >= 2) and Lens(sensor).connects:
+            self.near_zone = NearZone(Lens(sensor))
+        self.has_volume = self.near_zone is not None or (
+            lit and (self.has_caustics or depth < 0 or depth >= integrator.bdd + 2)
         )
         self.cones = None  # where the camera sees caustics in disks of a pixel's size, `RayCones`
-        chosen = integrator.denoised and not integrator.initial_radius
-        if chosen and self.has_caustics and self.narrows_seen and not self.has_volume:
+        if near and self.has_caustics and (self.near_zone or not self.has_volume):
             self.cones = cones_of(sensor)
+        if self.near_zone is not None:
+            self.expected_weight = expected_weight(sensor.film(), integrator.camera_paths)
         self.narrow = None
         if integrator.pass_narrow and self.has_indirect:
             self.narrow = narrow_bsdfs(scene)
@@ -330,6 +344,7 @@ class BDPMSession(PilotedSession):
             if self.chooses_light_paths and not integrator.photon_count
             else (1.0,),
             3 if self.points else 2,
+            self.near_zone is not None,
         )
 
     def pilot_passes(self, setting, pixels):
@@ -346,7 +361,7 @@ class BDPMSession(PilotedSession):
 
     def volume_density(self):
         """The `VolumeDensity` of the first light pass of a pilot, measured when it is first asked
-        for; None where all volume photons have the same radius."""
+        for, and the near zone with it; None where all volume photons have the same radius."""
         differ = self.has_volume and self.narrows_volume and not self.integrator.initial_radius
         if differ and self._volume_density is None:
             count = self.light_path_count
@@ -354,6 +369,9 @@ class BDPMSession(PilotedSession):
             in_media = self.trace_photons(PILOT_INDEX, LIGHT)[-1]
             largest = largest_radius(self.traits.extent)
             self._volume_density = VolumeDensity.of(*in_media[:3], largest)
+            if self.near_zone is not None:
+                self.near_zone.measure(in_media[0], in_media[2])
+                self._list_tables()
             self._use_light_paths(count)
         return self._volume_density
 
@@ -437,6 +455,14 @@ class BDPMSession(PilotedSession):
     def _freeze(self):
         """Records the passes anew; from the second iteration on, their kernels run without their
         Python."""
+        self._list_tables()
+        self._light_pass = self.recorded(self._trace_light)
+        self._map_pass = self.recorded(self._build_maps)
+        self._sensor_pass = self.recorded(self._splat_photons)
+        self._record_camera_pass()
+
+    def _list_tables(self):
+        """Lists what recorded functions read."""
         self._light_paths = dr.opaque(mi.Float, self.light_path_count)  # one kernel for any number
         self._tables = [
             self._light_paths,
@@ -448,9 +474,8 @@ class BDPMSession(PilotedSession):
             self._tables.append(self.narrow)
         if self.cones is not None:
             self._tables += self.cones.tables()
-        self._light_pass = self.recorded(self._trace_light)
-        self._map_pass = self.recorded(self._build_maps)
-        self._record_camera_pass()
+        if self.near_zone is not None:
+            self._tables += self.near_zone.tables()
 
     def _trace_light(self, scene, sensor, tables, sequence, spectral):
         return trace_light_paths(
@@ -486,6 +511,7 @@ class BDPMSession(PilotedSession):
             self.narrow,
             self.points,
             self.cones,
+            self.near_zone,
         )
         return trace_camera_paths(
             self.world,
@@ -497,6 +523,35 @@ class BDPMSession(PilotedSession):
             beyond,
             classes,
         )
+
+    def _join_sensor(self, sensor, in_media, seed, spectral):
+        """The `SensorLight` of an iteration's volume photons: its values are radiance."""
+        light = join_photons(
+            self.world,
+            Lens(sensor),
+            self.near_zone,
+            in_media[:3],
+            seed,
+            spectral["wavelengths"],
+            self.integrator.max_depth,
+            self.integrator.splits_light,
+        )
+        width, height = sensor.film().crop_size()
+        light.value *= width * height * dr.rcp(self._light_paths)
+        return light
+
+    def _splat_photons(self, scene, sensor, tables, in_media, seed, spectral):
+        """The block of the light that volume photons bring to the sensor."""
+        light = self._join_sensor(sensor, in_media, seed, spectral)
+        parts = [light.value * self.camera_paths]
+        if self.integrator.kept_classes:
+            classes = by_class_of_photons(
+                parts[0], light.depth, mi.Bool(True), light.delta_at_light
+            )
+            parts += classes[: self.integrator.kept_classes]
+        matrix = spectral["sensor_matrix"]
+        channels = [channel for part in parts for channel in colour_channels(part, matrix)]
+        return splat_channels(sensor.film(), light.film, channels, light.active)
 
     def _gather(self, photon_map, vertices, kind, radii, spectral, grey=False):
         """What photons of one kind bring to each vertex, volume photons to each beam, for each
@@ -510,6 +565,7 @@ class BDPMSession(PilotedSession):
                 self.integrator.max_depth,
                 grey,
                 self.integrator.splits_light,
+                near_zone=self.near_zone,
             )
         return self._merge(photon_map, read_queries(vertices), kind, radii, spectral, grey)
 
@@ -589,7 +645,7 @@ class BDPMSession(PilotedSession):
     def _map_again(self, arrays, kind, radius):
         """The map of the arrays of one."""
         if kind == "volume":
-            return VolumeMap.with_grid(arrays, radius, self.volume_capacity)
+            return VolumeMap.with_grid(arrays, self.volume_capacity)
         if TieredMap.has_made(arrays):
             return TieredMap(arrays, self.traits.bounds, self.photon_capacity)
         return PhotonMap.with_grid(arrays, self.traits.bounds, radius, self.photon_capacity)
@@ -729,7 +785,17 @@ class BDPMSession(PilotedSession):
                 self._freeze()
 
         (block,) = self.sum_of_chunks(render)
+        if self.near_zone is not None:
+            block = self._with_sensor_light(block, iteration, photons[-1], spectral)
         return self.direct_light.add_to(block, iteration, spectral)
+
+    def _with_sensor_light(self, block, iteration, in_media, spectral):
+        """The block of the camera paths, with the light of volume photons."""
+        seed = self._seed(iteration, SENSOR)
+        light = self._sensor_pass(
+            self.scene, self.sensor, self._tables, in_media, seed, spectral
+        )
+        return with_colour(block, as_camera_weights(light, block, self.expected_weight))
 
     def _wanted(self, counts):
         """How many vertices and beams a camera pass would have kept."""

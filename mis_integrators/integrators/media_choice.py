@@ -19,6 +19,7 @@ from ..pilot.denoiser import LEFT
 from ..pilot.setting import UNPLANNED_ITERATIONS
 from ..volume.views import views_of
 from .choice import (
+    FOR_DENOISERS,
     PATH_TRIALS,
     TRIAL_INDEX,
     Decision,
@@ -34,7 +35,7 @@ from .choice import (
 
 CAMERA, PHOTONS = "volpath_multiview", "bdpm"
 CANDIDATES = {CAMERA: {}, PHOTONS: {"bdd": 0}}
-"""Plugins that may be chosen, and their parameters."""
+"""Plugins that may be chosen, and their parameters, but for those of `FOR_DENOISERS`."""
 ENOUGH = 0.3
 """Tuned: photons that a light sub-path leaves, on average, from which on a pilot is worth its time
 and knows their blur."""
@@ -68,6 +69,7 @@ def new_session(plugin, integrator, scene, sensor, seed, iterations):
         **handed_on(integrator),
         "aovs": written(integrator.layers),
         **CANDIDATES[plugin],
+        **(FOR_DENOISERS.get(plugin, {}) if integrator.denoised else {}),
     }
     if iterations or plugin == PHOTONS:
         parameters["camera_paths"] = integrator.initial_camera_paths

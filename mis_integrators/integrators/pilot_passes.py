@@ -12,6 +12,7 @@ import numpy as np
 
 from ..core.recording import lanes
 from ..core.spectra import channel_mean
+from ..paths.camera import border_size, film_sample_count, film_size
 from ..photons.beams import Beams, mean_count_along
 from ..photons.gather import mean_photon_count
 from ..photons.points import Points, mean_count_in_balls, read_points
@@ -29,6 +30,7 @@ class SubsetPasses:
         self._record_camera(room, 4 * session._beam_room(pixels.paths))
         self._record_gather()
         self._covered = session.recorded(session._covered)
+        self._join = session.recorded(self._joined_light)
 
     def _record_camera(self, capacity, beams):
         session, pixels = self.session, self.pixels
@@ -73,6 +75,22 @@ class SubsetPasses:
                 for kind in radii
             }
         )
+
+    def _joined_light(self, scene, sensor, tables, in_media, seed, spectral):
+        """Light of volume photons joined with the sensor, mean over the channels, one a pixel."""
+        light = self.session._join_sensor(sensor, in_media, seed, spectral)
+        film = sensor.film()
+        corner = mi.ScalarVector2f(film.crop_offset()) - border_size(film)
+        place = mi.Point2u(dr.floor(light.film - corner))
+        total = dr.zeros(mi.Float, film_sample_count(sensor))
+        dr.scatter_reduce(
+            dr.ReduceOp.Add,
+            total,
+            channel_mean(light.value),
+            place.x + place.y * film_size(sensor)[0],
+            light.active,
+        )
+        return total
 
     def trace(self, number):
         session = self.session
@@ -144,6 +162,15 @@ class SubsetPasses:
             return mean_count_along(photon_map, beams, radius, self.pixels.paths)
         return mean_photon_count(photon_map, read_queries(vertices), radius)
 
+    def joined(self, photons, seed, spectral):
+        """Light of the photons that are joined with the sensor: (groups, pixels)."""
+        session, pixels = self.session, self.pixels
+        light = self._join(
+            session.scene, session.sensor, session._tables, photons[-1], seed, spectral
+        )
+        first = np.arange(pixels.count) * pixels.stride
+        return np.array([np.array(light)[first + g * pixels.apart] for g in range(pixels.groups)])
+
     def by_pixel(self, values):
         """Means (groups, pixels) of values of the camera paths; those that are not finite count as
         none."""
@@ -177,6 +204,9 @@ class SubsetIteration(NamedTuple):
 
     def gather(self, radii):
         return self.passes.gather(self.photons, self.vertices, radii, self.seed, self.spectral)
+
+    def joined(self):
+        return self.passes.joined(self.photons, self.seed, self.spectral)
 
     def direct(self):
         return self.passes.by_pixel(channel_mean(self.radiance))

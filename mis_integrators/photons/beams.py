@@ -244,7 +244,15 @@ def _within(low, high, beams):
 
 
 def gather_along(
-    photon_map, beams, radii, light_path_count, max_depth, grey=False, marked=False, weigh=None
+    photon_map,
+    beams,
+    radii,
+    light_path_count,
+    max_depth,
+    grey=False,
+    marked=False,
+    weigh=None,
+    near_zone=None,
 ):
     """Radiance that volume photons bring to camera paths along beams, for each radius of a list:
     the sum over photons of phase function x flux x transmittance to the beam's beginning, over
@@ -255,12 +263,20 @@ def gather_along(
     active)``: the weight (a number) of a photon to which camera paths would go on with density
     `pdf`. Photons count for beams in their own medium only, not behind the surface that ends the
     beam, and for short beams, unless they are weighed, only caustic ones.
+
+    Where a `near_zone` (a `NearZone`) is given, beams of first segments have its radius, and gather
+    the photons within it only.
     """
+    if near_zone is not None:
+        seen = beams.depth == 1
+        radii = [dr.select(seen, near_zone.radius, radius) for radius in radii]
     query = BeamQuery(photon_map, beams, radii[-1])
     split = marked and not grey
 
     def visit(index, landing, offset, distance_squared, hit, totals):
         hit &= beams.takes(landing, weigh is not None) & beams.before_surface(landing.p)
+        if near_zone is not None:
+            hit &= ~seen | near_zone.holds(landing.p)
         if max_depth > 0:
             hit &= landing.depth + beams.depth <= max_depth
         flux, towards = read_power(photon_map.power, index, hit)

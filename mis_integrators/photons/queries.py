@@ -126,7 +126,10 @@ class Queries:
     many beams of each kind there is room for (0: none are kept); `narrow`: a registry table of
     BSDFs at which none but caustic photons are gathered, and which the `bdd` does not count (None:
     there are none); `points`: in media, too, photons are asked for at vertices (under weights);
-    `cones` (`RayCones`, or None): they tell how wide pixels are at vertices that the camera sees.
+    `cones` (`RayCones`, or None): they tell how wide pixels are at vertices that the camera sees;
+    `near_zone` (a `NearZone`, or None): volume photons beyond it are joined with the sensor. Then
+    photons bring all light of media on the way to the first smooth surface: all segments before it
+    have long beams, the first one those within the zone.
     """
 
     bdd: int
@@ -138,6 +141,7 @@ class Queries:
     narrow: Any = None
     points: bool = False
     cones: Any = None
+    near_zone: Any = None
 
 
 class QueryVisitor:
@@ -154,7 +158,8 @@ class QueryVisitor:
     media the share of light that has got through these without being scattered.
 
     In media, paths scatter until they have left `bdd` smooth vertices behind, and go straight on
-    from there; where photons are asked for at points, until they have left one more behind.
+    from there; where photons are asked for at points, until they have left one more behind. Where
+    photons are joined with the sensor, paths go straight on to the first one on a surface, too.
     """
 
     def __init__(self, world, limits, queries, weights, first, beyond, classes):
@@ -175,7 +180,7 @@ class QueryVisitor:
             count=dr.zeros(mi.UInt32, self.sections),
         )
         self.flights = self.bdd + queries.points
-        self.flies = self.traits.has_media and self.flights > 0
+        self.flies = self.traits.has_media and self.flights > (queries.near_zone is not None)
         # Half transparent boundaries are none for the light that is met beyond the last vertex.
         self.passes_masks = self.traits.has_media and self.traits.has_null_vertices
         self.deepest = limits.max_depth - 1 if limits.max_depth > 0 else None
@@ -216,6 +221,8 @@ class QueryVisitor:
             if SHORT in self.kinds:
                 keep_short = self._keep_beams(state, throughput, path, depth + 1, SHORT)
             flies = state[0] < self.flights
+            if self.queries.near_zone is not None:
+                flies &= state[0] > 0
             hit, ray, flight, kept = next_hit_either(
                 self.scene, self.traits, ray, flight, numbers, keep_short, keep, flies, active
             )
@@ -234,6 +241,10 @@ class QueryVisitor:
         store, wanted = self.store, mi.Bool(True)
         if kind == LONG:
             wanted &= vertex == self.bdd
+        zone = self.queries.near_zone
+        if zone is not None:
+            first = depth == 1
+            wanted |= vertex == 0
         if self.deepest is not None:
             wanted &= mi.Int32(depth) <= self.deepest
         depth = depth | mi.UInt32(kind)
@@ -245,6 +256,9 @@ class QueryVisitor:
             depth |= dr.select(history[0] == 0, mi.UInt32(FIRST), 0)
 
         def keep(start, medium, length, kept, normal, surface, mask):
+            if zone is not None:
+                length = dr.select(first, dr.minimum(length, zone.reach(start)), length)
+                mask = mask & (length > 0)
             light = throughput * kept
             mask = mask & wanted & (dr.max(light) > 0)
             slot = dr.scatter_inc(store.beam_count[kind], mi.UInt32(0), mask)

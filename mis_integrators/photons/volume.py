@@ -21,7 +21,7 @@ from .photon import power_layout
 Array = Any
 
 CELL = 2.0
-"""Tuned: edge of a cell of the grid, in radii."""
+"""Tuned: edge of a cell of the grid, in radii; at least."""
 
 
 def place_layout():
@@ -70,11 +70,21 @@ class VolumeLanding:
 
 def read_place(place, index, active=True):
     """The `VolumeLanding` of photons `index`."""
-    record = place_layout().read(place, index, active)
+    return landing_of(place_layout().read(place, index, active))
+
+
+def landing_of(record):
+    """The `VolumeLanding` that a record of `place_layout` describes."""
     word = record["word"]
     medium = (word >> MEDIUM_SHIFT) & MOST_MEDIA
     share = dr.exp2(mi.Float(word >> SHARE_SHIFT) * (-1 / SHARE_STEPS))
     return VolumeLanding(record["p"], word & MAX_DEPTH, medium, (word & CAUSTIC) != 0, share)
+
+
+def medium_of(record, active):
+    """The medium that the photon of a record of `place_layout` lies in."""
+    number = dr.select(active, (record["word"] >> MEDIUM_SHIFT) & MOST_MEDIA, mi.UInt32(0))
+    return dr.reinterpret_array(mi.MediumPtr, number)
 
 
 def read_places(place, count):
@@ -129,6 +139,7 @@ class VolumeMap:
             **{name: getattr(self, name) for name in names},
             "low": self.box.min,
             "high": self.box.max,
+            "cell": self.grid.cell,
         }
 
     def place_of_mis_words(self, index, active):
@@ -136,16 +147,18 @@ class VolumeMap:
         return dr.gather(mi.UInt32, self.number, index, active)
 
     @classmethod
-    def with_grid(cls, arrays, radius, capacity: int):
-        """The map of `arrays`, built for the same radius and capacity."""
+    def with_grid(cls, arrays, capacity: int):
+        """The map of `arrays`, built for the same capacity."""
         arrays = dict(arrays)
         box = Box(arrays.pop("low"), arrays.pop("high"))
-        return cls(box, volume_grid(box, radius, capacity), **arrays)
+        return cls(box, Grid(box, arrays.pop("cell"), Table(capacity)), **arrays)
 
 
-def volume_grid(box, radius, capacity):
-    """The grid for queries of a radius (width one)."""
-    return Grid(box, CELL * radius, Table(capacity))
+def cell_size(box, radius, count):
+    """The edge of cells for queries of a radius, of so many photons (width one): no smaller than
+    holds one of them. To visit an empty cell takes as long as to visit a photon."""
+    x, y, z = box.max - box.min
+    return dr.maximum(CELL * radius, dr.cbrt(x * y * z / dr.maximum(mi.Float(count), 1)))
 
 
 def build_volume_map(place, power, count, radius, capacity: int, mis_words=None, density=None):
@@ -162,7 +175,7 @@ def build_volume_map(place, power, count, radius, capacity: int, mis_words=None,
         mi.Point3f(*(_extreme(dr.min, x, active, dr.inf) for x in p)),
         mi.Point3f(*(_extreme(dr.max, x, active, -dr.inf) for x in p)),
     )
-    grid = volume_grid(box, radius, capacity)
+    grid = Grid(box, cell_size(box, radius, count), Table(capacity))
     start, target = sort_by_cell(grid, p, active)
     sorted_place = place_layout().room(capacity)
     place_layout().write(sorted_place, record, target, active)

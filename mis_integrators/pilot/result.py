@@ -35,6 +35,9 @@ class PilotSamples(NamedTuple):
     """Light that neither photons bring nor other paths see, (iterations, groups, pixels)."""
     seen: np.ndarray
     """Light that other paths see, (pixels,)."""
+    joined: np.ndarray | None = None
+    """Light of photons that are joined with the sensor, (iterations, groups, pixels); None where
+    none are."""
 
 
 class PredictedError(NamedTuple):
@@ -97,6 +100,8 @@ class PilotResult:
     """By measure, and by kind of photons."""
     direct: dict[str, float]
     """By measure: variance, in an iteration, of the light that `PilotSamples.direct` is."""
+    joined: dict[str, float]
+    """By measure: that of `PilotSamples.joined`, with all light sub-paths."""
     mean: np.ndarray
     """(pixels,): radiance."""
     photon_light: float
@@ -196,7 +201,9 @@ class PilotResult:
             ]
             errors[measure] = PredictedError(
                 sum(squared_bias for squared_bias, _ in found),
-                self.direct[measure] + sum(variance for _, variance in found),
+                self.direct[measure]
+                + self.joined[measure] / share
+                + sum(variance for _, variance in found),
             )
         return Prediction(
             errors,
@@ -241,12 +248,15 @@ def measure(
     that gathers."""
     if samples is None:
         nothing = np.zeros(pixels.count)
-        return PilotResult(setting, pixels, seconds, {}, {}, {}, nothing, 0.0, 0.0)
+        return PilotResult(setting, pixels, seconds, {}, {}, {}, {}, nothing, 0.0, 0.0)
     middle = {
         kind: samples.gathered[kind, False][:, middle_index(ladder)].mean(axis=1)
         for kind, ladder in samples.ladder.items()
     }  # (iterations, pixels)
-    image = samples.direct.mean(axis=1) + sum(middle.values())
+    of_photons = sum(middle.values())
+    if samples.joined is not None:
+        of_photons = of_photons + samples.joined.mean(axis=1)
+    image = samples.direct.mean(axis=1) + of_photons
     mean = samples.seen + shrink_to_neighbours(image, neighbourhoods(setting.width, pixels))
     weights = {measure: weigh(mean) for measure, weigh in MEASURES.items()}
     errors: dict[str, dict[str, ErrorByRadius]] = {measure: {} for measure in MEASURES}
@@ -272,7 +282,13 @@ def measure(
         {kind: count * setting.light_paths for kind, count in samples.photons.items()},
         errors,
         {measure: direct_variance(samples.direct, weights[measure]) for measure in MEASURES},
+        {
+            measure: direct_variance(samples.joined, weights[measure]) / setting.light_paths
+            if samples.joined is not None
+            else 0.0
+            for measure in MEASURES
+        },
         mean,
-        float(sum(np.mean(part) for part in middle.values())),
+        float(np.mean(of_photons)),
         float(caustics / max(np.mean(mean), 1e-30)),
     )

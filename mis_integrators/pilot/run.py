@@ -56,6 +56,10 @@ class PilotIteration(Protocol):
         """Light that neither photons bring nor other paths see: mean over the channels, (groups,
         pixels)."""
 
+    def joined(self) -> np.ndarray:
+        """Light of photons that are joined with the sensor: mean over the channels, (groups,
+        pixels). Not called where none are."""
+
 
 class PilotPasses(Protocol):
     """What a pilot needs of a renderer."""
@@ -85,24 +89,30 @@ def run_pilot(setting: PilotSetting, pixels: PilotPixels, passes: PilotPasses) -
     photons: dict[str, float] = {}
     gathered: list[dict[tuple[str, bool], np.ndarray]] = []
     direct: list[np.ndarray] = []
+    joined: list[np.ndarray] = []
     spent = 0.0
     for done in range(1, MOST_ITERATIONS + 1):
         start = time.perf_counter()
         iteration = passes.trace(PILOT_INDEX + done - 1)
         if radii is None:
             radii, photons = choose_ladder(setting, iteration)
-        if radii:
+        if radii or setting.joins_sensor:
             gathered.append(iteration.gather(radii))
             direct.append(iteration.direct())
+        if setting.joins_sensor:
+            joined.append(iteration.joined())
         del iteration  # its photons' memory is free for those of the next
         seconds = time.perf_counter() - start
         spent += seconds if done > 1 else 0.0
-        if not radii or has_enough(setting, done, spent):
+        if not direct or has_enough(setting, done, spent):
             break
     samples = None
-    if radii:
+    if radii or np.any(joined):
         estimates = {key: np.array([step[key] for step in gathered]) for key in gathered[0]}
-        samples = PilotSamples(radii, photons, estimates, np.array(direct), passes.seen())
+        of_photons = np.array(joined) if joined else None
+        samples = PilotSamples(
+            radii, photons, estimates, np.array(direct), passes.seen(), of_photons
+        )
     return measure(setting, pixels, samples, seconds)
 
 

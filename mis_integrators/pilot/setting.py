@@ -61,6 +61,8 @@ class PilotSetting:
     """To choose from: the share of its light sub-paths that an iteration has."""
     volume_dimensions: int = 2
     """Of what volume photons are found in: disks across beams, or balls."""
+    joins_sensor: bool = False
+    """Whether photons are joined with the sensor, too."""
 
     def dimensions(self, kind: str) -> int:
         """Power of the radius with which the number of photons grows."""

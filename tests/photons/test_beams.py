@@ -247,7 +247,7 @@ def test_ten_million_photons_fit_into_two_gibibytes(rgb):
     assert total < 2 * 2**30
     _scene, medium, _ = media()
     arrays = photon_map(np.zeros((1000, 3)), np.ones(1000), medium, 0.1).arrays()
-    built = VolumeMap.with_grid(arrays, mi.Float([0.1]), 1003)
+    built = VolumeMap.with_grid(arrays, 1003)
     assert dr.width(built.place) == place_layout().words * 1003
     assert built.grid.table.size == table_size(1003)
     assert dr.width(built.start) == built.grid.table.size * 5 // 4
