@@ -59,10 +59,10 @@ class SmallRadiusBatches:
 
     def __init__(self, scene, blocks, radius=RADIUS, **parameters):
         self.blocks, self.batches = blocks, []
-        self.sessions = [
-            bdpm(initial_radius=r, **parameters).session(scene, seed=1, spp=0)
-            for r in (radius, radius / 2)
-        ]
+        self.sessions = [self.session(scene, r, parameters) for r in (radius, radius / 2)]
+
+    def session(self, scene, radius, parameters):
+        return bdpm(initial_radius=radius, **parameters).session(scene, seed=1, spp=0)
 
     def add(self, count):
         for wide, narrow in zip(*(pictures(session, count) for session in self.sessions)):

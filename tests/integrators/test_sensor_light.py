@@ -1,0 +1,260 @@
+"""Volume photons that are joined with the sensor, in images that will be denoised: their light
+against `volpath`, and their noise.
+
+Comparisons of renders as in `test_bdpm_media`, extrapolated to the radius zero, but for the disks
+close to the sensor, which blur a sixteenth of the light: false-alarm rate 1e-6 each, and the errors
+that are seen are those said there.
+"""
+
+import mis_integrators  # noqa: F401 (registers the plugins)
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from comparing import PathBatches, assert_same, collect_until, pictures
+from foggy import view, volpath
+from pilots import learned
+from selection import extended, one_in_each_row
+from test_bdpm_media import SLACK, SmallRadiusBatches
+from test_bdpt_media import FOG, SCENES, WITHIN, ball, fog_scene, homogeneous, inner
+from worlds import diffuse, film, grey
+
+
+@pytest.fixture(autouse=True)
+def _rgb(rgb):
+    pass
+
+
+def joined(scene, radius=0.06, **parameters):
+    """A session that joins photons with the sensor, and knows the radius of all others."""
+    plugin = {"type": "bdpm", "bdd": 0, "max_depth": 6, "denoised": True, "direct_paths": 1}
+    plugin |= {"camera_paths": 1, "photon_count": 20000, **parameters}
+    session = mi.load_dict(plugin).session(scene, seed=1, spp=0)
+    session.recall(learned(session, radius))
+    return session
+
+
+class JoinedBatches(SmallRadiusBatches):
+    """As those, with photons joined with the sensor."""
+
+    def session(self, scene, radius, parameters):
+        return joined(scene, radius, **parameters)
+
+
+def agree(scene, max_depth=6, whole=0.02, block=0.06, **parameters):
+    parameters = {"camera_paths": 16, **parameters}
+    mine = JoinedBatches(scene, 2, max_depth=max_depth, **parameters)
+    oracle = PathBatches(volpath(max_depth=max_depth), scene, 2, 512)
+    assert_same(*collect_until(mine, oracle, whole, block, most=600), whole, block, slack=SLACK)
+
+
+def greys(session, count):
+    """The images of so many iterations, each alone, mean over the channels: (count, H, W)."""
+    return np.array([picture[..., :3].mean(axis=2) for picture in pictures(session, count)])
+
+
+# --- Means ----------------------------------------------------------------------------------------
+
+USUAL = ("coloured", 1), ("glass", 0), ("sensor within", 0)
+"""Of `SCENES` and values of `bdd`, those of the default run."""
+
+
+@pytest.mark.parametrize("name, bdd", one_in_each_row(sorted(SCENES), (0, 1, 2), USUAL))
+def test_agrees_with_volpath(name, bdd):
+    """Glass: beams behind it, and light that is seen through it. Within the fog: the zone close to
+    the sensor. (Of the light sub-paths from a sky, few meet the cube.)"""
+    visible, more = (0.02, 0.06), {}
+    if name in ("sky", "sun"):
+        visible = (0.05, 0.15)
+    if "within" in name:  # all pixels see the few photons that are close to the sensor
+        visible, more = (0.08, 0.24), {"photon_count": 200000, "camera_paths": 4}
+    agree(SCENES[name](), 6, *visible, bdd=bdd, **more)
+
+
+@pytest.mark.parametrize("max_depth, bdd", [(2, 1), *extended((1, 0), (2, 0), (3, 0), (3, 1))])
+def test_depth_is_that_of_volpath(max_depth, bdd):
+    """Boundaries do not count, half transparent ones included."""
+    scene = fog_scene(
+        homogeneous(),
+        ball=ball({"type": "mask", "opacity": 0.4, "nested": diffuse()}, **inner()),
+        sky={"type": "constant", "radiance": grey(0.4)},
+    )
+    agree(scene, max_depth, bdd=bdd)
+
+
+def test_orthographic_sensors_have_no_zone():
+    """Their rays are parallel; the film here is a crop window, too."""
+    from worlds import look, T
+
+    window = {"crop_width": 10, "crop_height": 12, "crop_offset_x": 4, "crop_offset_y": 2}
+    sensor = {
+        "type": "orthographic",
+        "to_world": look((0, 0.7, 4.2), (0, 0, 0)) @ T().scale([1.5, 1.5, 1]),
+        "film": film(16, **window),
+    }
+    scene = fog_scene(homogeneous(), sensor)
+    session = joined(scene)
+    session.iterate()
+    assert float(session.near_zone.depth[0]) == 0
+    agree(scene)
+
+
+@pytest.mark.parametrize("bdd", [1, *extended(0)])
+def test_classes_of_light_are_those_without(bdd):
+    """Direct, indirect and caustic light sum to the image, and have the shares that beams find."""
+    aovs = ",".join(f"{name}:{name}" for name in ("direct", "indirect", "caustic"))
+    scene = fog_scene(homogeneous(0.5), ball=ball({"type": "dielectric"}, 0.8, exterior=FOG))
+    means = []
+    for parameters in ({}, {"denoised": False, "initial_radius": 0.03}):
+        plugin = {"type": "bdpm", "max_depth": 6, "denoised": True, "bdd": bdd, "aovs": aovs}
+        plugin |= {"photon_count": 20000, "camera_paths": 16, "direct_paths": 1}
+        session = mi.load_dict(plugin | parameters).session(scene, seed=1, spp=640)
+        if not parameters:
+            session.recall(learned(session, 0.03))
+        for _ in range(40):
+            session.iterate()
+        names = list(session.channels)
+        image = session.image()[..., [names.index(c) for c in "RGB"]].mean(axis=(0, 1))
+        layers = np.array(
+            [
+                session.image()[..., [names.index(f"{layer}.{c}") for c in "RGB"]].mean(axis=(0, 1))
+                for layer in ("direct", "indirect", "caustic")
+            ]
+        )
+        assert layers.sum(axis=0) == pytest.approx(image, rel=1e-4)
+        means.append(layers.mean(axis=1) / image.mean())
+    # Other seeds differ by 0.003.
+    assert means[1].min() > 0.03
+    assert np.abs(means[0] - means[1]).max() < 0.01
+
+
+# --- Noise ----------------------------------------------------------------------------------------
+
+
+def thin_fog(**sensor):
+    """Fog alone, of which the sensor sees all, under a point lamp."""
+    lamp = {"type": "point", "position": [0.3, 2.0, 0.5], "intensity": 4.0}
+    return fog_scene(homogeneous(0.5), view((0, 0, 3.6), **sensor), lamp=None, floor=None, lit=lamp)
+
+
+def test_near_pixels_share_no_noise():
+    """Neighbours' estimates are hardly correlated over iterations; along beams of the same photons
+    by more than a half."""
+    alike = []
+    for parameters in ({}, {"denoised": False, "initial_radius": 0.25}):
+        plugin = {"type": "bdpm", "bdd": 0, "max_depth": 2, "denoised": True}
+        plugin |= {"photon_count": 20000, "sampler": "independent", **parameters}
+        session = mi.load_dict(plugin).session(thin_fog(), seed=1, spp=0)
+        if not parameters:
+            session.recall(learned(session, 0.25))
+        images = greys(session, 100)[:, 2:14, 2:14]
+        noise = images / images.mean(axis=0) - 1
+        alike.append((noise[..., 1:] * noise[..., :-1]).mean() / (noise**2).mean())
+    assert alike[0] < 0.1 and alike[1] > 0.5
+
+
+def test_photons_close_to_the_sensor_are_no_dots(monkeypatch):
+    """Within fog, the largest pixel of images is many times brighter without the zone; the zone is
+    an eighth of the median depth of what is seen."""
+    from mis_integrators.photons import near_zone
+
+    scene = fog_scene(homogeneous(), view(*WITHIN, medium=FOG))
+    brightest = []
+    for depth in (near_zone.DEPTH, 0.0):
+        monkeypatch.setattr(near_zone, "DEPTH", depth)
+        session = joined(scene, photon_count=200000)
+        images = greys(session, 50)
+        zone = float(session.near_zone.depth[0])
+        assert 0.06 < zone < 0.25 if depth else zone == 0
+        # Of single iterations: of a thousand pixels the brightest.
+        brightest.append(np.quantile(images, 0.999) / images.mean())
+    assert brightest[1] > 2 * brightest[0]
+
+
+def test_the_pilot_counts_little_of_their_noise():
+    """What it predicts of them is a denoiser's share of the noise of pixels, measured over
+    iterations, within a factor of two; and less light makes more of it."""
+    from mis_integrators.pilot.denoiser import LEFT
+    from mis_integrators.pilot.run import run_pilot
+    from mis_integrators.pilot.setting import pilot_pixels
+
+    plugin = {"type": "bdpm", "bdd": 0, "denoised": True, "max_depth": 2}
+    plugin |= {"photon_count": 20000, "sampler": "independent", "direct_paths": 1}
+    session = mi.load_dict(plugin).session(thin_fog(size=32), seed=3, spp=512)
+    setting = session.pilot_setting()
+    pixels = pilot_pixels(setting)
+    pilot = run_pilot(setting, pixels, session.pilot_passes(setting, pixels))
+    session.start()
+    images = greys(session, 64)
+    weights = 1 / (images.mean(axis=0) ** 2 + 0.1 * np.mean(images) ** 2)
+    measured = LEFT * (images.var(axis=0, ddof=1) * weights).mean()
+    assert 0.5 * measured < pilot.joined["relmse"] < 2 * measured
+    choices = [pilot._predict(choice(pilot, share), 512) for share in (1.0, 0.25)]
+    variances = [prediction.errors["relmse"].variance for prediction in choices]
+    assert variances[1] - variances[0] > 2.9 * pilot.joined["relmse"]
+
+
+def choice(pilot, share):
+    return pilot._choose(share, 512, None, 0.0)
+
+
+# --- Sessions -------------------------------------------------------------------------------------
+
+
+def test_who_joins_photons():
+    """Images that will be denoised, where radii are chosen; no weighted plugin, nor a sensor that
+    no point is joined with."""
+    scene = thin_fog()
+
+    def zone(plugin="bdpm", scene=scene, **parameters):
+        return mi.load_dict({"type": plugin, **parameters}).session(scene).near_zone
+
+    assert zone(denoised=True) is not None
+    assert zone() is None and zone(denoised=True, initial_radius=0.1) is None
+    assert zone("bdpm_opt2", denoised=True) is None
+    meter = {"type": "radiancemeter", "origin": [0, 0, 3.6], "direction": [0, 0, -1]}
+    meter["film"] = film(1)
+    assert zone(scene=fog_scene(homogeneous(), meter), denoised=True) is None
+
+
+def test_recalled_sessions_render_the_same():
+    """The zone and the radii are found again."""
+    scene = fog_scene(homogeneous(), view(*WITHIN, medium=FOG))
+    images = []
+    plugin = mi.load_dict({"type": "bdpm", "denoised": True, "max_depth": 6})
+    first = plugin.session(scene, seed=1, spp=16)
+    second = plugin.session(scene, seed=1, spp=16)
+    first.start()
+    second.recall(first.learned)
+    for session in (first, second):
+        session.iterate()
+        images.append(session.image())
+    np.testing.assert_allclose(images[0], images[1], rtol=1e-3, atol=1e-5)
+
+
+@pytest.mark.parametrize("bdd, glass", [(1, False), (0, True)])
+def test_beams_are_thinned_beyond_the_first_surface(monkeypatch, bdd, glass):
+    """A quarter of these is kept (within 5 standard errors: 6e-7), and all that are seen through
+    glass."""
+    from mis_integrators.photons import queries
+    from mis_integrators.photons.beams import read_beams
+    from mis_integrators.pilot.setting import pilot_pixels
+
+    more = {"glass": ball({"type": "dielectric"}, exterior=FOG)} if glass else {}
+    scene = fog_scene(homogeneous(), view(*WITHIN, size=64, medium=FOG), **more)
+    counts = []
+    for share in (1.0, queries.BEAMS_KEPT):
+        monkeypatch.setattr(queries, "BEAMS_KEPT", share)
+        session = joined(scene, bdd=bdd)
+        setting = session.pilot_setting()
+        iteration = session.pilot_passes(setting, pilot_pixels(setting)).trace(0)
+        beams = read_beams(iteration.vertices["beams"])
+        there = np.array(dr.max(beams["throughput"])) > 0
+        counts.append(np.count_nonzero(there & ((np.array(beams["depth"]) & 0xFFFF) > 1)))
+    assert counts[0] > 300
+    if glass:
+        assert counts[1] == counts[0]
+    else:
+        share = queries.BEAMS_KEPT
+        assert abs(counts[1] - share * counts[0]) < 5 * np.sqrt(share * (1 - share) * counts[0])
