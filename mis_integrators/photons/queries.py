@@ -31,9 +31,9 @@ PIXEL_DISK = 0.35
 """Tuned: radius of a `pixel_disk` over the width of a pixel. (With 0.5 the denoised walls of a room
 lit through glass have a texture.)"""
 BEAMS_KEPT = 0.25
-"""Tuned: where photons are joined with the sensor, the share of the beams beyond the first smooth
-vertex that are kept, and count for all. They take most of the time then, and their noise is each
-pixel's own."""
+"""Tuned: where photons are joined with the sensor, the share of the beams beyond the first segment
+that are kept, and count for all. They take most of the time then, and their noise is each pixel's
+own."""
 BEAM = 1 << 24
 """Numbers of paths' vertices (see `PathNumbers.at`) that tell which beams are kept begin here."""
 STATE = ("weights.0", "weights.1", "weights.2")
@@ -225,7 +225,7 @@ class QueryVisitor:
         if self.queries.near_zone is not None:
             kept = numbers.at(BEAM + depth).next_float32() < BEAMS_KEPT
             brought = dr.select(
-                state[0] == 0, throughput, dr.select(kept, throughput / BEAMS_KEPT, 0)
+                depth == 0, throughput, dr.select(kept, throughput / BEAMS_KEPT, 0)
             )
         keep = self._keep_beams(state, brought, path, depth + 1, LONG)
         if self.flies:

@@ -154,11 +154,13 @@ class VolumeMap:
         return cls(box, Grid(box, arrays.pop("cell"), Table(capacity)), **arrays)
 
 
-def cell_size(box, radius, count):
-    """The edge of cells for queries of a radius, of so many photons (width one): no smaller than
-    holds one of them. To visit an empty cell takes as long as to visit a photon."""
-    x, y, z = box.max - box.min
-    return dr.maximum(CELL * radius, dr.cbrt(x * y * z / dr.maximum(mi.Float(count), 1)))
+def cell_size(radius, density, count):
+    """The edge of cells for queries of a radius. Where the `density` of so many photons (width one)
+    is known, cells are no smaller than holds one of them in the median: to visit an empty cell takes
+    as long as to visit a photon."""
+    if density is None:
+        return CELL * radius
+    return dr.maximum(CELL * radius, dr.rcp(dr.cbrt(density.median_of(mi.Float(count)))))
 
 
 def build_volume_map(place, power, count, radius, capacity: int, mis_words=None, density=None):
@@ -175,7 +177,7 @@ def build_volume_map(place, power, count, radius, capacity: int, mis_words=None,
         mi.Point3f(*(_extreme(dr.min, x, active, dr.inf) for x in p)),
         mi.Point3f(*(_extreme(dr.max, x, active, -dr.inf) for x in p)),
     )
-    grid = Grid(box, cell_size(box, radius, count), Table(capacity))
+    grid = Grid(box, cell_size(radius, density, count), Table(capacity))
     start, target = sort_by_cell(grid, p, active)
     sorted_place = place_layout().room(capacity)
     place_layout().write(sorted_place, record, target, active)

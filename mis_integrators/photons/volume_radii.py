@@ -34,6 +34,8 @@ class VolumeDensity:
     cells: LightCells
     median: mi.Float
     """Density [1/volume] at half of the light."""
+    photons: mi.Float
+    """How many there were."""
 
     @classmethod
     def of(cls, place, power, count, largest):
@@ -46,7 +48,12 @@ class VolumeDensity:
         cells.add(p, flux, active)
         light = dr.select(active, flux, 0)
         median = weighted_median(np.array(density_in(cells, p, flux, active)), np.array(light))
-        return cls(cells, dr.opaque(mi.Float, median))
+        photons = max(int(count[0]), 1)
+        return cls(cells, dr.opaque(mi.Float, median), dr.opaque(mi.Float, photons))
+
+    def median_of(self, count):
+        """The median density of so many photons of the same light; not zero."""
+        return dr.maximum(self.median * count / self.photons, 1e-30)
 
     def share(self, p, flux, active):
         """The radius of photons at `p`, over that of the sparsest ones; one where no density was
