@@ -51,6 +51,7 @@ ANALYTIC = "tests/integrators/test_analytic.py"
 LONG = "tests/app/test_long_renders.py"
 TIERS = "tests/photons/test_tiers.py"
 PIXEL_DISKS = "tests/integrators/test_pixel_disks.py"
+SENSOR_LIGHT = "tests/integrators/test_sensor_light.py"
 VOLUME_RADII = "tests/photons/test_volume_radii.py"
 LOBES = "tests/integrators/test_narrow_lobes.py"
 VCM = "tests/integrators/test_vcm.py"
@@ -671,5 +672,54 @@ MUTATIONS = [
         "number = mi.UInt32(number)",
         "photons that a denoiser is to smooth have wide disks",
         f"{TIERS}::test_tiers_bring_what_brute_force_finds",
+    ),
+    Mutation(
+        "photons/sensor_light.py",
+        "    active &= ~zone.holds(landing.p)\n",
+        "",
+        "photons close to the sensor are joined with it, and gathered along beams, too",
+        f"{SENSOR_LIGHT}::test_photons_close_to_the_sensor_are_no_dots",
+    ),
+    Mutation(
+        "photons/sensor_light.py",
+        "landing.depth + 1 <= max_depth",
+        "landing.depth <= max_depth",
+        "photons joined with the sensor have a segment too many",
+        f"{SENSOR_LIGHT}::test_depth_is_that_of_volpath",
+    ),
+    Mutation(
+        "photons/queries.py",
+        "            wanted |= vertex == 0\n",
+        "",
+        "media seen through glass bring no light where photons are joined with the sensor",
+        f"{SENSOR_LIGHT}::test_agrees_with_volpath",
+    ),
+    Mutation(
+        "photons/queries.py",
+        "throughput / BEAMS_KEPT, 0)",
+        "throughput, 0)",
+        "beams that are kept do not count for those that are not",
+        f"{SENSOR_LIGHT}::test_agrees_with_volpath",
+    ),
+    Mutation(
+        "pilot/result.py",
+        "+ self.joined[measure] / share",
+        "+ self.joined[measure]",
+        "fewer light sub-paths make no noise of joined photons",
+        f"{SENSOR_LIGHT}::test_the_pilot_counts_little_of_their_noise",
+    ),
+    Mutation(
+        "integrators/pilot_passes.py",
+        "return np.array(light)[first + group * pixels.apart]",
+        "return np.array(light)[first + group * 0]",
+        "the pilot takes the noise of joined photons for noise that near pixels share",
+        f"{SENSOR_LIGHT}::test_the_pilot_counts_little_of_their_noise",
+    ),
+    Mutation(
+        "photons/near_zone.py",
+        "left = self.depth + self.radius - self",
+        "left = self.depth - 2 * self.radius - self",
+        "beams end before the zone does",
+        f"{SENSOR_LIGHT}::test_beams_reach_to_the_end_of_the_zone",
     ),
 ]

@@ -792,9 +792,7 @@ class BDPMSession(PilotedSession):
     def _with_sensor_light(self, block, iteration, in_media, spectral):
         """The block of the camera paths, with the light of volume photons."""
         seed = self._seed(iteration, SENSOR)
-        light = self._sensor_pass(
-            self.scene, self.sensor, self._tables, in_media, seed, spectral
-        )
+        light = self._sensor_pass(self.scene, self.sensor, self._tables, in_media, seed, spectral)
         return with_colour(block, as_camera_weights(light, block, self.expected_weight))
 
     def _wanted(self, counts):

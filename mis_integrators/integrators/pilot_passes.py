@@ -169,7 +169,8 @@ class SubsetPasses:
             session.scene, session.sensor, session._tables, photons[-1], seed, spectral
         )
         first = np.arange(pixels.count) * pixels.stride
-        return np.array([np.array(light)[first + g * pixels.apart] for g in range(pixels.groups)])
+        group = np.arange(pixels.groups)[:, None]
+        return np.array(light)[first + group * pixels.apart]
 
     def by_pixel(self, values):
         """Means (groups, pixels) of values of the camera paths; those that are not finite count as

@@ -62,4 +62,3 @@ class NearZone:
         """How far along a ray the disks are that reach into the zone."""
         left = self.depth + self.radius - self.depth_of(ray.o)
         return dr.maximum(left / dr.maximum(dr.dot(ray.d, self.axis), 1e-3), 0)
-

@@ -224,9 +224,7 @@ class QueryVisitor:
         brought = throughput
         if self.queries.near_zone is not None:
             kept = numbers.at(BEAM + depth).next_float32() < BEAMS_KEPT
-            brought = dr.select(
-                depth == 0, throughput, dr.select(kept, throughput / BEAMS_KEPT, 0)
-            )
+            brought = dr.select(depth == 0, throughput, dr.select(kept, throughput / BEAMS_KEPT, 0))
         keep = self._keep_beams(state, brought, path, depth + 1, LONG)
         if self.flies:
             keep_short = None

@@ -156,8 +156,8 @@ class VolumeMap:
 
 def cell_size(radius, density, count):
     """The edge of cells for queries of a radius. Where the `density` of so many photons (width one)
-    is known, cells are no smaller than holds one of them in the median: to visit an empty cell takes
-    as long as to visit a photon."""
+    is known, cells are no smaller than holds one of them in the median: to visit an empty cell
+    takes as long as to visit a photon."""
     if density is None:
         return CELL * radius
     return dr.maximum(CELL * radius, dr.rcp(dr.cbrt(density.median_of(mi.Float(count)))))

@@ -111,7 +111,7 @@ def run_pilot(setting: PilotSetting, pixels: PilotPixels, passes: PilotPasses) -
         estimates = {key: np.array([step[key] for step in gathered]) for key in gathered[0]}
         of_photons = np.array(joined) if joined else None
         samples = PilotSamples(
-            radii, photons, estimates, np.array(direct), passes.seen(), of_photons
+            radii or {}, photons, estimates, np.array(direct), passes.seen(), of_photons
         )
     return measure(setting, pixels, samples, seconds)
 

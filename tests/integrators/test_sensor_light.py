@@ -18,7 +18,7 @@ from pilots import learned
 from selection import extended, one_in_each_row
 from test_bdpm_media import SLACK, SmallRadiusBatches
 from test_bdpt_media import FOG, SCENES, WITHIN, ball, fog_scene, homogeneous, inner
-from worlds import diffuse, film, grey
+from worlds import T, diffuse, film, grey, look
 
 
 @pytest.fixture(autouse=True)
@@ -85,8 +85,6 @@ def test_depth_is_that_of_volpath(max_depth, bdd):
 
 def test_orthographic_sensors_have_no_zone():
     """Their rays are parallel; the film here is a crop window, too."""
-    from worlds import look, T
-
     window = {"crop_width": 10, "crop_height": 12, "crop_offset_x": 4, "crop_offset_y": 2}
     sensor = {
         "type": "orthographic",
@@ -170,6 +168,29 @@ def test_photons_close_to_the_sensor_are_no_dots(monkeypatch):
         # Of single iterations: of a thousand pixels the brightest.
         brightest.append(np.quantile(images, 0.999) / images.mean())
     assert brightest[1] > 2 * brightest[0]
+
+
+def test_beams_reach_to_the_end_of_the_zone():
+    """Whatever lies in it, and within the radius of a ray, is before the end of the ray's beam;
+    rays that begin far beyond have none."""
+    from mis_integrators.paths.sensor import Lens
+    from mis_integrators.photons.near_zone import NearZone
+
+    zone = NearZone(Lens(mi.load_dict(view((1, 2, 3), (1, 2, 0)))))  # looks along -z
+    zone._set(0.8)
+    radius, rng = float(zone.radius[0]), np.random.default_rng(1)
+    d = rng.normal(size=(3, 4000)) * [[0.5], [0.5], [0]] - [[0], [0], [1]]
+    d /= np.linalg.norm(d, axis=0)
+    along, aside = rng.uniform(0, 1.5, 4000), np.cross(d.T, rng.normal(size=(4000, 3))).T
+    aside *= rng.uniform(0, radius, 4000) / np.linalg.norm(aside, axis=0)
+    p = np.array([[1.0], [2.0], [3.0]]) + along * d + aside
+    inside = np.array(zone.holds(mi.Point3f(p)))
+    np.testing.assert_array_equal(inside, 3 - np.float32(p[2]) < 0.8)
+    ray = mi.Ray3f(mi.Point3f(1, 2, 3), mi.Vector3f(d))
+    reach = np.array(zone.reach(ray))
+    assert 1000 < inside.sum() < 3000
+    assert np.all(along[inside] <= reach[inside] + 1e-5) and np.all(reach < 4 * 0.8)
+    assert zone.reach(mi.Ray3f(mi.Point3f(1, 2, 1), mi.Vector3f(0, 0, -1)))[0] == 0
 
 
 def test_the_pilot_counts_little_of_their_noise():

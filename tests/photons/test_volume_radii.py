@@ -117,17 +117,22 @@ def test_words_hold_shares(rgb):
     assert np.all(number == number[0]) and number[0] > 0
 
 
-def test_beams_find_what_brute_force_finds(rgb):
-    """Each photon's flux over the area of its own disk, at two radii."""
+@pytest.mark.parametrize("radii", [(0.2, 0.4), (0.02, 0.04)])
+def test_beams_find_what_brute_force_finds(rgb, radii):
+    """Each photon's flux over the area of its own disk, at two radii; small ones, too, for which
+    cells of two radii would be empty: there each has a photon in the median."""
     rng = np.random.default_rng(4)
     _scene, medium, _ = media()
-    points = np.concatenate([cloud(rng, 3000, 2.0, (0, 0, 0)), cloud(rng, 3000, 0.2, (0, 0, 0))])
+    points = np.concatenate([cloud(rng, 4000, 2.0, (0, 0, 0)), cloud(rng, 2000, 0.2, (0, 0, 0))])
     points, flux = np.float32(points).astype(float), np.ones(len(points))
-    density, radii = density_of(points), [0.2, 0.4]
+    density = density_of(points)
     place, power, count = written(points, flux, medium)
     built = build_volume_map(
-        place, power, count, mi.Float([0.4]), place_layout().capacity(place), density=density
+        place, power, count, mi.Float([radii[1]]), place_layout().capacity(place), density=density
     )
+    cell = max(2 * radii[1], float(density.median[0]) ** (-1 / 3))
+    assert built.grid.cell[0] == pytest.approx(cell, rel=1e-4)
+    assert (cell > 2 * radii[1]) == (radii[1] < 0.05)
     landing = read_place(built.place, dr.arange(mi.UInt32, len(points)))
     share, p = np.array(landing.share), np.array(landing.p).T.astype(float)
     assert share.min() < 0.3 and share.max() == 1
