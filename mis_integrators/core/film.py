@@ -29,7 +29,8 @@ def shared_wavelengths(sensor, number):
     """The wavelengths that all sub-paths of an iteration share, the sample that makes them (from
     `number`, 32 random bits), and their conversion to colour: a dictionary of opaque arrays
     `sample`, `wavelengths`, `matrix`, and `sensor_matrix`, for light that has no camera ray: the
-    weight of one holds the response over the density of its wavelengths, too."""
+    weight of one holds the response over the density of its wavelengths, too, and so does
+    `sensor_weight`."""
     sample = dr.opaque(mi.Float, number / 2**32)
     wavelengths, weight = sensor.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), sample)
     matrix = colour_matrix(wavelengths)
@@ -38,6 +39,7 @@ def shared_wavelengths(sensor, number):
         "wavelengths": wavelengths,
         "matrix": matrix,
         "sensor_matrix": [column * weight[i] for i, column in enumerate(matrix)],
+        "sensor_weight": mi.Spectrum(weight),
     }
     dr.make_opaque(spectral)
     return spectral
@@ -81,9 +83,10 @@ def splat_channels(film, position, channels, active):
     return block.tensor()
 
 
-def expected_weight(film, camera_paths):
+def expected_weight(film, camera_paths, in_crop=False):
     """Expected sum of filter weights that `camera_paths` samples a pixel leave in each pixel of a
-    block, border included: a tensor (height, width, 1).
+    block, border included: a tensor (height, width, 1). `in_crop`: no samples count that a film may
+    take beyond its crop window, where nothing else brings the light that is joined with the sensor.
 
     What light sub-paths bring to the sensor is divided by this, not by the weights that the
     camera's samples happen to have."""
@@ -97,7 +100,7 @@ def expected_weight(film, camera_paths):
             np.cumsum(np.array(rfilter.eval(mi.Float(x)), dtype=np.float64)) * (2 * radius / steps),
         ]
     )
-    spread = border if film.sample_border() else 0
+    spread = border if film.sample_border() and not in_crop else 0
 
     def along(size):
         middle = np.arange(-border, size + border) + 0.5

@@ -150,7 +150,12 @@ class BDPM(IterativeIntegrator):
     al. 2008, the beam radiance estimate). They carry all light that media scatter there, their
     single scattering included.
 
-    The estimate is consistent: its bias vanishes with the radius. Polarised variants, gradients and
+    In images that will be ``denoised``, volume photons that the sensor sees are joined with it,
+    each for one pixel, but for those very close to it. Camera paths go straight through media to
+    the first smooth surface then.
+
+    The estimate is consistent: its bias vanishes with the radius (but for that of photons very
+    close to the sensor). Polarised variants, gradients and
     the film ``specfilm`` are refused by name; in media also phase functions of flakes and
     ``hide_emitters``.
 
@@ -240,18 +245,22 @@ class BDPMSession(PilotedSession):
         )
         self.has_indirect = not self.lights.dark and (depth < 0 or depth >= integrator.bdd + 3)
         lit = self.traits.has_media and not self.lights.dark
-        near = integrator.denoised and not integrator.initial_radius and self.suits_denoisers
+        for_denoiser = (
+            integrator.denoised and not integrator.initial_radius and self.suits_denoisers
+        )
         self.near_zone = None  # where volume photons are joined with the sensor, a `NearZone`
-        if near and lit and (depth < 0 or depth >= 2) and Lens(sensor).connects:
-            self.near_zone = NearZone(Lens(sensor))
+        lens = Lens(sensor)
+        if for_denoiser and lit and (depth < 0 or depth >= 2) and lens.connects:
+            self.near_zone = NearZone(lens)
+            self.expected_weight = expected_weight(
+                sensor.film(), integrator.camera_paths, in_crop=True
+            )
         self.has_volume = self.near_zone is not None or (
             lit and (self.has_caustics or depth < 0 or depth >= integrator.bdd + 2)
         )
         self.cones = None  # where the camera sees caustics in disks of a pixel's size, `RayCones`
-        if near and self.has_caustics and (self.near_zone or not self.has_volume):
+        if for_denoiser and self.has_caustics and (lens.connects or not self.has_volume):
             self.cones = cones_of(sensor)
-        if self.near_zone is not None:
-            self.expected_weight = expected_weight(sensor.film(), integrator.camera_paths)
         self.narrow = None
         if integrator.pass_narrow and self.has_indirect:
             self.narrow = narrow_bsdfs(scene)
@@ -370,10 +379,16 @@ class BDPMSession(PilotedSession):
             largest = largest_radius(self.traits.extent)
             self._volume_density = VolumeDensity.of(*in_media[:3], largest)
             if self.near_zone is not None:
-                self.near_zone.measure(in_media[0], in_media[2])
-                self._list_tables()
+                self._measure_near_zone(in_media)
             self._use_light_paths(count)
         return self._volume_density
+
+    def _measure_near_zone(self, in_media):
+        """Finds the zone's depth by the light of all photons that are joined with the sensor."""
+        seed, spectral = self.sensor_seed(PILOT_INDEX), self._spectral(PILOT_INDEX)
+        light = self._join_sensor(self.sensor, in_media, seed, spectral)
+        self.near_zone.measure(in_media[0], light)
+        self._list_tables()
 
     def photons_of_a_path(self):
         """How many photons a light sub-path leaves, on average: by the light pass of a pilot."""
@@ -539,6 +554,10 @@ class BDPMSession(PilotedSession):
         width, height = sensor.film().crop_size()
         light.value *= width * height * dr.rcp(self._light_paths)
         return light
+
+    def sensor_seed(self, iteration):
+        """Of the random numbers of photons that are joined with the sensor."""
+        return self._seed(iteration, SENSOR)
 
     def _splat_photons(self, scene, sensor, tables, in_media, seed, spectral):
         """The block of the light that volume photons bring to the sensor."""
@@ -785,13 +804,14 @@ class BDPMSession(PilotedSession):
                 self._freeze()
 
         (block,) = self.sum_of_chunks(render)
+        block = self.direct_light.add_to(block, iteration, spectral)
         if self.near_zone is not None:
             block = self._with_sensor_light(block, iteration, photons[-1], spectral)
-        return self.direct_light.add_to(block, iteration, spectral)
+        return block
 
     def _with_sensor_light(self, block, iteration, in_media, spectral):
-        """The block of the camera paths, with the light of volume photons."""
-        seed = self._seed(iteration, SENSOR)
+        """The block of all camera paths, with the light of volume photons."""
+        seed = self.sensor_seed(iteration)
         light = self._sensor_pass(self.scene, self.sensor, self._tables, in_media, seed, spectral)
         return with_colour(block, as_camera_weights(light, block, self.expected_weight))
 

@@ -36,8 +36,9 @@ class BDPMAuto(IterativeIntegrator):
     be denoised. The photon mapper runs its pilot; a few samples of ``path`` on the same pixels tell
     what that would bring in the same time. What an iteration costs is counted (segments, photons)
     and priced, not clocked. Where ``path`` cannot see all the light of the scene, it is not tried.
-    In scenes with media the two are ``volpath_multiview``, with one view, and ``bdpm`` with ``bdd``
-    0. Photons are not tried there where light sub-paths leave few of them, nor in media of grids.
+    In scenes with media the two are ``volpath_multiview``, with one view, and ``bdpm`` with the
+    same ``bdd``. Photons are not tried there where light sub-paths leave few of them, nor in media
+    of grids.
 
     The settings of the image (in the EXR's header) say which integrator was chosen and why, with
     the predictions; ``mis-render`` prints the reasons, too. Without a time limit, the same seed and

@@ -165,12 +165,16 @@ def new_session(plugin, integrator, scene, sensor, seed, iterations):
         "denoised": integrator.denoised,
         "aovs": written(integrator.layers),
     }
-    own = CANDIDATES[plugin]
-    if integrator.denoised:
-        own = FOR_DENOISERS.get(plugin, own)
+    own = own_parameters(CANDIDATES, plugin, integrator)
     return mi.load_dict({"type": plugin, **shared, **own}).new_session(
         scene, sensor, seed, iterations
     )
+
+
+def own_parameters(candidates, plugin, integrator):
+    """The parameters of one of the `candidates` that others do not share."""
+    own = candidates[plugin]
+    return FOR_DENOISERS.get(plugin, own) if integrator.denoised else own
 
 
 def no_photons(integrator, session):

@@ -19,7 +19,6 @@ from ..pilot.denoiser import LEFT
 from ..pilot.setting import UNPLANNED_ITERATIONS
 from ..volume.views import views_of
 from .choice import (
-    FOR_DENOISERS,
     PATH_TRIALS,
     TRIAL_INDEX,
     Decision,
@@ -28,6 +27,7 @@ from .choice import (
     decide,
     handed_on,
     no_photons,
+    own_parameters,
     parts_of_samples,
     trial_of_photons,
     why_not_camera_paths,
@@ -35,13 +35,14 @@ from .choice import (
 
 CAMERA, PHOTONS = "volpath_multiview", "bdpm"
 CANDIDATES = {CAMERA: {}, PHOTONS: {"bdd": 0}}
-"""Plugins that may be chosen, and their parameters, but for those of `FOR_DENOISERS`."""
+"""Plugins that may be chosen, and their parameters (see `choice.FOR_DENOISERS`)."""
 ENOUGH = 0.3
 """Tuned: photons that a light sub-path leaves, on average, from which on a pilot is worth its time
 and knows their blur."""
 PATHS_AN_ITERATION = 4.0
 """Tuned: camera paths that cost as much as an iteration of photons, for each that it has itself.
-1.5 to 4.5 were measured. The most counts: where both are close, camera paths are the safer."""
+1.5 to 4.5 were measured, and 1.8 to 4.5 for a denoiser. The most counts: where both are close,
+camera paths are the safer."""
 
 
 def choose(integrator, scene, sensor, seed, iterations, seconds):
@@ -68,8 +69,7 @@ def new_session(plugin, integrator, scene, sensor, seed, iterations):
         "type": plugin,
         **handed_on(integrator),
         "aovs": written(integrator.layers),
-        **CANDIDATES[plugin],
-        **(FOR_DENOISERS.get(plugin, {}) if integrator.denoised else {}),
+        **own_parameters(CANDIDATES, plugin, integrator),
     }
     if iterations or plugin == PHOTONS:
         parameters["camera_paths"] = integrator.initial_camera_paths

@@ -86,7 +86,7 @@ class SubsetPasses:
         dr.scatter_reduce(
             dr.ReduceOp.Add,
             total,
-            channel_mean(light.value),
+            channel_mean(light.value * spectral["sensor_weight"]),
             place.x + place.y * film_size(sensor)[0],
             light.active,
         )
@@ -100,7 +100,8 @@ class SubsetPasses:
             self._record_gather()
         sequence = session._sequence(number, self.purpose, self.pixels.camera_paths)
         radiance, vertices = self._trace_camera(sequence, spectral)
-        return SubsetIteration(self, photons, vertices, radiance, sequence.own_seed(), spectral)
+        seed = sequence.own_seed()
+        return SubsetIteration(self, number, photons, vertices, radiance, seed, spectral)
 
     def _trace_camera(self, sequence, spectral):
         """Radiance and vertices of the camera paths. Where the vertices overflow their buffer, it
@@ -159,12 +160,14 @@ class SubsetPasses:
                 points = Points.of(self.session.traits, record, wavelengths)
                 return mean_count_in_balls(photon_map, points, radius)
             beams = Beams.read(vertices["beams"], wavelengths)
-            return mean_count_along(photon_map, beams, radius, self.pixels.paths)
+            zone = self.session.near_zone
+            return mean_count_along(photon_map, beams, radius, self.pixels.paths, zone)
         return mean_photon_count(photon_map, read_queries(vertices), radius)
 
-    def joined(self, photons, seed, spectral):
+    def joined(self, number, photons, spectral):
         """Light of the photons that are joined with the sensor: (groups, pixels)."""
         session, pixels = self.session, self.pixels
+        seed = session.sensor_seed(number)
         light = self._join(
             session.scene, session.sensor, session._tables, photons[-1], seed, spectral
         )
@@ -185,6 +188,7 @@ class SubsetIteration(NamedTuple):
     """Photons and camera paths of one iteration of `SubsetPasses` (`pilot.run.PilotIteration`)."""
 
     passes: SubsetPasses
+    number: int
     photons: tuple
     vertices: dict
     radiance: mi.Spectrum
@@ -207,7 +211,7 @@ class SubsetIteration(NamedTuple):
         return self.passes.gather(self.photons, self.vertices, radii, self.seed, self.spectral)
 
     def joined(self):
-        return self.passes.joined(self.photons, self.seed, self.spectral)
+        return self.passes.joined(self.number, self.photons, self.spectral)
 
     def direct(self):
         return self.passes.by_pixel(channel_mean(self.radiance))

@@ -34,12 +34,16 @@ class RayCones:
         """A cone: its width, and its spread, which the first segment tells."""
         return [mi.Float(self.width), mi.Float(0)]
 
+    def grown(self, cone, d, distance, first, active):
+        """The cone so much further in direction `d`; `first`: along a path's first segment."""
+        width, spread = cone
+        cosine = dr.abs(dr.dot(d, self.axis))
+        spread = dr.select(first, self.spread * _falling_off(cosine), spread)
+        return [dr.select(active, width + spread * distance, width), spread]
+
     def arrived(self, cone, at, active):
         """The cone at what it has met (a `CameraArrival`)."""
-        width, spread = cone
-        cosine = dr.abs(dr.dot(at.ray.d, self.axis))
-        spread = dr.select(at.depth == 1, self.spread * _falling_off(cosine), spread)
-        return [dr.select(active, width + spread * at.si.t, width), spread]
+        return self.grown(cone, at.ray.d, at.si.t, at.depth == 1, active)
 
 
 def cones_of(sensor):

@@ -16,6 +16,7 @@ A comprehensive theory of volumetric radiance estimation using photon points and
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import drjit as dr
@@ -210,7 +211,10 @@ class BeamQuery(Query):
         most = self.grid.table.longest - 4
         first_x, last_x = dr.clip(first_x + 2, 0, most), dr.clip(last_x + 2, -1, most)
         near = (begin <= end) & (row <= last) & (last_x >= first_x)
-        base = self.grid.row(*self._row(slab, row))
+        y, z = self._row(slab, row)
+        # Rows outside of the box hold nothing, and would have the numbers of others inside.
+        near &= mi.UInt32(y) < self.grid.lines
+        base = self.grid.row(y, z)
         start = self.photon_map.start
         return (
             dr.gather(mi.UInt32, start, base + mi.UInt32(first_x), near),
@@ -307,9 +311,12 @@ def gather_along(
     ]
 
 
-def mean_count_along(photon_map, beams, radius, paths):
+def mean_count_along(photon_map, beams, radius, paths, near_zone=None):
     """Photons within `radius` of the beams of a camera path that a query has to look at, on average
-    over `paths` of them (a number)."""
+    over `paths` of them (a number). Where there is a `near_zone`, first segments have another
+    radius, and do not count."""
+    if near_zone is not None:
+        beams = dataclasses.replace(beams, active=beams.active & (beams.depth > 1))
     query = BeamQuery(photon_map, beams, radius)
     (count,) = visit_hits(
         query,

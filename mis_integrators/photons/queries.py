@@ -221,6 +221,7 @@ class QueryVisitor:
 
     def travel(self, state, ray, flight, numbers, throughput, path, depth, active):
         *others, clear = state
+        o = mi.Point3f(ray.o)
         brought = throughput
         if self.queries.near_zone is not None:
             kept = numbers.at(BEAM + depth).next_float32() < BEAMS_KEPT
@@ -240,11 +241,15 @@ class QueryVisitor:
             hit, ray, flight, kept = next_hit_straight_on(
                 self.scene, self.traits, ray, flight, numbers, keep, active
             )
+        if self.queries.cones is not None:  # boundaries have been passed on the way
+            *others, cone = others
+            passed = dr.norm(ray.o - o)
+            others += [self.queries.cones.grown(cone, ray.d, passed, depth == 0, active)]
         return [*others, [clear[0] * kept]], hit, ray, flight, throughput * kept
 
     def _keep_beams(self, state, throughput, path, depth, kind):
         """What keeps the beams of paths (see `pass_straight`, `fly`): long ones after `bdd` smooth
-        vertices, short ones before."""
+        vertices, short ones before; with a near zone also long ones before the first vertex."""
         if not self.queries.beams:
             return lambda *piece: None
         vertex, *_, sums, history, _, _ = state
@@ -447,7 +452,8 @@ class QueryVisitor:
         return state, weight, active
 
     def cross(self, before, after, crosses):
-        return selected(crosses, before, after)
+        *left, _, clear = before
+        return selected(crosses, [*left, after[-2], clear], after)
 
     def alpha(self, state, visible):
         if not self.traits.has_media:

@@ -234,7 +234,7 @@ class PilotResult:
                 for kind, radius in choice.radii.items()
                 if kind in self._met
             ),
-            default=1.0,
+            default=iteration_cost(0.0, False, self.setting.camera_paths, choice.light_share),
         )
 
 

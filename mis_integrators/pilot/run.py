@@ -85,7 +85,7 @@ def run_pilot(setting: PilotSetting, pixels: PilotPixels, passes: PilotPasses) -
     passes
         They trace those pixels, and gather all kinds and corrections of the setting.
     """
-    radii: dict[str, np.ndarray] | None = None
+    radii: dict[str, np.ndarray] = {}
     photons: dict[str, float] = {}
     gathered: list[dict[tuple[str, bool], np.ndarray]] = []
     direct: list[np.ndarray] = []
@@ -94,7 +94,7 @@ def run_pilot(setting: PilotSetting, pixels: PilotPixels, passes: PilotPasses) -
     for done in range(1, MOST_ITERATIONS + 1):
         start = time.perf_counter()
         iteration = passes.trace(PILOT_INDEX + done - 1)
-        if radii is None:
+        if done == 1:
             radii, photons = choose_ladder(setting, iteration)
         if radii or setting.joins_sensor:
             gathered.append(iteration.gather(radii))
@@ -111,7 +111,7 @@ def run_pilot(setting: PilotSetting, pixels: PilotPixels, passes: PilotPasses) -
         estimates = {key: np.array([step[key] for step in gathered]) for key in gathered[0]}
         of_photons = np.array(joined) if joined else None
         samples = PilotSamples(
-            radii or {}, photons, estimates, np.array(direct), passes.seen(), of_photons
+            radii, photons, estimates, np.array(direct), passes.seen(), of_photons
         )
     return measure(setting, pixels, samples, seconds)
 

@@ -30,8 +30,9 @@ def sensor_of(kind="perspective", size=SIZE, fov=50):
     return {"type": kind, "film": film, "to_world": to_world, "fov": fov}
 
 
-def caustic_scene(**sensor):
-    """A floor lit by nothing but what a mirror above the camera throws back: a spot of light."""
+def caustic_scene(fog=None, leaf=None, **sensor):
+    """A floor lit by nothing but what a mirror above the camera throws back: a spot of light. There
+    may be a `fog` and a `leaf` in between."""
     transform = mi.ScalarTransform4f
     return mi.load_dict(
         {
@@ -49,6 +50,8 @@ def caustic_scene(**sensor):
                 "intensity": 1000.0,
             },
             "sensor": sensor_of(**sensor),
+            **({"fog": fog} if fog else {}),
+            **({"leaf": leaf} if leaf else {}),
         }
     )
 
@@ -98,6 +101,30 @@ def test_cones_are_as_wide_as_pixels(kind):
         across, down = points[1] - points[0], points[3] - points[2]
         area = np.linalg.norm(np.cross(across.T, down.T), axis=1)
         np.testing.assert_allclose(np.array(cone[0] + 0 * x), np.sqrt(area), rtol=0.01)
+
+
+def test_widths_grow_through_boundaries():
+    """Those of media, and masks that are passed: widths are as without them."""
+    null = {"type": "cube", "to_world": mi.ScalarTransform4f().scale([9, 9, 4])}
+    null |= {"bsdf": {"type": "null"}, "interior": {"type": "homogeneous", "sigma_t": 0.02}}
+    mask = {"type": "mask", "opacity": 0.3, "nested": {"type": "diffuse"}}
+    up = mi.ScalarTransform4f().translate([0, 0, 6]).scale(9)
+    leaf = {"type": "rectangle", "to_world": up, "bsdf": mask}
+    for more in ({}, {"leaf": leaf}):
+        scene = caustic_scene(fog=null, **more)
+        session = session_of(scene, 1000, max_depth=6)
+        setting = session.pilot_setting()
+        record = read_queries(
+            session.pilot_passes(setting, pilot_pixels(setting)).trace(0).vertices
+        )
+        p = np.array(record["ray_o"] + record["ray_d"] * record["hit"].t)
+        on_floor = (np.array(record["throughput"])[0] > 0) & (np.abs(p[2]) < 1e-3)
+        on_floor &= np.array(record["pixel"]) > 0
+        width = np.array(record["pixel"])[on_floor]
+        cosine = FAR / np.linalg.norm(p[:, on_floor] - [[0], [0], [FAR]], axis=0)
+        along = 2 * np.tan(np.radians(25)) / SIZE * FAR / cosine * cosine * np.sqrt(cosine)
+        assert len(width) > 50
+        np.testing.assert_allclose(width, along, rtol=2e-3)
 
 
 def test_widths_belong_to_vertices_that_the_camera_sees():

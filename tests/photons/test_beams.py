@@ -133,6 +133,22 @@ def test_beams_find_what_brute_force_finds(rgb, kind, radius, length):
     assert np.mean(close) > 0.995 and abs(found.sum() / right.sum() - 1) < 1e-3
 
 
+def test_photons_of_a_flat_medium_count_once(rgb):
+    """In a layer thinner than the radius, with cells of a tenth of that: rows that lie outside of
+    the box have the places of others."""
+    rng = np.random.default_rng(5)
+    _scene, medium, _ = media()
+    points = rng.uniform([0, 0, 0], [4, 0.1, 4], (20000, 3)).astype(np.float32).astype(float)
+    built = photon_map(points, np.ones(20000), medium, 0.01)
+    o = rng.uniform([0, -0.1, 0], [4, 0.2, 4], (300, 3)).astype(np.float32).astype(float)
+    d = directions(rng, "anywhere", 300).astype(np.float32).astype(float)
+    those = beams(o, d, np.full(300, 1.0), medium)
+    (found,) = gather_along(built, those, [mi.Float(0.2)], 1, -1, grey=True)
+    right, _ = expected(points, np.ones(20000), o, d, np.full(300, 1.0), 0.2)
+    np.testing.assert_allclose(np.array(found), right, rtol=0.05, atol=1e-2 * right.mean())
+    assert np.sum(found) == pytest.approx(right.sum(), rel=1e-3)
+
+
 def test_several_radii_are_those_of_each(rgb):
     rng = np.random.default_rng(3)
     _scene, medium, _ = media()
