@@ -83,6 +83,13 @@ def splat_channels(film, position, channels, active):
     return block.tensor()
 
 
+def splat_light(film, position, spectra, matrix, active, more=()):
+    """Image tensor, as of `splat_channels`, of light that is joined with the sensor: three channels
+    for each of the `spectra` (its whole, and its classes), by a `colour_matrix`, then `more`."""
+    colours = [channel for light in spectra for channel in colour_channels(light, matrix)]
+    return splat_channels(film, position, [*colours, *more], active)
+
+
 def expected_weight(film, camera_paths, in_crop=False):
     """Expected sum of filter weights that `camera_paths` samples a pixel leave in each pixel of a
     block, border included: a tensor (height, width, 1). `in_crop`: no samples count that a film may

@@ -7,14 +7,7 @@ import math
 import drjit as dr
 import mitsuba as mi
 
-from ..core.film import (
-    as_camera_weights,
-    colour_channels,
-    expected_weight,
-    splat_channels,
-    splat_samples,
-    with_colour,
-)
+from ..core.film import as_camera_weights, expected_weight, splat_light, splat_samples, with_colour
 from ..core.packing import with_reserve
 from ..core.recording import recorder
 from ..core.traits import SceneTraits, lookup
@@ -155,9 +148,8 @@ class BDPM(IterativeIntegrator):
     the first smooth surface then.
 
     The estimate is consistent: its bias vanishes with the radius (but for that of photons very
-    close to the sensor). Polarised variants, gradients and
-    the film ``specfilm`` are refused by name; in media also phase functions of flakes and
-    ``hide_emitters``.
+    close to the sensor). Polarised variants, gradients and the film ``specfilm`` are refused by
+    name; in media also phase functions of flakes and ``hide_emitters``.
 
     .. tabs::
         .. code-tab:: xml
@@ -569,8 +561,7 @@ class BDPMSession(PilotedSession):
             )
             parts += classes[: self.integrator.kept_classes]
         matrix = spectral["sensor_matrix"]
-        channels = [channel for part in parts for channel in colour_channels(part, matrix)]
-        return splat_channels(sensor.film(), light.film, channels, light.active)
+        return splat_light(sensor.film(), light.film, parts, matrix, light.active)
 
     def _gather(self, photon_map, vertices, kind, radii, spectral, grey=False):
         """What photons of one kind bring to each vertex, volume photons to each beam, for each

@@ -9,9 +9,9 @@ import mitsuba as mi
 
 from ..core.film import (
     as_camera_weights,
-    colour_channels,
     expected_weight,
     splat_channels,
+    splat_light,
     splat_samples,
     with_colour,
 )
@@ -301,18 +301,15 @@ class BDPTSession(IterativeSession):
             rng,
         )
         value = joined.value * (self.pixel_paths / self.light_path_count)
-        share = self.weights(spectral).seen_by_sensor(joined, y)
-        channels = list(colour_channels(value * share, spectral["sensor_matrix"]))
+        share, matrix = self.weights(spectral).seen_by_sensor(joined, y), spectral["sensor_matrix"]
+        spectra, techniques = [value * share], []
         if self.integrator.splits_light:
             smooth = dr.select(y["depth"] == 1, mi.UInt32(1), mi.UInt32(2))
-            for light in by_class(class_of(smooth, y["mark"]), value * share):
-                channels.extend(colour_channels(light, spectral["sensor_matrix"]))
+            spectra += by_class(class_of(smooth, y["mark"]), value * share)
         if self.integrator.techniques:
             value = value * share if self.integrator.technique_weights else value
-            channels += sensor_images(
-                self.integrator.techniques, y["depth"], value, spectral["sensor_matrix"]
-            )
-        return splat_channels(sensor.film(), joined.film, channels, joined.active)
+            techniques = sensor_images(self.integrator.techniques, y["depth"], value, matrix)
+        return splat_light(sensor.film(), joined.film, spectra, matrix, joined.active, techniques)
 
     def _splat(self, radiance, alpha, position, first, spectral, entries):
         """Block of the camera paths, and that of their techniques (or None)."""

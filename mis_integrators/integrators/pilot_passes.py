@@ -12,7 +12,7 @@ import numpy as np
 
 from ..core.recording import lanes
 from ..core.spectra import channel_mean
-from ..paths.camera import border_size, film_sample_count, film_size
+from ..paths.camera import film_sample_count, pixel_at
 from ..photons.beams import Beams, mean_count_along
 from ..photons.gather import mean_photon_count
 from ..photons.points import Points, mean_count_in_balls, read_points
@@ -79,15 +79,12 @@ class SubsetPasses:
     def _joined_light(self, scene, sensor, tables, in_media, seed, spectral):
         """Light of volume photons joined with the sensor, mean over the channels, one a pixel."""
         light = self.session._join_sensor(sensor, in_media, seed, spectral)
-        film = sensor.film()
-        corner = mi.ScalarVector2f(film.crop_offset()) - border_size(film)
-        place = mi.Point2u(dr.floor(light.film - corner))
         total = dr.zeros(mi.Float, film_sample_count(sensor))
         dr.scatter_reduce(
             dr.ReduceOp.Add,
             total,
             channel_mean(light.value * spectral["sensor_weight"]),
-            place.x + place.y * film_size(sensor)[0],
+            pixel_at(sensor, light.film),
             light.active,
         )
         return total

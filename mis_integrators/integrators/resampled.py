@@ -11,9 +11,8 @@ import numpy as np
 
 from ..core.film import (
     as_camera_weights,
-    colour_channels,
     expected_weight,
-    splat_channels,
+    splat_light,
     splat_samples,
     with_colour,
 )
@@ -664,12 +663,12 @@ class ResampledSession(IterativeSession):
             rng,
         )
         value = joined.value * (self.weights(spectral).seen_by_sensor(joined, y) / self.ratio)
-        channels = list(colour_channels(value, spectral["sensor_matrix"]))
+        spectra = [value]
         if self.integrator.splits_light:
             smooth = dr.select(y["depth"] == 1, mi.UInt32(1), mi.UInt32(2))
-            for part in by_class(class_of(smooth, y["mark"]), value):
-                channels.extend(colour_channels(part, spectral["sensor_matrix"]))
-        return splat_channels(sensor.film(), joined.film, channels, joined.active)
+            spectra += by_class(class_of(smooth, y["mark"]), value)
+        matrix = spectral["sensor_matrix"]
+        return splat_light(sensor.film(), joined.film, spectra, matrix, joined.active)
 
     # ------------------------------------------------------------------ before the first iteration
 

@@ -37,6 +37,14 @@ def film_samples(sensor, pixel, rng):
     return mi.Point2f(unit), mi.Point2f(splat)
 
 
+def pixel_at(sensor, splat):
+    """Number of the pixel, as of `film_samples`, at a position for splatting."""
+    film = sensor.film()
+    corner = mi.ScalarVector2f(film.crop_offset()) - border_size(film)
+    place = mi.Point2u(dr.floor(splat - corner))
+    return place.x + place.y * film_size(sensor)[0]
+
+
 def film_size(sensor):
     """Width and height, in pixels, of what camera paths are sent through: the crop window, with its
     border where the film samples it."""

@@ -16,8 +16,7 @@ A comprehensive theory of volumetric radiance estimation using photon points and
 
 from __future__ import annotations
 
-import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -316,7 +315,7 @@ def mean_count_along(photon_map, beams, radius, paths, near_zone=None):
     over `paths` of them (a number). Where there is a `near_zone`, first segments have another
     radius, and do not count."""
     if near_zone is not None:
-        beams = dataclasses.replace(beams, active=beams.active & (beams.depth > 1))
+        beams = replace(beams, active=beams.active & (beams.depth > 1))
     query = BeamQuery(photon_map, beams, radius)
     (count,) = visit_hits(
         query,

@@ -13,7 +13,6 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.spectra import channel_mean
-from ..paths.camera_rays import axis_of
 from .volume import place_layout
 from .volume_radii import weighted_median
 
@@ -33,7 +32,7 @@ class NearZone:
         sensor = lens.sensor
         self.lens = lens
         self.origin = mi.Point3f(sensor.world_transform() @ mi.Point3f(0))
-        self.axis = mi.Vector3f(axis_of(sensor))
+        self.axis = mi.Vector3f(lens.axis)
         dr.make_opaque(self.origin, self.axis)
         self._set(0.0)
 

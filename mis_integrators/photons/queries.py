@@ -221,11 +221,11 @@ class QueryVisitor:
 
     def travel(self, state, ray, flight, numbers, throughput, path, depth, active):
         *others, clear = state
-        o = mi.Point3f(ray.o)
         brought = throughput
         if self.queries.near_zone is not None:
             kept = numbers.at(BEAM + depth).next_float32() < BEAMS_KEPT
             brought = dr.select(depth == 0, throughput, dr.select(kept, throughput / BEAMS_KEPT, 0))
+        begun = mi.Point3f(ray.o)
         keep = self._keep_beams(state, brought, path, depth + 1, LONG)
         if self.flies:
             keep_short = None
@@ -243,7 +243,7 @@ class QueryVisitor:
             )
         if self.queries.cones is not None:  # boundaries have been passed on the way
             *others, cone = others
-            passed = dr.norm(ray.o - o)
+            passed = dr.norm(ray.o - begun)
             others += [self.queries.cones.grown(cone, ray.d, passed, depth == 0, active)]
         return [*others, [clear[0] * kept]], hit, ray, flight, throughput * kept
 

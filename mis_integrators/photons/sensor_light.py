@@ -69,7 +69,7 @@ def join_photons(world, lens, zone, photons, seed, wavelengths, max_depth, marke
     delta_at_light = mi.Bool(False)
     if marked:
         flux, delta_at_light = read_mark(flux)
-    medium = medium_of(record, active)
+    medium = medium_of(dr.select(active, landing.medium, 0))
     sides = Sides(medium, medium, landing.p, wavelengths)
     phase, _, _ = phase_f_and_pdfs(sides, d, dr.normalize(towards), active)
     active &= dr.max(phase) > 0

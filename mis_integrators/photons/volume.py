@@ -56,6 +56,11 @@ def number_of_medium(medium):
     return dr.reinterpret_array(mi.UInt32, medium) & MOST_MEDIA
 
 
+def medium_of(number):
+    """The medium of a number, as of `number_of_medium`."""
+    return dr.reinterpret_array(mi.MediumPtr, number)
+
+
 @dataclass
 class VolumeLanding:
     """Where a volume photon was left: position, depth in segments, number of the medium, kind; and
@@ -79,12 +84,6 @@ def landing_of(record):
     medium = (word >> MEDIUM_SHIFT) & MOST_MEDIA
     share = dr.exp2(mi.Float(word >> SHARE_SHIFT) * (-1 / SHARE_STEPS))
     return VolumeLanding(record["p"], word & MAX_DEPTH, medium, (word & CAUSTIC) != 0, share)
-
-
-def medium_of(record, active):
-    """The medium that the photon of a record of `place_layout` lies in."""
-    number = dr.select(active, (record["word"] >> MEDIUM_SHIFT) & MOST_MEDIA, mi.UInt32(0))
-    return dr.reinterpret_array(mi.MediumPtr, number)
 
 
 def read_places(place, count):

@@ -44,12 +44,12 @@ class VolumeDensity:
         record, active = read_places(place, count)
         p, flux = record["p"], flux_of(power, active)
         finest = largest / 2 ** (GRIDS - 1)
-        cells = LightCells.empty(finest, quantum_of(power, count), int(count[0]))
+        photons = int(count[0])
+        cells = LightCells.empty(finest, quantum_of(power, count), photons)
         cells.add(p, flux, active)
         light = dr.select(active, flux, 0)
         median = weighted_median(np.array(density_in(cells, p, flux, active)), np.array(light))
-        photons = max(int(count[0]), 1)
-        return cls(cells, dr.opaque(mi.Float, median), dr.opaque(mi.Float, photons))
+        return cls(cells, dr.opaque(mi.Float, median), dr.opaque(mi.Float, max(photons, 1)))
 
     def median_of(self, count):
         """The median density of so many photons of the same light; not zero."""

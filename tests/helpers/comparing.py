@@ -262,6 +262,11 @@ def pictures(session, count):
         before = total
 
 
+def grey_pictures(session, count):
+    """`pictures`, mean over the colours: (count, H, W)."""
+    return np.array([picture[..., :3].mean(axis=2) for picture in pictures(session, count)])
+
+
 def kernels_of(run, operations=0):
     """Hashes of the kernels, of more than so many operations, that `run()` launches."""
     dr.kernel_history_clear()

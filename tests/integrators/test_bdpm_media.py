@@ -65,8 +65,10 @@ class SmallRadiusBatches:
         return bdpm(initial_radius=radius, **parameters).session(scene, seed=1, spp=0)
 
     def add(self, count):
+        colours = 1 if mi.is_monochromatic else 3  # further channels are those for a denoiser
         for wide, narrow in zip(*(pictures(session, count) for session in self.sessions)):
-            self.batches.append(block_means(2 * narrow[:, :, :3] - wide[:, :, :3], self.blocks))
+            image = 2 * narrow[:, :, :colours] - wide[:, :, :colours]
+            self.batches.append(block_means(image, self.blocks))
 
     def estimate(self):
         return Estimate.of(self.batches)

@@ -23,7 +23,7 @@ import medium_sphere
 import mitsuba as mi
 import numpy as np
 import pytest
-from comparing import PathBatches, assert_same, collect_until, in_one_thread, pictures
+from comparing import PathBatches, assert_same, collect_until, grey_pictures, in_one_thread
 from foggy import volpath
 from selection import extended, one_in_each_row
 from test_balance_media import COUNT, NEAR, JointPaths, room
@@ -269,7 +269,7 @@ def test_agrees_beyond_the_first_vertex(variant_name):
 def noise_of(integrator, scene, count=40):
     """Relative variance of an iteration: the mean over pixels, and the median."""
     session = integrator.session(scene, seed=5, spp=0)
-    images = np.array([picture[:, :, :3].mean(axis=2) for picture in pictures(session, count)])
+    images = grey_pictures(session, count)
     variance = images.var(axis=0, ddof=1)
     return variance.mean() / images.mean() ** 2, np.median(variance / images.mean(axis=0) ** 2)
 

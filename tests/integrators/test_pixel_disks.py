@@ -9,7 +9,7 @@ from mis_integrators.pilot.setting import APART, pilot_pixels
 import mitsuba as mi
 import numpy as np
 import pytest
-from comparing import pictures
+from comparing import grey_pictures
 from pilots import learned
 
 SIZE = 24
@@ -66,11 +66,6 @@ def session_of(scene, photons, iterations=1e6, radii=None, **parameters):
     return session
 
 
-def iterations_of(session, count):
-    """The image of so many iterations, each alone, mean over the channels: (count, H, W)."""
-    return np.array([picture[..., :3].mean(axis=2) for picture in pictures(session, count)])
-
-
 @pytest.mark.parametrize("kind", ["perspective", "orthographic"])
 def test_cones_are_as_wide_as_pixels(kind):
     """Width squared is the area that a pixel has across its ray, here by the rays through two
@@ -122,9 +117,9 @@ def test_widths_grow_through_boundaries():
         on_floor &= np.array(record["pixel"]) > 0
         width = np.array(record["pixel"])[on_floor]
         cosine = FAR / np.linalg.norm(p[:, on_floor] - [[0], [0], [FAR]], axis=0)
-        along = 2 * np.tan(np.radians(25)) / SIZE * FAR / cosine * cosine * np.sqrt(cosine)
         assert len(width) > 50
-        np.testing.assert_allclose(width, along, rtol=2e-3)
+        in_middle = 2 * np.tan(np.radians(25)) / SIZE * FAR
+        np.testing.assert_allclose(width, in_middle * np.sqrt(cosine), rtol=2e-3)
 
 
 def test_widths_belong_to_vertices_that_the_camera_sees():
@@ -159,7 +154,7 @@ def test_near_pixels_share_no_noise():
         ("small", small),
         ("wide", session_of(scene, 24000, denoised=False, initial_radius=1.5)),
     ):
-        images = iterations_of(session, 200)[:, 6:18, 6:18]
+        images = grey_pictures(session, 200)[:, 6:18, 6:18]
         noise = images - images.mean(axis=0)
         alike = (noise[..., 1:] * noise[..., :-1]).mean() / (noise**2).mean()
         blocks = images.reshape(-1, 6, 2, 6, 2).mean(axis=(2, 4))
@@ -180,7 +175,7 @@ def test_light_counts_once():
     for parameters in ({}, {"denoised": False, "initial_radius": 0.5}):
         session = session_of(scene, 4000, bdd=1, max_depth=5, **parameters)
         assert ("seen_caustic" in session.kinds()) is (not parameters)
-        sums.append(iterations_of(session, 100).mean(axis=(1, 2)))
+        sums.append(grey_pictures(session, 100).mean(axis=(1, 2)))
     error = np.sqrt(sum(np.var(s, ddof=1) / len(s) for s in sums))
     assert abs(sums[0].mean() - sums[1].mean()) < 4.9 * error
     assert error < 0.02 * sums[0].mean()
@@ -198,7 +193,7 @@ def test_disks_are_no_wider_than_the_map_is_for():
         denoised=False,
         initial_radius=radius,
     )
-    one, other = (iterations_of(session, 2) for session in (far, given))
+    one, other = (grey_pictures(session, 2) for session in (far, given))
     assert one.max() > 0
     np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-5 * one.max())
 
@@ -208,7 +203,7 @@ def test_sparse_photons_keep_wide_disks():
     scene, radii = caustic_scene(), {"seen_caustic": 0.5, "indirect": 1.0}
     short = session_of(scene, 300, iterations=4.0, radii=radii)
     long = session_of(scene, 300, iterations=1e6, radii=radii)
-    dark = [np.mean(iterations_of(session, 4).mean(axis=0) == 0) for session in (short, long)]
+    dark = [np.mean(grey_pictures(session, 4).mean(axis=0) == 0) for session in (short, long)]
     assert dark[0] < 0.1 and dark[1] > 0.4
 
 
@@ -270,7 +265,7 @@ def test_the_pilot_counts_little_of_their_noise():
     ).session(scene, seed=3, spp=64)
     session.start()
     assert session.prediction.caustic_share > 0.9
-    images = iterations_of(session, 32)
+    images = grey_pictures(session, 32)
     weights = 1 / (images.mean() ** 2 * 1.1)
     inner = images[:, 4:20, 4:20]
     measured = LEFT * (inner.var(axis=0, ddof=1) * weights).mean()

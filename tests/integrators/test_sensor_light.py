@@ -12,7 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from comparing import PathBatches, assert_same, block_means, collect_until, pictures
+from comparing import PathBatches, assert_same, collect_until, grey_pictures
 from foggy import view, volpath
 from pilots import learned
 from selection import extended, one_in_each_row
@@ -41,23 +41,12 @@ class JoinedBatches(SmallRadiusBatches):
     def session(self, scene, radius, parameters):
         return joined(scene, radius, **parameters)
 
-    def add(self, count):
-        colours = 1 if mi.is_monochromatic else 3  # further channels are those for the denoiser
-        for wide, narrow in zip(*(pictures(session, count) for session in self.sessions)):
-            image = 2 * narrow[:, :, :colours] - wide[:, :, :colours]
-            self.batches.append(block_means(image, self.blocks))
-
 
 def agree(scene, max_depth=6, whole=0.02, block=0.06, **parameters):
     parameters = {"camera_paths": 16, **parameters}
     mine = JoinedBatches(scene, 2, max_depth=max_depth, **parameters)
     oracle = PathBatches(volpath(max_depth=max_depth), scene, 2, 512)
     assert_same(*collect_until(mine, oracle, whole, block, most=600), whole, block, slack=SLACK)
-
-
-def greys(session, count):
-    """The images of so many iterations, each alone, mean over the channels: (count, H, W)."""
-    return np.array([picture[..., :3].mean(axis=2) for picture in pictures(session, count)])
 
 
 # --- Means ----------------------------------------------------------------------------------------
@@ -150,7 +139,7 @@ def test_what_the_zone_brings_is_what_joined_photons_bring():
         session.volume_density()
         session.near_zone._set(depth)
         session._list_tables()
-        images.append(greys(session, 100).mean(axis=(1, 2)))
+        images.append(grey_pictures(session, 100).mean(axis=(1, 2)))
     assert float(session.near_zone.depth[0]) == 0.5
     difference = images[1] - images[0]
     error = difference.std(ddof=1) / np.sqrt(len(difference))
@@ -218,7 +207,7 @@ def test_near_pixels_share_no_noise():
         session = mi.load_dict(plugin).session(thin_fog(), seed=1, spp=0)
         if not parameters:
             session.recall(learned(session, 0.25))
-        images = greys(session, 100)[:, 2:14, 2:14]
+        images = grey_pictures(session, 100)[:, 2:14, 2:14]
         noise = images / images.mean(axis=0) - 1
         alike.append((noise[..., 1:] * noise[..., :-1]).mean() / (noise**2).mean())
     assert alike[0] < 0.1 and alike[1] > 0.5
@@ -234,7 +223,7 @@ def test_photons_close_to_the_sensor_are_no_dots(monkeypatch):
     for depth in (near_zone.DEPTH, 0.0):
         monkeypatch.setattr(near_zone, "DEPTH", depth)
         session = joined(scene, photon_count=200000)
-        images = greys(session, 50)
+        images = grey_pictures(session, 50)
         zone = float(session.near_zone.depth[0])
         assert 0.06 < zone < 0.3 if depth else zone == 0
         # Of single iterations: of a thousand pixels the brightest.
@@ -281,7 +270,7 @@ def test_the_pilot_counts_little_of_their_noise(variant_name):
     pixels = pilot_pixels(setting)
     pilot = run_pilot(setting, pixels, session.pilot_passes(setting, pixels))
     session.start()
-    images = greys(session, 64)
+    images = grey_pictures(session, 64)
     weights = 1 / (images.mean(axis=0) ** 2 + 0.1 * np.mean(images) ** 2)
     measured = LEFT * (images.var(axis=0, ddof=1) * weights).mean()
     assert 0.5 * measured < pilot.joined["relmse"] < 2 * measured
