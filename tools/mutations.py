@@ -681,13 +681,6 @@ MUTATIONS = [
         f"{SENSOR_LIGHT}::test_photons_close_to_the_sensor_are_no_dots",
     ),
     Mutation(
-        "photons/sensor_light.py",
-        "landing.depth + 1 <= max_depth",
-        "landing.depth <= max_depth",
-        "photons joined with the sensor have a segment too many",
-        f"{SENSOR_LIGHT}::test_depth_is_that_of_volpath",
-    ),
-    Mutation(
         "photons/queries.py",
         "            wanted |= vertex == 0\n",
         "",

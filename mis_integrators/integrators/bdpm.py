@@ -540,7 +540,6 @@ class BDPMSession(PilotedSession):
             in_media[:3],
             seed,
             spectral["wavelengths"],
-            self.integrator.max_depth,
             self.integrator.splits_light,
         )
         width, height = sensor.film().crop_size()

@@ -38,8 +38,9 @@ class SensorLight:
     active: mi.Bool
 
 
-def join_photons(world, lens, zone, photons, seed, wavelengths, max_depth, marked):
-    """The `SensorLight` of the volume photons outside of the near `zone` (a `NearZone`).
+def join_photons(world, lens, zone, photons, seed, wavelengths, marked):
+    """The `SensorLight` of the volume photons outside of the near `zone` (a `NearZone`). Light
+    sub-paths leave none from where the sensor would be a segment too far.
 
     Parameters
     ----------
@@ -49,8 +50,6 @@ def join_photons(world, lens, zone, photons, seed, wavelengths, max_depth, marke
         As `trace_light_paths` returns them: places, powers, and their number.
     seed
         Of the random numbers, uint32.
-    max_depth
-        Segments of the longest path (negative: unlimited).
     marked
         Whether fluxes have marks.
     """
@@ -58,8 +57,6 @@ def join_photons(world, lens, zone, photons, seed, wavelengths, max_depth, marke
     record, active = read_places(place, count)
     landing = landing_of(record)
     active &= ~zone.holds(landing.p)
-    if max_depth > 0:
-        active &= landing.depth + 1 <= max_depth
     index = lanes(dr.width(record["word"]))
     rng = vertex_streams(index, mi.UInt32(0), seed)
     aperture = next_2d(rng) if lens.sensor.needs_aperture_sample() else mi.Point2f(0.5)
