@@ -61,7 +61,7 @@ def run_tests(
     copy: Path, tests: Sequence[str], selection: str, limit: float | None
 ) -> tuple[str, str]:
     """Runs tests in a copy until the first fails: the verdict, and what pytest wrote."""
-    command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider"]
+    command = [sys.executable, "-m", "pytest", "-x", "-q", "-rf", "-p", "no:cacheprovider"]
     process = subprocess.Popen(
         [*command, *SELECTIONS[selection], *tests],
         cwd=copy,
