@@ -339,8 +339,8 @@ MUTATIONS = [
     ),
     Mutation(
         "photons/beams.py",
-        "dr.select(i, value / share, 0)",
-        "dr.select(i, value, 0)",
+        "sums.add(totals, value / share, inside",
+        "sums.add(totals, value, inside",
         "photons of small disks bring too little light",
         VOLUME_RADII,
     ),

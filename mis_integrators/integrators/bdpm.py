@@ -19,12 +19,11 @@ from ..paths.lobes import is_narrow, narrow_bsdfs
 from ..paths.ray_cones import cones_of
 from ..paths.sensor import Lens
 from ..paths.setting import World
-from ..photons.beams import Beams, gather_along, read_beams
+from ..photons.beams import Beams, gather_along, mean_count_along, read_beams
 from ..photons.coverage import covered_share
-from ..photons.gather import QueryVertices, gather_photons
+from ..photons.gather import QueryVertices, gather_photons, mean_photon_count
 from ..photons.grid import PhotonMap, build_photon_map
 from ..photons.near_zone import NearZone
-from ..photons.points import read_points
 from ..photons.queries import (
     Queries,
     pixel_disk,
@@ -611,26 +610,32 @@ class BDPMSession(PilotedSession):
             probed &= lookup(self.traits.lambertian, bsdf, mi.Bool, probed)
         return dr.select(probed, covered_share(scene, record, radius, seed, probed), 1)
 
+    def _records(self, vertices, kind):
+        """What gathers photons of a kind, a dictionary of fields: vertices, or beams."""
+        return read_beams(vertices["beams"]) if kind == "volume" else read_queries(vertices)
+
     def _per_path(self, values, vertices, kind, paths):
-        """Sums values of the vertices, or beams, for each of `paths` camera paths."""
-        if kind == "volume" and self.points:
-            vertices = read_points(vertices["points"]["words"])
-        elif kind == "volume":
-            vertices = read_beams(vertices["beams"])
-        elif self.one_vertex:
+        """Sums values of what gathers photons of a kind for each of `paths` camera paths."""
+        if self.one_vertex and kind != "volume":
             return values
-        else:
-            vertices = read_queries(vertices)
-        total = dr.zeros(type(values), paths)
+        record, total = self._records(vertices, kind), dr.zeros(type(values), paths)
         dr.scatter_reduce(
             dr.ReduceOp.Add,
             total,
             values,
-            vertices["path"],
-            dr.max(vertices["throughput"]) > 0,
+            record["path"],
+            dr.max(record["throughput"]) > 0,
             dr.ReduceMode.Direct,
         )
         return total
+
+    def mean_count(self, photon_map, vertices, kind, radius, paths, spectral):
+        """Photons of a kind within `radius` of a vertex, or of a path's beams, on average (a
+        number); `vertices` are those of so many `paths`."""
+        if kind == "volume":
+            beams = Beams.read(vertices["beams"], spectral["wavelengths"])
+            return mean_count_along(photon_map, beams, radius, paths, self.near_zone)
+        return mean_photon_count(photon_map, read_queries(vertices), radius)
 
     def _map(self, photons, kind, radius, density=None):
         """The map of photons of a kind; `density`: that of volume photons, by which their radii

@@ -13,7 +13,7 @@ from ..mis.neighbour_radiance import NeighbourRadiance
 from ..mis.optimal import OptimalWeights
 from ..photons.frozen import SurfacePhotons, VolumePhotons
 from ..photons.irradiance_cache import IrradianceCache
-from ..photons.points import ball_volume
+from ..photons.kernel_sums import ball_volume
 from ..photons.trace import trace_light_paths
 from ..pilot.denoiser import LEFT
 from .common import MOST_LIGHT_PATHS

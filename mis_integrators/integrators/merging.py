@@ -13,7 +13,8 @@ from ..paths.light_classes import CLASSES, LightClasses
 from ..paths.subpaths import STATES, on_surfaces, read_vertices
 from ..paths.vertex import in_medium
 from ..photons.gather import KeptVertices, gather_photons
-from ..photons.points import Points, ball_volume, gather_in_balls
+from ..photons.kernel_sums import ball_volume
+from ..photons.points import Points, gather_in_balls
 from ..photons.vertex_map import vertex_map, vertex_map_in_media
 from ..pilot.result import RADIUS_WITHOUT_VERTICES
 

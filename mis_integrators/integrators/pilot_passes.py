@@ -10,12 +10,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..core.packing import with_reserve
 from ..core.recording import lanes
 from ..core.spectra import channel_mean
 from ..paths.camera import film_sample_count, pixel_at
-from ..photons.beams import Beams, mean_count_along
-from ..photons.gather import mean_photon_count
-from ..photons.points import Points, mean_count_in_balls, read_points
 from ..photons.queries import read_queries
 
 
@@ -113,9 +111,8 @@ class SubsetPasses:
             session.expect(found, beams, self.pixels.paths)
             if found <= self.capacity and beams <= self.beam_capacity:
                 return radiance, vertices
-            self._record_camera(
-                max(self.capacity, found + found // 8), max(self.beam_capacity, beams + beams // 8)
-            )
+            found, beams = with_reserve(found), with_reserve(beams)
+            self._record_camera(max(self.capacity, found), max(self.beam_capacity, beams))
 
     def gather(self, photons, vertices, radii, seed, spectral):
         """What photons bring to the camera paths, for the radii of each kind, by kind and whether
@@ -146,20 +143,12 @@ class SubsetPasses:
                 )
         return estimates
 
-    def mean_photon_count(self, photons, vertices, kind, radius):
-        """Photons of a kind within `radius` of a vertex, or of a path's beams, on average."""
+    def mean_photon_count(self, photons, vertices, kind, radius, spectral):
+        """As of `BDPMSession.mean_count`; `spectral`: that of the vertices' paths."""
         radius = dr.opaque(mi.Float, radius)
         photon_map = self.session._map(photons, kind, radius, self.density)
-        if kind == "volume":
-            wavelengths = self.session._spectral(0)["wavelengths"]
-            if self.session.points:
-                record = read_points(vertices["points"]["words"])
-                points = Points.of(self.session.traits, record, wavelengths)
-                return mean_count_in_balls(photon_map, points, radius)
-            beams = Beams.read(vertices["beams"], wavelengths)
-            zone = self.session.near_zone
-            return mean_count_along(photon_map, beams, radius, self.pixels.paths, zone)
-        return mean_photon_count(photon_map, read_queries(vertices), radius)
+        paths = self.pixels.paths
+        return self.session.mean_count(photon_map, vertices, kind, radius, paths, spectral)
 
     def joined(self, number, photons, spectral):
         """Light of the photons that are joined with the sensor: (groups, pixels)."""
@@ -202,7 +191,9 @@ class SubsetIteration(NamedTuple):
         return widths[widths > 0]
 
     def mean_photon_count(self, kind, radius):
-        return self.passes.mean_photon_count(self.photons, self.vertices, kind, radius)
+        return self.passes.mean_photon_count(
+            self.photons, self.vertices, kind, radius, self.spectral
+        )
 
     def gather(self, radii):
         return self.passes.gather(self.photons, self.vertices, radii, self.seed, self.spectral)

@@ -7,7 +7,13 @@ import mitsuba as mi
 
 from ..core.recording import lanes
 from ..photons.beams import Beams, beam_layout, gather_along
-from ..photons.points import Points, gather_in_balls, point_layout, read_points
+from ..photons.points import (
+    Points,
+    gather_in_balls,
+    mean_count_in_balls,
+    point_layout,
+    read_points,
+)
 from ..photons.queries import STATE, query_layout, read_queries, weight_layout
 from .bdpm import BDPM, BDPMSession
 
@@ -180,6 +186,19 @@ class WeightedSession(BDPMSession):
             return self._merge_weighted(photon_map, record, kind, level, radii, spectral, grey)
 
         return self._by_section(query_layout().capacity(vertices["words"]), gather)
+
+    def _records(self, vertices, kind):
+        if kind == "volume" and self.points:
+            return read_points(vertices["points"]["words"])
+        return super()._records(vertices, kind)
+
+    def mean_count(self, photon_map, vertices, kind, radius, paths, spectral):
+        """As of `BDPMSession`; of volume photons gathered at vertices those of a vertex."""
+        if kind == "volume" and self.points:
+            record = self._records(vertices, kind)
+            points = Points.of(self.traits, record, spectral["wavelengths"])
+            return mean_count_in_balls(photon_map, points, radius)
+        return super().mean_count(photon_map, vertices, kind, radius, paths, spectral)
 
     def _read_points(self, points, first, count):
         """Records of `count` vertices in media from place `first` of a buffer on, with the state of

@@ -21,14 +21,12 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
-from ..core.packing import read_mark, unpack_direction
+from ..core.packing import unpack_direction
 from ..core.recording import lanes
 from ..core.records import Layout
-from ..core.spectra import channel_mean
-from ..paths.light_classes import CLASSES, by_class_of_photons
 from ..paths.media import point_in
 from .grid import Query, visit_hits
-from .photon import read_power
+from .kernel_sums import KernelSums, disk_area
 from .volume import number_of_medium, read_place
 
 SHORT, LONG = 0, 1 << 31
@@ -274,7 +272,7 @@ def gather_along(
         seen = beams.depth == 1
         radii = [dr.select(seen, near_zone.radius, radius) for radius in radii]
     query = BeamQuery(photon_map, beams, radii[-1])
-    split = marked and not grey
+    sums = KernelSums(radii, beams.throughput, grey, marked)
 
     def visit(index, landing, offset, distance_squared, hit, totals):
         hit &= beams.takes(landing, weigh is not None) & beams.before_surface(landing.p)
@@ -282,32 +280,19 @@ def gather_along(
             hit &= ~seen | near_zone.holds(landing.p)
         if max_depth > 0:
             hit &= landing.depth + beams.depth <= max_depth
-        flux, towards = read_power(photon_map.power, index, hit)
-        if marked:
-            flux, delta_at_light = read_mark(flux)
+        flux, delta_at_light, towards = sums.read(photon_map, index, hit)
         along = query.skipped + dr.dot(offset, query.d)
         phase, pdf = beams.phase(landing.p, dr.normalize(towards), hit)
         value = flux * phase
         if weigh is not None:
             value *= dr.select(hit, weigh(index, pdf, hit), 0)
         value *= dr.exp(-beams.extinction * along)
-        if grey:
-            value = channel_mean(value * beams.throughput)
-        values = [value]
-        if split:
-            values = by_class_of_photons(value, landing.depth, beams.first, delta_at_light)
         share = dr.square(landing.share)
         inside = [hit & (distance_squared < dr.square(radius) * share) for radius in radii]
-        found = [dr.select(i, value / share, 0) for i in inside for value in values]
-        return tuple(total + value for total, value in zip(totals, found))
+        return sums.add(totals, value / share, inside, beams, landing, delta_at_light)
 
-    sums = [radius for radius in radii for _ in range(len(CLASSES) if split else 1)]
-    totals = visit_hits(query, visit, tuple(mi.Float(0) if grey else mi.Spectrum(0) for _ in sums))
-    factor = 1 if grey else beams.throughput
-    return [
-        dr.select(beams.active, total * factor / (dr.pi * dr.square(radius) * light_path_count), 0)
-        for total, radius in zip(totals, sums)
-    ]
+    totals = visit_hits(query, visit, sums.zeros())
+    return sums.estimates(totals, disk_area, light_path_count, beams.active)
 
 
 def mean_count_along(photon_map, beams, radius, paths, near_zone=None):

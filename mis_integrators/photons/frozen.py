@@ -12,8 +12,9 @@ import mitsuba as mi
 from ..paths.media import scattered_share
 from .gather import SAME_SURFACE_COSINE
 from .grid import build_photon_map, for_each_photon, visit_hits
+from .kernel_sums import ball_volume
 from .photon import read_landing, read_power, surface_layout
-from .points import BallQuery, ball_volume
+from .points import BallQuery
 from .volume import build_volume_map, place_layout, read_place
 
 

@@ -10,13 +10,10 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from ..core.packing import read_mark
-from ..core.spectra import channel_mean
 from ..core.traits import lookup
-from ..paths.light_classes import CLASSES, by_class_of_photons
 from ..paths.subpaths import vertex_bsdf_of
 from .grid import for_each_photon
-from .photon import read_power
+from .kernel_sums import KernelSums, disk_area
 from .queries import LAST_VERTEX
 from .scattering import Scattering
 
@@ -186,36 +183,21 @@ def gather_photons(
     For each radius a `Spectrum` (`grey`: a `Float`) of the vertices' width, throughput included; if
     `marked` and not `grey` three, one for each of `light_classes.CLASSES`.
     """
-    split = marked and not grey
+    sums = KernelSums(radii, vertices.factor, grey, marked)
 
     def visit(index, landing, offset, distance_squared, hit, totals):
         hit &= same_surface(landing, vertices.n)
         if max_depth > 0:
             hit &= landing.depth + vertices.depth <= max_depth
-        flux, towards = read_power(photon_map.power, index, hit)
-        if marked:
-            flux, delta_at_light = read_mark(flux)
+        flux, delta_at_light, towards = sums.read(photon_map, index, hit)
         value = _contribution(flux, towards, vertices, index, landing, weigh, hit)
-        if grey:
-            value = channel_mean(value * vertices.factor)
-        values = [value]
-        if split:
-            values = by_class_of_photons(value, landing.depth, vertices.first, delta_at_light)
         # The largest radius is tested again, too: without, kernels are slower by some per cent.
         inside = [hit & within_disk(offset, distance_squared, vertices.n, r, height) for r in radii]
-        found = [dr.select(i, value, 0) for i in inside for value in values]
-        return tuple(total + value for total, value in zip(totals, found))
+        return sums.add(totals, value, inside, vertices, landing, delta_at_light)
 
-    sums = [radius for radius in radii for _ in range(len(CLASSES) if split else 1)]
-    zeros = tuple(mi.Float(0) if grey else mi.Spectrum(0) for _ in sums)
-    totals = for_each_photon(photon_map, vertices.p, radii[-1], vertices.active, visit, zeros)
-    factor = 1 if grey else vertices.factor
-    return [
-        dr.select(
-            vertices.active, total * factor / (dr.pi * dr.square(radius) * light_path_count), 0
-        )
-        for total, radius in zip(totals, sums)
-    ]
+    active = vertices.active
+    totals = for_each_photon(photon_map, vertices.p, radii[-1], active, visit, sums.zeros())
+    return sums.estimates(totals, disk_area, light_path_count, active)
 
 
 def _contribution(flux, towards, vertices, index, landing, weigh, active):

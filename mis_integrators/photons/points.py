@@ -15,14 +15,11 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from ..core.packing import read_mark
 from ..core.recording import lanes
 from ..core.records import Layout
-from ..core.spectra import channel_mean
-from ..paths.light_classes import CLASSES, by_class_of_photons
 from ..paths.media import point_in, scattered_share
 from .grid import DiskQuery, visit_hits
-from .photon import read_power
+from .kernel_sums import KernelSums, ball_volume
 from .scattering import Scattering
 from .volume import number_of_medium, read_place
 
@@ -153,41 +150,22 @@ def gather_in_balls(
     its own: what is divided by is the coefficient of both. Parameters and result are those of
     `gather.gather_photons`; `weigh` is called with a `VolumeLanding`; `straight`: as of `takes`.
     """
-    split = marked and not grey
+    sums = KernelSums(radii, points.throughput, grey, marked)
 
     def visit(index, landing, offset, distance_squared, hit, totals):
         hit &= takes(points, landing, straight)
         if max_depth > 0:
             hit &= landing.depth + points.depth <= max_depth
-        flux, towards = read_power(photon_map.power, index, hit)
-        if marked:
-            flux, delta_at_light = read_mark(flux)
+        flux, delta_at_light, towards = sums.read(photon_map, index, hit)
         scattering = points.phase(dr.normalize(towards), hit)
         value = flux * scattering.value / points.scattering_around(landing.p, hit)
         value *= dr.select(hit, weigh(index, landing, scattering, hit), 0)
-        if grey:
-            value = channel_mean(value * points.throughput)
-        values = [value]
-        if split:
-            values = by_class_of_photons(value, landing.depth, points.first, delta_at_light)
         inside = [hit & (distance_squared < dr.square(radius)) for radius in radii]
-        found = [dr.select(i, value, 0) for i in inside for value in values]
-        return tuple(total + value for total, value in zip(totals, found))
+        return sums.add(totals, value, inside, points, landing, delta_at_light)
 
     query = BallQuery(photon_map, points.p, radii[-1], points.active)
-    sums = [radius for radius in radii for _ in range(len(CLASSES) if split else 1)]
-    zeros = tuple(mi.Float(0) if grey else mi.Spectrum(0) for _ in sums)
-    totals = visit_hits(query, visit, zeros)
-    factor = 1 if grey else points.throughput
-    return [
-        dr.select(points.active, total * factor / (ball_volume(radius) * light_path_count), 0)
-        for total, radius in zip(totals, sums)
-    ]
-
-
-def ball_volume(radius):
-    """4/3 pi radius^3."""
-    return (4 / 3 * dr.pi) * radius * dr.square(radius)
+    totals = visit_hits(query, visit, sums.zeros())
+    return sums.estimates(totals, ball_volume, light_path_count, points.active)
 
 
 def mean_count_in_balls(photon_map, points, radius):

@@ -5,11 +5,8 @@ strategies, and what is refused.
 Comparisons of renders: as in `test_bdpm_media`.
 """
 
-from mis_integrators.photons.points import (
-    Points,
-    ball_volume,
-    gather_in_balls,
-)
+from mis_integrators.photons.kernel_sums import ball_volume
+from mis_integrators.photons.points import Points, gather_in_balls
 from mis_integrators.photons.queries import STATE
 from mis_integrators.photons.volume import (
     build_volume_map,

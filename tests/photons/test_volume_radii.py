@@ -17,10 +17,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from comparing import Estimate, assert_same, block_means, collect_until, pictures
+from comparing import Estimate, assert_same, block_means, collect_until
 from foggy import view
 from pilots import learned
 from selection import extended
+from test_bdpm_media import SmallRadiusBatches
 from test_bdpt_media import FOG, POINT, homogeneous, single_scattering
 from test_beams import beams, media, written
 from worlds import look
@@ -187,19 +188,11 @@ def session_of(scene, radius, uniform=False, **parameters):
     return session
 
 
-class Extrapolated:
-    """Blocks of images, extrapolated to the radius zero, as in `test_bdpm_media`."""
+class Extrapolated(SmallRadiusBatches):
+    """The same with radii of the photons' own."""
 
-    def __init__(self, scene, radius, **parameters):
-        self.batches = []
-        self.sessions = [session_of(scene, r, **parameters) for r in (radius, radius / 2)]
-
-    def add(self, count):
-        for wide, narrow in zip(*(pictures(session, count) for session in self.sessions)):
-            self.batches.append(block_means(2 * narrow[:, :, :3] - wide[:, :, :3], 2))
-
-    def estimate(self):
-        return Estimate.of(self.batches)
+    def session(self, scene, radius, parameters):
+        return session_of(scene, radius, **parameters)
 
 
 @pytest.mark.parametrize("bdd", [0, *extended(1)])
@@ -209,7 +202,7 @@ def test_single_scattering_in_closed_form(rgb, bdd):
     scene = lamp_in_fog(16)
     picture = single_scattering(0.7, 0.9, 0.0, POINT, 16, 0.5, 2.0)
     exact = Estimate.exact(np.repeat(block_means(picture[:, :, None], 2), 3, axis=1))
-    batches = Extrapolated(scene, 0.06, bdd=bdd, camera_paths=16)
+    batches = Extrapolated(scene, 2, 0.06, bdd=bdd, camera_paths=16)
     batches.add(2)
     assert_same(*collect_until(batches, exact, 0.03, 0.08), 0.03, 0.08, slack=2e-3)
 
