@@ -36,6 +36,7 @@ METHODS = {
     "mis.resampling": "bdpt_ris:light_paths=50",
     "resampling": "bdpt_ris",
     "integrators.resampled": "bdpt_ris",
+    "integrators.resampled_passes": "bdpt_ris",
     "integrators.choice": "bdpm_auto",
     "integrators.media_choice": "bdpm_auto",
     "integrators.merging": "vcm",

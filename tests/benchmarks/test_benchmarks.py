@@ -641,7 +641,7 @@ def test_published_forms_change_what_they_name(module):
     integrator has the values that it names."""
     published, methods = module("experiments.published"), module("common.methods")
     changed = module("common.tuned").changed
-    from mis_integrators.integrators import resampled
+    from mis_integrators.integrators import resampled_passes
     from mis_integrators.mis import resampling as bounded
     from mis_integrators.resampling import proposals
 
@@ -653,9 +653,9 @@ def test_published_forms_change_what_they_name(module):
         with changed(values):
             seen.add(
                 (
-                    resampled.PublishedWeights,
-                    resampled.ResampledWeights,
-                    resampled.guessed_weight,
+                    resampled_passes.PublishedWeights,
+                    resampled_passes.ResampledWeights,
+                    resampled_passes.guessed_weight,
                     bounded.BLIND_SHARE,
                     bounded.LEAST_GAIN,
                     bounded.MOST_GAIN,
@@ -665,7 +665,8 @@ def test_published_forms_change_what_they_name(module):
             )
     # `published`, `bounded` and both with path densities change nothing; all others differ.
     assert len(seen) == len(published.LADDER) - 3
-    assert resampled.PublishedWeights not in (published.WithBounds, published.WithoutLengths)
+    forms = published.WithBounds, published.WithoutLengths
+    assert resampled_passes.PublishedWeights not in forms
 
 
 def test_common_noise_is_that_of_blocks(module):

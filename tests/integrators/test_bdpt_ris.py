@@ -650,11 +650,11 @@ def test_light_that_only_merging_makes(rgb, name):
 def test_merges_in_parts(rgb, monkeypatch, rounds):
     """The film in parts, each with light sub-paths of its own in one round or two: the same light
     as all at once, merged once."""
-    from mis_integrators.integrators import resampled
+    from mis_integrators.integrators import resampled_passes
 
     scene = floor_in_a_beam(1, pane=index_matched_pane(0.25))
-    monkeypatch.setattr(resampled, "CHUNK", 600)
-    monkeypatch.setattr(resampled, "KNOWN_PATHS", 50)
+    monkeypatch.setattr(resampled_passes, "CHUNK", 600)
+    monkeypatch.setattr(resampled_passes, "KNOWN_PATHS", 50)
     integrator = plugin(
         "bdpt_ris", merging=True, initial_radius=0.08, light_paths=50, light_tracing=rounds
     )
@@ -914,9 +914,9 @@ def test_memory_is_bounded(rgb, monkeypatch):
 def test_parts_share_their_proposals(rgb, monkeypatch):
     """A film rendered in parts, the last one incomplete, has the mean of `path`, and draws from one
     set of pmfs in each iteration."""
-    from mis_integrators.integrators import resampled
+    from mis_integrators.integrators import resampled_passes
 
-    monkeypatch.setattr(resampled, "CHUNK", 470)
+    monkeypatch.setattr(resampled_passes, "CHUNK", 470)
     scene = box_scene(24)
     session = plugin("bdpt_ris", light_tracing=1).session(scene, 0, 1, 0)
     assert session.chunks == 5 and session.chunk * 5 > session.path_count
@@ -930,10 +930,10 @@ def test_parts_share_their_proposals(rgb, monkeypatch):
 
 def test_parts_hold_every_path_once(rgb, monkeypatch):
     """Parts of a film, each of which sees all of it."""
-    from mis_integrators.integrators import resampled
+    from mis_integrators.integrators import resampled_passes
     from mis_integrators.paths.camera import with_gaps
 
-    monkeypatch.setattr(resampled, "CHUNK", 470)
+    monkeypatch.setattr(resampled_passes, "CHUNK", 470)
     session = plugin("pcbpt").session(box_scene(23), 0, 1, 0)
     numbers = []
     for chunk in range(session.chunks):
@@ -951,11 +951,11 @@ def test_pilot_sees_all_of_the_film(rgb, monkeypatch):
     """Cache points of a film in parts come from all over it, as those of a film in one: heights of
     first vertices, two samples of the same distribution (Kolmogorov and Smirnov; false alarms
     1e-6)."""
-    from mis_integrators.integrators import resampled
+    from mis_integrators.integrators import resampled_passes
 
     heights = []
     for chunk in (1 << 18, 500):
-        monkeypatch.setattr(resampled, "CHUNK", chunk)
+        monkeypatch.setattr(resampled_passes, "CHUNK", chunk)
         session = plugin("bdpt_ris", light_tracing=1).session(box_scene(32), 0, 1, 0)
         session._prepare()
         first = np.array(session.cache["depth"]) == 1
@@ -983,10 +983,10 @@ def test_no_light_tracing_is_the_default(rgb):
 def test_any_light_tracing_is_unbiased(rgb, monkeypatch, ratio):
     """Fewer light sub-paths than camera paths, and so many that they are traced in several rounds,
     of a film in parts."""
-    from mis_integrators.integrators import resampled
+    from mis_integrators.integrators import resampled_passes
 
-    monkeypatch.setattr(resampled, "CHUNK", 1200)
-    monkeypatch.setattr(resampled, "KNOWN_PATHS", 50)
+    monkeypatch.setattr(resampled_passes, "CHUNK", 1200)
+    monkeypatch.setattr(resampled_passes, "KNOWN_PATHS", 50)
     scene = box_scene(24)
     integrator = plugin("bdpt_ris", light_tracing=ratio, light_paths=50)
     session = integrator.session(scene, 0, 1, 0)
