@@ -33,6 +33,7 @@ METHODS = {
     "mis.neighbour_radiance": "bdpm_opt3:weights=full",
     "photons.irradiance_cache": "bdpm_opt3",
     "integrators.bdpm_opt": "bdpm_opt3",
+    "integrators.published_optimal": "bdpm_opt3",
     "mis.resampling": "bdpt_ris:light_paths=50",
     "resampling": "bdpt_ris",
     "integrators.resampled": "bdpt_ris",

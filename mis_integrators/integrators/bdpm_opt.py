@@ -18,17 +18,19 @@ from ..photons.trace import trace_light_paths
 from ..pilot.denoiser import LEFT
 from .common import MOST_LIGHT_PATHS
 from .parameters import ParameterError
-from .published_optimal import STRATEGIES, PublishedSession
+from .published_optimal import (
+    FROZEN,
+    PHOTONS_A_PATH,
+    STRATEGIES,
+    USUAL_FROZEN_PATHS,
+    PublishedSession,
+)
 from .weighted import WeightedBDPM, WeightedSession
 
-USUAL_FROZEN_PATHS = 1 << 16
-"""Tuned: light sub-paths of the frozen pass, unless the parameter says otherwise."""
 USUAL_PHOTONS = 10
 """Tuned: photons a merge disk of the radius for which the weights of a pilot are made."""
 SMALLEST_USUAL_RADIUS = 1e-5
 """That radius at least, in units of the scene's diagonal."""
-PHOTONS_A_PATH = 5
-"""Room for photons of the frozen pass; it grows where that is not enough."""
 
 
 class BDPMOpt(WeightedBDPM):
@@ -121,6 +123,11 @@ class BDPMOpt(WeightedBDPM):
             raise ParameterError(
                 f'{self.plugin}: parameter "weights" = "published" allows no "mix_diffuse" = '
                 "false: the papers mix strategies at all surfaces"
+            )
+        if self.denoised:
+            raise ParameterError(
+                f'{self.plugin}: parameter "weights" = "published" allows no "denoised": the '
+                "papers know of no denoiser"
             )
         if self.splits_light:
             raise ParameterError(
@@ -300,7 +307,3 @@ class BDPMOptSession(WeightedSession):
             "caustic_cost": dearer * dr.square(radius / radii.get("caustic", radius)),
             **of_media,
         }
-
-
-FROZEN = 3
-"""Purpose of the frozen pass's random seed."""

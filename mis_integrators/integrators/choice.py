@@ -203,7 +203,8 @@ def why_not_camera_paths(plugin, session, prediction):
 
 
 def _try_photons(session, segments):
-    counted = costs.events(session, segments, session.last_vertex, session.prediction.gathered)
+    gathered, paths = session.prediction.gathered, session.camera_paths
+    counted = costs.events(session, segments, session.last_vertex, gathered, paths)
     cost = costs.cost(PHOTONS, counted) + costs.of_direct_paths(session, segments)
     return trial_of_photons(PHOTONS, session, cost)
 

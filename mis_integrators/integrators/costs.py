@@ -16,8 +16,8 @@ depend on any of them."""
 PRICES = json.loads(Path(__file__).with_name("costs.json").read_text())
 
 
-def events(session, segments, last_vertex, gathered):
-    """Events of an iteration of one camera path a pixel, in the order of `EVENTS`.
+def events(session, segments, last_vertex, gathered, camera_paths=1):
+    """Events of an iteration of so many camera paths a pixel, in the order of `EVENTS`.
 
     `segments`: `paths.path_length_statistics.mean_segments`; `last_vertex`: the last smooth vertex
     that shades (`None`: all); `gathered`: photons within a vertex's merge disks.
@@ -25,7 +25,7 @@ def events(session, segments, last_vertex, gathered):
     camera = float(sum(segments if last_vertex is None else segments[: last_vertex + 1]))
     paths = getattr(session, "light_path_count", 0) * session.camera_paths / session.path_count
     light = paths * (1 + getattr(session, "photons_a_path", 0))
-    return camera, light, gathered, 1.0
+    return camera_paths * camera, light, camera_paths * gathered, 1.0
 
 
 def of_direct_paths(session, segments):

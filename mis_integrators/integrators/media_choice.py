@@ -76,6 +76,7 @@ def new_session(plugin, integrator, scene, sensor, seed, iterations):
     if plugin == PHOTONS:
         parameters["denoised"] = integrator.denoised
     made = mi.load_dict(parameters)
+    made.denoised = integrator.denoised
     samples = (iterations or 0) * integrator.initial_camera_paths
     return made.session(scene, sensor, seed, samples)
 

@@ -24,8 +24,10 @@ from .bdpm import CAMERA, LIGHT, BDPMSession
 STRATEGIES = {2: TwoStrategies, 3: ThreeStrategies}
 """Numbers of strategies for which there are printed weights."""
 USUAL_FROZEN_PATHS = 1 << 16
-"""Light sub-paths of the frozen pass, unless the parameter says otherwise: those of the other
-weights."""
+"""Tuned: light sub-paths of the frozen pass, of all weights, unless the parameter says
+otherwise."""
+FROZEN = 3
+"""Purpose of the frozen pass's random seed."""
 CHAIN_CHUNK = 1 << 18
 """Camera paths traced at once at most (bounds memory)."""
 PHOTONS_A_PATH = 5
@@ -192,7 +194,6 @@ class LightOfIteration:
         root_record = camera.record(camera.section(first))
         root = self.theory.roots(root_record)
         self._add_pairs(
-            first,
             root_record,
             lambda meeting, place, vertex: self.theory.of_photons(
                 meeting, self.chains, self.known, place, [take(x, vertex) for x in root]
@@ -214,7 +215,6 @@ class LightOfIteration:
         self._add_direct(number, record, weight)
         self._add("caustic", number, weight)
         self._add_pairs(
-            number,
             record,
             lambda meeting, place, vertex: theory.of_inner_photons(
                 meeting, self.known, place, middle.at(vertex)
@@ -283,8 +283,8 @@ class LightOfIteration:
         )
         self._to_paths(self.photons, record, values * self._correction(kind, record, radius))
 
-    def _add_pairs(self, number, record, weight_of):
-        """Indirect photons at vertices with a number, each under a weight of its own,
+    def _add_pairs(self, record, weight_of):
+        """Indirect photons at vertices, each under a weight of its own,
         `weight_of(meeting, place of the photon, number of the vertex)`."""
         if "indirect" not in self.maps:
             return
@@ -309,7 +309,3 @@ class LightOfIteration:
             dr.eval(values)
         values *= dr.rcp(dr.pi * dr.square(radius) * session.light_path_count)
         self._to_paths(self.photons, record, values * self._correction("indirect", record, radius))
-
-
-FROZEN = 3
-"""Purpose of the frozen pass's random seed."""

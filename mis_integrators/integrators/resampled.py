@@ -323,8 +323,7 @@ class ResampledSession(ResampledPasses):
         return radiance, entries
 
     def _meet_sensor(self, light, seed, spectral):
-        """Block of the light sub-paths (`trace_light_subpaths`) that meet the sensor: three
-        channels, and three for each class."""
+        """As `_join_sensor`, of what `trace_light_subpaths` returns."""
         vertices, found, _ = light
         return self._sensor_pass(
             self.scene, self.sensor, self._tables, vertices, found, seed, spectral

@@ -556,7 +556,8 @@ class ResampledPasses(IterativeSession):
         return class_of(dr.select(scattered, later, 0), hit["d_vcm"] == 0)
 
     def _join_sensor(self, scene, sensor, tables, light, count, seed, spectral):
-        """As `_meet_sensor`."""
+        """Block of the light sub-paths that are joined with the sensor: three channels, and three
+        for each class."""
         index = lanes(self.capacity["light"])
         active = index < dr.gather(mi.UInt32, count, 0)
         y = read_vertices(light, index, active, states=END)

@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.film import colour_channels, colour_matrix
+from ..core.film import colour_channels, colour_matrix, direct_channels
 from ..core.random import mix
 from ..core.recording import recorder
 from ..core.render_lock import render_lock, under_render_lock
@@ -513,9 +513,11 @@ class MultiViewSession(IterativeSession):
     def _fill(self, film, pictures):
         """Writes pictures side by side into a film; where there is one view, its layers, too."""
         picture = pictures[0] if len(pictures) == 1 else dr.concat(pictures, axis=1)
-        border = film.rfilter().border_size()
+        border, (height, width) = film.rfilter().border_size(), picture.shape[:2]
+        if self.integrator.denoised:  # as `bdpm_auto` may ask: no light is known to be direct
+            nothing = dr.zeros(type(picture), (height, width, len(direct_channels())))
+            picture = dr.concat([picture, nothing], axis=2)
         for layer in self.integrator.layers:
-            height, width = picture.shape[:2]
             inside = slice(border, border + height), slice(border, border + width)
             picture = dr.concat([picture, self._layers[layer.name][inside]], axis=2)
         write_film(self._emptied(film), picture)

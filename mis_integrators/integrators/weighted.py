@@ -24,7 +24,6 @@ class WeightedBDPM(BDPM):
 
     first_vertex = 0
     pass_narrow = False  # weights leave the light of narrow lobes to later vertices by themselves
-    MEDIA = False
 
     def settings(self):
         settings = super().settings()

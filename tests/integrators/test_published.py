@@ -1,6 +1,7 @@
 """`bdpm_opt` under the weights as they are printed: one weight function for all strategies, right
 means, and the least noise that one weight for direct light and photons allows."""
 
+from mis_integrators.app.loading import knows_of_denoisers
 from mis_integrators.mis import published_optimal as published
 from mis_integrators.photons.queries import LAST_VERTEX
 
@@ -403,11 +404,18 @@ def test_least_noise_in_a_glossy_sphere(rgb):
         ({"type": "bdpm_opt", "strategies": 1}, '"strategies" 2 or 3'),
         ({"type": "bdpm_opt3", "mix_diffuse": False}, 'no "mix_diffuse" = false'),
         ({"type": "bdpm_opt2", "aovs": "light:direct"}, '"direct"'),
+        ({"type": "bdpm_opt3", "denoised": True}, 'no "denoised"'),
     ],
 )
 def test_what_published_weights_do_not_have(rgb, parameters, message):
     with pytest.raises(RuntimeError, match=message):
         mi.load_dict({**parameters, "weights": "published"})
+
+
+def test_images_of_published_weights_are_denoised_as_a_whole(rgb):
+    """`--denoise` tells all plugins of it that have the parameter, but not these."""
+    assert not knows_of_denoisers("bdpm_opt3", {"weights": "published"})
+    assert knows_of_denoisers("bdpm_opt3", {})
 
 
 def test_renders_from_a_file(rgb, tmp_path):
