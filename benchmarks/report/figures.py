@@ -57,10 +57,11 @@ def draw_mape_over_time(path: Path, rows: Sequence[Mapping]) -> None:
     figure, axis = plt.subplots(figsize=(7, 4.5))
     for method in dict.fromkeys(row["method"] for row in rows):
         mine = [row for row in rows if row["method"] == method]
-        axis.loglog(
+        axis.plot(
             [row["seconds"] for row in mine], [row["MAPE"] for row in mine], "o-", label=method
         )
-    axis.set(xlabel="rendering time [s]", ylabel="MAPE", title=rows[0]["scene"])
+    charts.logarithmic(axis, "rendering time [s]", "MAPE")
+    axis.set_title(rows[0]["scene"])
     axis.legend(fontsize=7)
     figure.tight_layout()
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -123,7 +123,7 @@ def error_against_time(curves: Mapping[str, Curve], style: Mapping[str, Style]) 
                 axis.fill_between(
                     x[good], low[good], high[good], color=look.colour, alpha=0.1, lw=0
                 )
-    _logarithmic(axis, "seconds", "relMSE, mean of the seeds")
+    logarithmic(axis, "seconds", "relMSE, mean of the seeds")
     _legend(axis, "method, slope")
     return figure
 
@@ -162,7 +162,7 @@ def front(
                     alpha=1 if filled else 0.7,
                 )
                 labelled = True
-    _logarithmic(axis, "seconds", "relMSE without the worst 0.1 %")
+    logarithmic(axis, "seconds", "relMSE without the worst 0.1 %")
     _legend(axis, "large: on the front")
     return figure
 
@@ -184,7 +184,7 @@ def sweep(title: str, sweeps: Mapping[str, Sequence[Point]], style: Mapping[str,
         if broken:
             axis.plot(*zip(*broken), "o", ms=12, mfc="none", mec=look.colour, mew=1.8)
             axis.plot(*zip(*broken), "x", ms=7, color=look.colour, mew=2)
-    _logarithmic(axis, title, "relMSE without the worst 0.1 %")
+    logarithmic(axis, title, "relMSE without the worst 0.1 %")
     _legend(axis, "ringed: breaks")
     return figure
 
@@ -207,7 +207,7 @@ def cost_by_count(
             lw=1.6,
             label=label,
         )
-    _logarithmic(axis, "views", f"variance x time, {base} = 1")
+    logarithmic(axis, "views", f"variance x time, {base} = 1")
     counts = sorted({count for points in curves.values() for count, _ in points})
     axis.xaxis.set_major_locator(FixedLocator(counts))
     axis.set_ylim(min(axis.get_ylim()[0], 0.7), max(axis.get_ylim()[1], 1.4))
@@ -280,7 +280,7 @@ def ratios(
                             alpha=0.1,
                             lw=0,
                         )
-                _logarithmic(axis, name, title)
+                logarithmic(axis, name, title)
                 axis.label_outer()
         _legend(axes[0, -1], f"grey: {base}")
     return figure
@@ -314,7 +314,7 @@ def convergence_of_samplers(rows: Sequence[Mapping[str, Any]]) -> Figure:
                         label=f"{sampler}, {name.removesuffix(' trimmed')}",
                     )
             axis.set_title(f"{scene}, {method}")
-            _logarithmic(axis, "iterations", "variance of the image")
+            logarithmic(axis, "iterations", "variance of the image")
         figure.axes[-1].legend(fontsize=7)
     return figure
 
@@ -382,7 +382,7 @@ def _axes(width: float, height: float) -> tuple[Figure, Any]:
     return figure, axis
 
 
-def _logarithmic(axis: Any, x: str, y: str) -> None:
+def logarithmic(axis: Any, x: str, y: str) -> None:
     """Logarithmic axes with plain numbers at 1, 2 and 5 times powers of ten, at powers alone where
     these are many."""
     axis.set(xscale="log", yscale="log", xlabel=f"{x} (log)", ylabel=f"{y} (log)")
