@@ -221,6 +221,7 @@ class MultiViewSession(IterativeSession):
             self._connection_pass,
             self._suffix_pass,
             self._splat_pass,
+            self._trial_pass,
         ) = map(
             self.recorded,
             (
@@ -230,6 +231,7 @@ class MultiViewSession(IterativeSession):
                 self._connect,
                 self._continue,
                 self._splat,
+                self._try,
             ),
         )
 
@@ -404,13 +406,14 @@ class MultiViewSession(IterativeSession):
         if variation:
             seed = self._seed(iteration + variation, PATHS)
             sequence.first += variation
-        pivots, radiance, _, _ = self._first_pass(
-            self.scene, self._tables, numbers, seed, sequence, spectral
-        )
+        return self._trial_pass(self.scene, self._tables, numbers, seed, sequence, spectral)
+
+    def _try(self, scene, tables, numbers, seed, sequence, spectral):
+        """As `radiance`. The passes of a part of an iteration are recorded apart: a recording does
+        not know how wide arrays are that hang on no `numbers`."""
+        pivots, radiance, _, _ = self._trace_first(scene, tables, numbers, seed, sequence, spectral)
         dr.eval(pivots, radiance)
-        _, value = self._suffix_pass(
-            self.scene, self._tables, pivots, None, numbers, seed, sequence
-        )
+        _, value = self._continue(scene, tables, pivots, None, numbers, seed, sequence)
         return radiance + value
 
     def _numbers(self, iteration):

@@ -201,6 +201,22 @@ def test_means(rgb, monkeypatch):
     agree_with_volpath(auto(camera_paths=16), plain())
 
 
+def test_trial_on_some_of_the_pixels(rgb, monkeypatch):
+    """Camera paths are tried on the pixels of the pilot, and render all of a larger film."""
+    set_price_of_photons(monkeypatch, 1e4)
+    scene = plain()
+    film = mi.traverse(scene)
+    film["sensor.film.size"] = [72, 71]
+    film.update()
+    session = decided(scene, spp=1)
+    assert session.settings["choice"] == "volpath_multiview"
+    own = mi.load_dict({"type": "volpath_multiview", "max_depth": 6, "camera_paths": 1})
+    own = own.session(scene, seed=3, spp=1)
+    own.iterate()
+    np.testing.assert_allclose(session.image(), own.image(), rtol=1e-4, atol=1e-5)
+    assert own.image().shape[:2] == (71, 72) and own.image().mean() > 0
+
+
 @pytest.mark.parametrize("chosen", ["bdpm", "volpath_multiview"])
 def test_denoised(rgb, monkeypatch, chosen):
     """Photons keep direct light apart for the denoiser, camera paths have nothing to keep apart;
