@@ -9,27 +9,23 @@ import mitsuba as mi
 
 from ..core.film import (
     as_camera_weights,
-    expected_weight,
     splat_channels,
     splat_light,
     splat_samples,
     with_colour,
 )
 from ..core.packing import rounded_up
-from ..core.random import next_2d, vertex_streams
-from ..core.recording import lanes, recorder
-from ..core.traits import SceneTraits
-from ..lights.lights import Lights
+from ..core.random import vertex_streams
+from ..core.recording import lanes
 from ..mis.vertex_merging import ConnectionWeights
 from ..paths.camera import with_gaps
-from ..paths.connect import by_path, join, join_sensor, kept_between, list_pairs, visible
+from ..paths.connect import by_path, join, kept_between, list_pairs, visible
 from ..paths.layers import CHANNELS, SPLIT
-from ..paths.light_classes import LightClasses, by_class, class_of
-from ..paths.sensor import Lens
-from ..paths.setting import World
-from ..paths.subpaths import Kept, read_vertices, trace_camera_subpaths, trace_light_subpaths
-from .common import MOST_LIGHT_PATHS, IterativeIntegrator, IterativeSession
+from ..paths.light_classes import LightClasses, class_of
+from ..paths.subpaths import Kept, read_vertices, trace_camera_subpaths
+from .common import MOST_LIGHT_PATHS, IterativeIntegrator
 from .pyramid import Ledger, camera_images, sensor_images, technique_channels, with_rest
+from .subpath_session import SubpathSession
 
 CHUNK = 1 << 19
 """Camera paths, and as many light sub-paths, traced at once at most; larger films are traced in
@@ -150,7 +146,7 @@ class BDPT(IterativeIntegrator):
         return BDPTSession(self, scene, sensor, seed, iterations)
 
 
-class BDPTSession(IterativeSession):
+class BDPTSession(SubpathSession):
     """Iterations of `bdpt`: light sub-paths, camera sub-paths, connections, the light that meets
     the sensor."""
 
@@ -165,31 +161,20 @@ class BDPTSession(IterativeSession):
     }
 
     def __init__(self, integrator, scene, sensor, seed, iterations):
-        super().__init__(integrator, scene, sensor, seed, iterations)
-        self.traits = SceneTraits(scene, sensor)
-        self.lights = Lights.seen_by(scene, sensor, integrator.plugin)
-        if self.traits.has_media:
-            self.lights.find_media(sensor, integrator.plugin)
-        self.world = World(scene, self.lights, self.traits)
-        self.split_paths(CHUNK)
+        super().__init__(integrator, scene, sensor, seed, iterations, CHUNK)
         self.light_chunk = self.light_count()
         self.light_path_count = self.chunks * self.light_chunk
-        width, height = sensor.film().crop_size()
-        self.pixel_paths = width * height * integrator.camera_paths
         self.capacity = {
             "light": rounded_up(3 * self.light_chunk),
             "camera": rounded_up(3 * self.chunk),
             "pairs": rounded_up(4 * self.chunk),
         }
-        self.lens = Lens(sensor).connects
         if integrator.techniques:
             self.accumulator.technique_channels = len(
                 technique_channels(integrator.techniques, integrator.technique_weights)
             )
         depth = integrator.max_depth
         self.bidirectional = not self.lights.dark and (depth < 0 or depth >= 2)
-        self.expected_weight = expected_weight(sensor.film(), integrator.camera_paths)
-        self.recorded = recorder()
         self._freeze()
 
     def _freeze(self, grown=None):
@@ -208,17 +193,6 @@ class BDPTSession(IterativeSession):
         return ConnectionWeights(self.lights, beta, ratio, media=self.traits.has_media)
 
     # ------------------------------------------------------------------ passes
-
-    def _trace_light(self, scene, sensor, tables, sequence, first, spectral):
-        light_pass = self.describe_light_pass(sensor, sequence, self.light_chunk, spectral, first)
-        return trace_light_subpaths(
-            self.world,
-            self.limits,
-            light_pass,
-            self.weights(spectral),
-            self.capacity["light"],
-            self.integrator.splits_light,
-        )
 
     def _trace_camera(self, scene, sensor, tables, sequence, first, skip, spectral):
         ledger = self._ledger() if self.integrator.techniques else None
@@ -284,28 +258,10 @@ class BDPTSession(IterativeSession):
     def _join_sensor(self, scene, sensor, tables, light, seed, spectral):
         """Block of the light that meets the sensor."""
         vertices, count, _ = light
-        index = lanes(self.capacity["light"])
-        active = index < dr.gather(mi.UInt32, count, 0)
-        y = read_vertices(vertices, index, active)
-        rng = vertex_streams(y["path"], y["number"], seed)
-        aperture = next_2d(rng) if sensor.needs_aperture_sample() else mi.Point2f(0.5)
-        joined = join_sensor(
-            self.world,
-            self.limits,
-            self.integrator,
-            Lens(sensor),
-            y,
-            aperture,
-            spectral["wavelengths"],
-            active,
-            rng,
-        )
+        y, joined = self._joined_with_sensor(sensor, vertices, count, seed, spectral)
         value = joined.value * (self.pixel_paths / self.light_path_count)
         share, matrix = self.weights(spectral).seen_by_sensor(joined, y), spectral["sensor_matrix"]
-        spectra, techniques = [value * share], []
-        if self.integrator.splits_light:
-            smooth = dr.select(y["depth"] == 1, mi.UInt32(1), mi.UInt32(2))
-            spectra += by_class(class_of(smooth, y["mark"]), value * share)
+        spectra, techniques = self._with_classes(value * share, y), []
         if self.integrator.techniques:
             value = value * share if self.integrator.technique_weights else value
             techniques = sensor_images(self.integrator.techniques, y["depth"], value, matrix)

@@ -11,7 +11,6 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.film import Accumulator, direct_channels, shared_wavelengths, variance_channels
-from ..core.packing import with_reserve
 from ..core.random import mix, reversed_bits
 from ..core.recording import settle
 from ..core.render_lock import render_lock, under_render_lock
@@ -396,17 +395,6 @@ class IterativeSession:
                 dr.eval(self.sums.tensors)
                 dr.sync_thread()
 
-    PASSES = {}
-    """Recorded passes of sessions whose buffers grow one by one: the method of each, and the
-    buffers that it uses."""
-
-    def _record(self, grown):
-        """Records the `PASSES` anew, or those that use the buffer that has `grown`; from the second
-        iteration on, kernels run without their Python."""
-        for name, (function, buffers) in self.PASSES.items():
-            if grown is None or grown in buffers:
-                setattr(self, name, self.recorded(getattr(self, function)))
-
     def split_paths(self, largest):
         """Splits the `path_count` camera paths of an iteration into `chunks` parts of `chunk`
         paths, all those of a pixel in the same part and about `largest` at most: that bounds
@@ -501,17 +489,6 @@ class IterativeSession:
             group_size,
             self._low_discrepancy(iteration),
         )
-
-    def _grown(self, name, count):
-        """Whether the `count` (an array of width one) found more than there is room for in the
-        buffer of that name; then there will be more room. For sessions with a dictionary `capacity`
-        and a method `_freeze`, which calls `_record`."""
-        found = int(count[0])
-        if found <= self.capacity[name]:
-            return False
-        self.capacity[name] = with_reserve(found)
-        self._freeze(name)
-        return True
 
     def fill_film(self):
         """Hands what has been rendered so far to the sensor's film, ready to develop."""

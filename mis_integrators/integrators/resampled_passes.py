@@ -11,34 +11,23 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.film import (
-    expected_weight,
     splat_light,
 )
 from ..core.packing import rounded_up
-from ..core.random import next_2d, own_stream, vertex_streams
-from ..core.recording import lanes, recorder
+from ..core.random import own_stream, vertex_streams
+from ..core.recording import lanes
 from ..core.spectra import channel_mean
-from ..core.traits import SceneTraits
-from ..lights.lights import Lights
 from ..mis.published_resampling import PublishedWeights, unknown_tables
-from ..mis.resampling import (
-    ResampledWeights,
-    guessed_weight,
-    uniform_tables,
-)
+from ..mis.resampling import ResampledWeights, guessed_weight, uniform_tables
 from ..paths.camera import with_gaps
 from ..paths.camera_vertices import STEP, LightEnd, hit_layout, sum_before, trace_camera_vertices
-from ..paths.connect import join_sensor
-from ..paths.light_classes import LightClasses, by_class, class_of
+from ..paths.light_classes import LightClasses, class_of
 from ..paths.light_starts import sample_light_starts
 from ..paths.media import SHADOW_SALT
-from ..paths.sensor import Lens
-from ..paths.setting import World
 from ..paths.subpaths import (
     NO_PARENT,
     read_vertices,
     seen_normal,
-    trace_light_subpaths,
     vertex_bsdf_of,
 )
 from ..paths.vertex import facing
@@ -49,9 +38,9 @@ from ..resampling.cache_targets import TARGETS, CacheTargets, receiving_cosine
 from ..resampling.light_vertices import END, LightVertices, list_light_vertices
 from ..resampling.proposals import Proposals, arriving, cumulative_sums
 from ..weights import resampling
-from .common import IterativeSession
 from .merging import automatic_radius, merged_light, merging_of, with_merged
 from .schedule import shrunk
+from .subpath_session import SubpathSession
 
 CHUNK = 1 << 18
 """Camera paths, and as many light sub-paths, traced at once at most; larger films are traced in
@@ -61,7 +50,7 @@ KNOWN_PATHS, MOST_KNOWN_SETS = 200, 8
 at most so many sets."""
 
 
-class ResampledPasses(IterativeSession):
+class ResampledPasses(SubpathSession):
     """The passes of a session of both plugins, and what they share."""
 
     PASSES = {
@@ -76,21 +65,13 @@ class ResampledPasses(IterativeSession):
     }
 
     def __init__(self, integrator, scene, sensor, seed, iterations):
-        super().__init__(integrator, scene, sensor, seed, iterations)
-        self.traits = SceneTraits(scene, sensor)
-        self.lights = Lights.seen_by(scene, sensor, integrator.plugin, integrator.guided_lights)
-        if self.traits.has_media:
-            self.lights.find_media(sensor, integrator.plugin)
-        self.world = World(scene, self.lights, self.traits)
-        self.split_paths(CHUNK)
-        width, height = sensor.film().crop_size()
-        self.pixel_paths = width * height * integrator.camera_paths
+        guided = integrator.guided_lights
+        super().__init__(integrator, scene, sensor, seed, iterations, CHUNK, guided)
         self.capacity = {
             "camera": rounded_up(4 * self.chunk),
             "hits": rounded_up(self.chunk),
             "ends": rounded_up(6 * integrator.resampled_light_paths),
         }
-        self.lens = Lens(sensor).connects
         self._share_light()
         depth = integrator.max_depth
         self.lit = not self.lights.dark and (depth < 0 or depth >= 2)
@@ -98,8 +79,6 @@ class ResampledPasses(IterativeSession):
         self.reach = 4 * float(
             np.linalg.norm(np.array(bounds.max).ravel() - np.array(bounds.min).ravel())
         )
-        self.expected_weight = expected_weight(sensor.film(), integrator.camera_paths)
-        self.recorded = recorder()
         self.grid = self._grid(mi.Point3f(0), mi.Normal3f(0, 0, 1))
         self.records, self.shares = uniform_tables(self.grid)
         self.cache = self.known = self.first_light = None
@@ -207,17 +186,6 @@ class ResampledPasses(IterativeSession):
         return merging_of(self.traits, spectral["radius"], self.merged_paths)
 
     # ------------------------------------------------------------------ passes
-
-    def _trace_light(self, scene, sensor, tables, sequence, first, spectral):
-        light_pass = self.describe_light_pass(sensor, sequence, self.light_chunk, spectral, first)
-        return trace_light_subpaths(
-            self.world,
-            self.limits,
-            light_pass,
-            self.weights(spectral),
-            self.capacity["light"],
-            self.integrator.splits_light,
-        )
 
     def _trace_camera(self, scene, sensor, tables, sequence, first, skip, spectral):
         first = with_gaps(first, skip, self.chunk, self.camera_paths)
@@ -558,26 +526,7 @@ class ResampledPasses(IterativeSession):
     def _join_sensor(self, scene, sensor, tables, light, count, seed, spectral):
         """Block of the light sub-paths that are joined with the sensor: three channels, and three
         for each class."""
-        index = lanes(self.capacity["light"])
-        active = index < dr.gather(mi.UInt32, count, 0)
-        y = read_vertices(light, index, active, states=END)
-        rng = vertex_streams(y["path"], y["number"], seed)
-        aperture = next_2d(rng) if sensor.needs_aperture_sample() else mi.Point2f(0.5)
-        joined = join_sensor(
-            self.world,
-            self.limits,
-            self.integrator,
-            Lens(sensor),
-            y,
-            aperture,
-            spectral["wavelengths"],
-            active,
-            rng,
-        )
+        y, joined = self._joined_with_sensor(sensor, light, count, seed, spectral, END)
         value = joined.value * (self.weights(spectral).seen_by_sensor(joined, y) / self.ratio)
-        spectra = [value]
-        if self.integrator.splits_light:
-            smooth = dr.select(y["depth"] == 1, mi.UInt32(1), mi.UInt32(2))
-            spectra += by_class(class_of(smooth, y["mark"]), value)
-        matrix = spectral["sensor_matrix"]
+        spectra, matrix = self._with_classes(value, y), spectral["sensor_matrix"]
         return splat_light(sensor.film(), joined.film, spectra, matrix, joined.active)

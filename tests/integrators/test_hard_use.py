@@ -301,6 +301,23 @@ def test_variants_in_turn(rgb):
     session.iterate()
 
 
+def test_classes_belong_to_the_active_variant(rgb):
+    """Whatever inherits from a module that is loaded anew is loaded anew itself, after it."""
+    mi.set_variant("llvm_ad_mono")
+    mi.set_variant("llvm_ad_rgb")
+    package = "mis_integrators.integrators."
+    modules = {name: module for name, module in sys.modules.items() if name.startswith(package)}
+    classes = [
+        c for module in modules.values() for c in vars(module).values() if isinstance(c, type)
+    ]
+    inherited = {
+        base for c in classes for base in c.__mro__[1:] if base.__module__.startswith(package)
+    }
+    assert len(inherited) > 10
+    for base in inherited:
+        assert base is getattr(modules[base.__module__], base.__name__), base
+
+
 def test_threads_take_turns(rgb, monkeypatch):
     """Two threads that render one scene at the same time get their own images, and no two
     iterations or set-ups overlap: who sets up outside the lock meets another's recorded pass."""
