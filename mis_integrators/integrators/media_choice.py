@@ -73,10 +73,8 @@ def new_session(plugin, integrator, scene, sensor, seed, iterations):
     }
     if iterations or plugin == PHOTONS:
         parameters["camera_paths"] = integrator.initial_camera_paths
-    if plugin == PHOTONS:
-        parameters["denoised"] = integrator.denoised
     made = mi.load_dict(parameters)
-    made.denoised = integrator.denoised
+    made.denoised = integrator.denoised  # no parameter of camera paths, which keep channels empty
     samples = (iterations or 0) * integrator.initial_camera_paths
     return made.session(scene, sensor, seed, samples)
 

@@ -29,8 +29,8 @@ class KernelSums:
         return tuple(mi.Float(0) if self.grey else mi.Spectrum(0) for _ in range(count))
 
     def read(self, photon_map, index, active):
-        """Flux of photons `index`, where they come from, and whether the last thing before was a
-        delta function (False where they are not marked)."""
+        """Flux of photons `index`, `delta_at_light` as of `photon.write_photon` (False where they
+        are not marked), and the direction to where they came from (not normalised)."""
         flux, towards = read_power(photon_map.power, index, active)
         return (*read_mark(flux), towards) if self.marked else (flux, mi.Bool(False), towards)
 

@@ -7,6 +7,7 @@ the image and of 3 or 8 % in a block is seen with a probability of 0.95.
 
 import json
 import math
+from types import SimpleNamespace
 
 from mis_integrators.integrators import costs
 from mis_integrators.paths.path_length_statistics import mean_segments
@@ -220,6 +221,22 @@ def test_prices(rgb):
     assert costs.cost("path", (3.5, 9.0, 9.0, 9.0)) == 3.5
     few, many = (costs.cost("bdpm", (1, 1, photons, 1)) for photons in (0, 100))
     assert few < many < 10 * few
+
+
+def test_more_camera_paths_cost_more(rgb):
+    """Each of a pixel's camera paths has its segments and its photons; light sub-paths and what an
+    iteration takes besides are counted once."""
+    pixels, light_paths, photons = 10, 30, 3
+    for camera_paths in (1, 4):
+        session = SimpleNamespace(
+            light_path_count=light_paths,
+            photons_a_path=photons,
+            camera_paths=camera_paths,
+            path_count=pixels * camera_paths,
+        )
+        found = costs.events(session, [1.0, 0.5, 0.25], 1, 20.0, camera_paths)
+        of_light = light_paths / pixels * (1 + photons)
+        assert found == (1.5 * camera_paths, of_light, 20.0 * camera_paths, 1.0)
 
 
 # --- The choice ---------------------------------------------------------------
