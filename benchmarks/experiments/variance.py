@@ -91,14 +91,15 @@ def variants(options: argparse.Namespace) -> list[tuple[Method, Callable]]:
 
 def compare(opened: OpenScene, camera_paths: int, options: argparse.Namespace) -> list[Row]:
     """A row a method; pictures and maps go to a PNG. Ratios are to the best of the pure strategies
-    (`bdpm`), or of all if there is none.
+    (`bdpm`), or of all if there is none. Methods take turns, so that what else the machine does
+    delays all of them; the time of an iteration is the median.
 
     Methods whose plugin has no merge radius or no channel of variances, and those that cannot
     render the scene, are left out.
     """
     radius = merge_radius(opened, options)
     common = {"initial_radius": radius, "camera_paths": camera_paths, "variance": True}
-    methods, images, variances, seconds = [], [], [], []
+    methods, changes, sessions = [], [], []
     for method, changed in variants(options):
         with changed():
             try:
@@ -111,17 +112,23 @@ def compare(opened: OpenScene, camera_paths: int, options: argparse.Namespace) -
                 console.print(f"{opened.name}: {method.label} left out: {loading.one_line(error)}")
                 continue
             session.iterate()
-            start = time.perf_counter()
-            while session.iterations < options.iterations + 2:
-                session.iterate()
-                tell(f"{opened.name}: {method.label} {session.iterations}")
         methods.append(method)
-        seconds.append((time.perf_counter() - start) / options.iterations)
-        image = session.image()
-        images.append(image[..., :3])
-        variances.append(image[..., -3:] * session.iterations)
+        changes.append(changed)
+        sessions.append(session)
     if not methods:
         raise SystemExit(f"{opened.name}: no method's variance can be measured")
+    times = np.zeros((options.iterations, len(methods)))
+    for number in range(options.iterations):
+        for column, (changed, session) in enumerate(zip(changes, sessions)):
+            with changed():
+                start = time.perf_counter()
+                session.iterate()
+                times[number, column] = time.perf_counter() - start
+            tell(f"{opened.name}: {methods[column].label} {number + 1}")
+    seconds = np.median(times, axis=0)
+    rendered = [session.image() for session in sessions]
+    images = [image[..., :3] for image in rendered]
+    variances = [image[..., -3:] * session.iterations for image, session in zip(rendered, sessions)]
     mean = np.mean(images, axis=0)
     maps = [relative_variance(variance, mean) for variance in variances]
     singles = [number for number, method in enumerate(methods) if method.plugin == "bdpm"] or list(
