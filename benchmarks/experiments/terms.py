@@ -29,6 +29,7 @@ COLUMNS = (
     "cross share",
     "camera share",
     "photon share",
+    "B",
     "F / N_F",
     "error of a share",
 )
@@ -123,6 +124,7 @@ def compare(opened: OpenScene, camera_paths: int, options: argparse.Namespace) -
                 "cross share": float(cross),
                 "camera share": float(of_camera),
                 "photon share": float(of_photons),
+                "B": float(camera) * camera_paths,
                 "F / N_F": float(light),
                 "error of a share": float(spread.std(axis=0, ddof=1).max() / GROUPS**0.5),
             }
