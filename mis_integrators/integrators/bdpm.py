@@ -10,16 +10,24 @@ import mitsuba as mi
 from ..core.film import as_camera_weights, expected_weight, splat_light, splat_samples, with_colour
 from ..core.packing import with_reserve
 from ..core.recording import recorder
+from ..core.spectra import channel_mean
 from ..core.traits import SceneTraits, lookup
 from ..lights.lights import Lights
 from ..paths.camera import film_sample_count, film_size
 from ..paths.layers import CHANNELS, SPLIT
-from ..paths.light_classes import LightClasses, by_class_of_photons
+from ..paths.light_classes import CAUSTIC, CLASSES, LightClasses, by_class_of_photons
 from ..paths.lobes import is_narrow, narrow_bsdfs
 from ..paths.ray_cones import cones_of
 from ..paths.sensor import Lens
 from ..paths.setting import World
 from ..photons.beams import Beams, gather_along, mean_count_along, read_beams
+from ..photons.chance import (
+    StartDensity,
+    can_meet_lights,
+    photon_weigher,
+    weight_of_hit,
+    x_of,
+)
 from ..photons.coverage import covered_share
 from ..photons.gather import QueryVertices, gather_photons, mean_photon_count
 from ..photons.grid import PhotonMap, build_photon_map
@@ -216,6 +224,9 @@ class BDPMSession(PilotedSession):
     """Whether in images that will be denoised near pixels share no photons that the camera sees:
     caustic ones have disks of a pixel's size there, and volume photons are joined with the sensor.
     (Weights know one radius for all, and beams only.)"""
+    meets_lights = True
+    """Whether camera paths bring caustic light, too, where they meet lights by chance. (Weights
+    know of photons alone.)"""
     points = False
     """Whether volume photons are gathered at vertices in media, and not along beams."""
 
@@ -257,6 +268,13 @@ class BDPMSession(PilotedSession):
             self.narrow = narrow_bsdfs(scene)
         self.has_caustics_unseen = self.has_caustics and (
             self.cones is None or integrator.bdd > 0 or self.narrow is not None
+        )
+        self.by_chance = (
+            self.meets_lights
+            and self.has_caustics
+            and self.traits.has_light_surfaces
+            and not self.traits.has_media
+            and can_meet_lights(scene)
         )
         self.one_vertex = not self.traits.has_mixed and (
             (integrator.bdd == 0 and self.narrow is None) or not self.has_caustics
@@ -496,7 +514,7 @@ class BDPMSession(PilotedSession):
 
     def _light_state(self, spectral):
         """What photons carry for the weights; None where there are none."""
-        return None
+        return StartDensity(self.lights) if self.by_chance else None
 
     def _merge_state(self, spectral):
         """The weights of camera paths (a `mis.state.MergeState`); None where there are none."""
@@ -518,6 +536,7 @@ class BDPMSession(PilotedSession):
             self.points,
             self.cones,
             self.near_zone,
+            self.by_chance,
         )
         return trace_camera_paths(
             self.world,
@@ -584,17 +603,45 @@ class BDPMSession(PilotedSession):
         if kind == "seen_caustic":
             radii = [dr.minimum(radius, pixel_disk(record)) for radius in radii]
         light_paths, max_depth = self._light_paths, self.integrator.max_depth
-        marked = self.integrator.splits_light
+        marked, weigher = self.integrator.splits_light, None
+        if self.by_chance and kind != "indirect":
+            weigher = photon_weigher(self.lights, light_paths, vertices)
         if isinstance(photon_map, TieredMap):
             narrow = False
             if self.narrow is not None:
                 narrow = is_narrow(self.narrow, vertices.bsdf, vertices.si, vertices.active)
-            return gather_tiers(
-                photon_map, vertices, radii[0], light_paths, max_depth, weigh, marked, narrow
+            found = gather_tiers(
+                photon_map, vertices, radii[0], light_paths, max_depth, weigher, marked, narrow
             )
-        return gather_photons(
-            photon_map, vertices, radii, light_paths, max_depth, weigh, grey, marked
-        )
+            if weigher is not None:
+                flux, left = record["hits"]["flux"], self._tiers_left
+                radii = [
+                    photon_map.radii_of(vertices.p, flux, radii[0], narrow, left, vertices.active)
+                ]
+        else:
+            weigh = weigher(photon_map, radii) if weigher is not None else weigh
+            found = gather_photons(
+                photon_map, vertices, radii, light_paths, max_depth, weigh, grey, marked
+            )
+        if weigher is not None:
+            found = self._with_hits(found, record["hits"], radii, vertices.active, grey)
+        return found
+
+    @property
+    def _tiers_left(self):
+        """The last tier whose photons have the radius of the first, see `build_tiered_map`."""
+        return LEFT_TO_DENOISER if self.cones is not None else 0
+
+    def _with_hits(self, found, hits, radii, active, grey):
+        """What photons bring to vertices for each radius (and class), with the lights that paths
+        have met."""
+        classes = len(found) // len(radii)
+        place = CLASSES.index(CAUSTIC) if classes > 1 else 0
+        light = dr.select(active, hits["light"], 0)
+        for number, radius in enumerate(radii):
+            value = light * weight_of_hit(x_of(self._light_paths, radius, hits["ratio"]))
+            found[number * classes + place] += channel_mean(value) if grey else value
+        return found
 
     def _covered(self, scene, tables, vertices, radius, seed):
         """`covered` of the vertices of a buffer (recorded: `tables` are what it reads)."""
@@ -646,7 +693,8 @@ class BDPMSession(PilotedSession):
                 return build_volume_map(
                     *in_media[:3], radius, self.volume_capacity, *in_media[3:], density=density
                 )
-        mis_words = photons[3] if kind == "indirect" and len(photons) > 3 else None
+        weighted = len(photons) > 3 and (kind == "indirect") != self.by_chance
+        mis_words = photons[3] if weighted else None
         return build_photon_map(
             *photons[:3],
             self.traits.bounds,
@@ -682,7 +730,8 @@ class BDPMSession(PilotedSession):
             radius,
             self.photon_capacity,
             around,
-            LEFT_TO_DENOISER if self.cones is not None else 0,
+            self._tiers_left,
+            photons[3] if self.by_chance else None,
         )
 
     def _render_chunk(self, scene, sensor, tables, maps, sequence, first, spectral, radii, beyond):

@@ -165,7 +165,7 @@ class CameraVisitor(Protocol):
     def emission(self, state: list[Any], at: CameraArrival, active: Array) -> Array:
         """Radiance of a light that is met. Not called in scenes without lights that can be met."""
 
-    def unfinished(self, state: list[Any]) -> Array:
+    def unfinished(self, state: list[Any], at: CameraArrival) -> Array:
         """Which sub-paths may scatter at what they have met."""
 
     def arrive(
@@ -250,7 +250,7 @@ def trace_camera(
             radiance += visitor.emission(state, at, active)
 
         # ---- Arrive
-        active &= si.is_valid() & visitor.unfinished(state)
+        active &= si.is_valid() & visitor.unfinished(state, at)
         met = mi.Bool(active)  # a surface, perhaps the last one
         if dr.hint(max_depth > 0, mode="scalar"):
             active &= depth < max_depth

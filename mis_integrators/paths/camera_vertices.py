@@ -161,7 +161,7 @@ class StepVisitor:
         self.hit.write(store.hits, values, slot, met)
         return dr.select(shown & (at.depth == 1), value, 0)
 
-    def unfinished(self, state):
+    def unfinished(self, state, at):
         return mi.Bool(True)
 
     def arrive(self, state, at, rng, active):

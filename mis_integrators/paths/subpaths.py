@@ -357,7 +357,7 @@ class CameraVertexVisitor:
             self.classes.add("met", at.path, class_of(*history), light * share, shown)
         return dr.select(shown, light * share, 0)
 
-    def unfinished(self, state):
+    def unfinished(self, state, at):
         return mi.Bool(True)
 
     def arrive(self, state, at, rng, active):

@@ -173,7 +173,8 @@ def gather_photons(
     light_path_count : light sub-paths that made the photons
     max_depth : segments of a whole path (negative: unlimited)
     weigh : None, or the weight of a photon, ``weigh(index, landing, scattering, active)``, a
-        spectrum or a number: its index in the map, its `Landing` and its `Scattering`
+        spectrum or a number, or a list with one for each radius: its index in the map, its
+        `Landing` and its `Scattering`
     grey : sums the mean over channels only (fewer sums to keep for many radii)
     marked : the photons are (`photon.write_photon`)
     height : the radius by which photons are close to a vertex' plane (None: that of the disk)
@@ -190,10 +191,10 @@ def gather_photons(
         if max_depth > 0:
             hit &= landing.depth + vertices.depth <= max_depth
         flux, delta_at_light, towards = sums.read(photon_map, index, hit)
-        value = _contribution(flux, towards, vertices, index, landing, weigh, hit)
+        value, weights = _contribution(flux, towards, vertices, index, landing, weigh, hit)
         # The largest radius is tested again, too: without, kernels are slower by some per cent.
         inside = [hit & within_disk(offset, distance_squared, vertices.n, r, height) for r in radii]
-        return sums.add(totals, value, inside, vertices, landing, delta_at_light)
+        return sums.add(totals, value, inside, vertices, landing, delta_at_light, weights)
 
     active = vertices.active
     totals = for_each_photon(photon_map, vertices.p, radii[-1], active, visit, sums.zeros())
@@ -201,14 +202,17 @@ def gather_photons(
 
 
 def _contribution(flux, towards, vertices, index, landing, weigh, active):
-    """What photons `index` bring: BSDF x flux x weight, over the cosine where they landed."""
+    """What photons `index` bring, BSDF x flux x weight, over the cosine where they landed; and the
+    weights that are not in it, one for each radius (None: none)."""
     scattering = vertices.scatter(towards, weigh is not None, active)
-    value = scattering.value
+    value, weights = scattering.value, None
     if weigh is not None:
         lit = active & (dr.max(value) > 0)
-        weight = weigh(index, landing, scattering, lit)
-        value *= dr.select(lit, weight, 0)
-    return value * flux * dr.rcp(landing_cosine(landing.n, scattering, vertices.plane))
+        weights = weigh(index, landing, scattering, lit)
+        if not isinstance(weights, list):
+            value *= dr.select(lit, weights, 0)
+            weights = None
+    return value * flux * dr.rcp(landing_cosine(landing.n, scattering, vertices.plane)), weights
 
 
 def mean_photon_count(photon_map, vertices, radius):

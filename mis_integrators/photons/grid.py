@@ -142,12 +142,16 @@ def build_photon_map(surface, power, count, bbox, cell, capacity: int, kind: str
     if kind != "all":
         active &= landing.caustic == (kind == "caustic")
     start, surface, power, target = sorted_photons(grid, record, power, active)
-    place = None
-    if mis_words is not None:
-        place = dr.empty(mi.UInt32, capacity)
-        dr.scatter(place, dr.arange(mi.UInt32, capacity), target, active)
-        dr.eval(place)
+    place = None if mis_words is None else places_before(target, active)
     return PhotonMap(grid, start, surface, power, mis_words, place)
+
+
+def places_before(target, active):
+    """Where photons that have gone to the places `target` were before, by where they are now."""
+    place = dr.empty(mi.UInt32, dr.width(target))
+    dr.scatter(place, dr.arange(mi.UInt32, dr.width(target)), target, active)
+    dr.eval(place)
+    return place
 
 
 def read_photons(surface, count, capacity):

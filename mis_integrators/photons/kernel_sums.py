@@ -34,15 +34,20 @@ class KernelSums:
         flux, towards = read_power(photon_map.power, index, active)
         return (*read_mark(flux), towards) if self.marked else (flux, mi.Bool(False), towards)
 
-    def add(self, totals, value, inside, asking, landing, delta_at_light):
+    def add(self, totals, value, inside, asking, landing, delta_at_light, weights=None):
         """The sums with the `value` of one photon more, `inside` each radius or not. `asking`: what
-        gathers it; `landing`: where it landed."""
+        gathers it; `landing`: where it landed; `weights`: of the value, for each radius."""
         if self.grey:
             value = channel_mean(value * self.throughput)
         values = [value]
         if self.split:
             values = by_class_of_photons(value, landing.depth, asking.first, delta_at_light)
-        found = [dr.select(i, value, 0) for i in inside for value in values]
+        weights = weights or [1] * len(inside)
+        found = [
+            dr.select(i, value * weight, 0)
+            for i, weight in zip(inside, weights)
+            for value in values
+        ]
         return tuple(total + value for total, value in zip(totals, found))
 
     def estimates(self, totals, measure, light_path_count, active):

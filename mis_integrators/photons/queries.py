@@ -23,6 +23,7 @@ from ..paths.setting import CameraPass, Limits, ListedPass, World
 from ..paths.subpaths import selected, smooth_at
 from ..paths.vertex import PhaseOrBSDF, Sides
 from .beams import FIRST, LEVEL_SHIFT, LONG, SHORT, beam_layout, new_beams
+from .chance import hit_layout, write_hit
 from .points import new_points, point_layout
 
 LAST_VERTEX = 1 << 31
@@ -74,11 +75,12 @@ def weight_layout():
     return Layout(dict.fromkeys((*STATE, "share"), mi.Spectrum))
 
 
-def new_vertex_buffer(capacity, weighted=False, split=False, cones=False):
+def new_vertex_buffer(capacity, weighted=False, split=False, cones=False, hits=False):
     """Room for `capacity` camera vertices, a dictionary: `words` (records of `query_layout`; unused
     ones are zero), if `weighted`, `weights` (records of `weight_layout`), and if light is `split`
     into classes, `first`: whether the path has scattered smoothly nowhere before. With `cones`,
-    `pixel`: how wide a pixel is there; 0 where the path has scattered smoothly before."""
+    `pixel`: how wide a pixel is there; 0 where the path has scattered smoothly before. With `hits`,
+    those of lights that are met by chance (records of `chance.hit_layout`; zero: none)."""
     buffer = {"words": dr.zeros(mi.UInt32, query_layout().words * capacity)}
     if weighted:
         buffer["weights"] = weight_layout().room(capacity)
@@ -86,6 +88,8 @@ def new_vertex_buffer(capacity, weighted=False, split=False, cones=False):
         buffer["first"] = dr.zeros(mi.Bool, capacity)
     if cones:
         buffer["pixel"] = dr.zeros(mi.Float, capacity)
+    if hits:
+        buffer["hits"] = dr.zeros(mi.UInt32, hit_layout().words * capacity)
     return buffer
 
 
@@ -103,6 +107,8 @@ def read_queries(vertices, first=0, count=None):
         record["first"] = dr.gather(mi.Bool, vertices["first"], index)
     if "pixel" in vertices:
         record["pixel"] = dr.gather(mi.Float, vertices["pixel"], index)
+    if "hits" in vertices:
+        record["hits"] = hit_layout().read(vertices["hits"], index)
     return record
 
 
@@ -135,7 +141,8 @@ class Queries:
     `cones` (`RayCones`, or None): they tell how wide pixels are at vertices that the camera sees;
     `near_zone` (a `NearZone`, or None): volume photons beyond it are joined with the sensor. Then
     photons bring all light of media on the way to the first smooth surface: all segments before it
-    have long beams, the first one those within the zone.
+    have long beams, the first one those within the zone. `meets_lights`: lights that paths meet
+    behind delta surfaces are kept with the smooth vertex before (not in scenes with media).
     """
 
     bdd: int
@@ -148,6 +155,7 @@ class Queries:
     points: bool = False
     cones: Any = None
     near_zone: Any = None
+    meets_lights: bool = False
 
 
 class QueryVisitor:
@@ -160,8 +168,10 @@ class QueryVisitor:
     `bdd`-th); whether there was any of these; whether the last vertex scattered by a delta
     function; the density of the last smooth scattering; the last smooth vertex; the weight of
     direct light there; how many times light counts that is found there; the state of `weights`;
-    with `classes` what these carry along; with the queries' `cones` the path's; and in scenes with
-    media the share of light that has got through these without being scattered.
+    with `classes` what these carry along; with the queries' `cones` the path's; where paths meet
+    lights by chance, the place of the last smooth vertex, the cosine at which they left it, and the
+    mean throughput with which they did; and in scenes with media the share of light that has got
+    through these without being scattered.
 
     In media, paths scatter until they have left `bdd` smooth vertices behind, and go straight on
     from there; where photons are asked for at points, until they have left one more behind. Where
@@ -181,6 +191,7 @@ class QueryVisitor:
                 weights is not None,
                 classes is not None,
                 queries.cones is not None,
+                queries.meets_lights,
             ),
             room=dr.opaque(mi.UInt32, queries.capacity),
             count=dr.zeros(mi.UInt32, self.sections),
@@ -216,11 +227,12 @@ class QueryVisitor:
         history = [] if self.classes is None else start_of_camera_path()
         begun = [mi.UInt32(0), mi.Bool(False), mi.Bool(False), one, origin, mi.Spectrum(1)]
         cone = [] if self.queries.cones is None else self.queries.cones.begin()
+        left = [mi.UInt32(0), one, one] if self.queries.meets_lights else []
         clear = [mi.Spectrum(1)] if self.traits.has_media else []
-        return [*begun, mi.Float(self.first), sums, history, cone, clear]
+        return [*begun, mi.Float(self.first), sums, history, cone, left, clear]
 
     def travel(self, state, ray, flight, numbers, throughput, path, depth, active):
-        *others, clear = state
+        *others, left, clear = state
         brought = throughput
         if self.queries.near_zone is not None:
             kept = numbers.at(BEAM + depth).next_float32() < BEAMS_KEPT
@@ -245,14 +257,14 @@ class QueryVisitor:
             *others, cone = others
             passed = dr.norm(ray.o - begun)
             others += [self.queries.cones.grown(cone, ray.d, passed, depth == 0, active)]
-        return [*others, [clear[0] * kept]], hit, ray, flight, throughput * kept
+        return [*others, left, [clear[0] * kept]], hit, ray, flight, throughput * kept
 
     def _keep_beams(self, state, throughput, path, depth, kind):
         """What keeps the beams of paths (see `pass_straight`, `fly`): long ones after `bdd` smooth
         vertices, short ones before; with a near zone also long ones before the first vertex."""
         if not self.queries.beams:
             return lambda *piece: None
-        vertex, *_, sums, history, _, _ = state
+        vertex, *_, sums, history, _, _, _ = state
         store, wanted = self.store, mi.Bool(True)
         if kind == LONG:
             wanted &= vertex == self.bdd
@@ -297,12 +309,14 @@ class QueryVisitor:
         return keep
 
     def emission(self, state, at, active):
-        _, met, behind_delta, scatter_pdf, origin, share_here, times, sums, history, _, _ = state
+        _, met, behind_delta, scatter_pdf, origin, share_here, times, sums, history, *more = state
         ds = mi.DirectionSample3f(self.scene, at.si, origin)
         shown = active & (~met | ~behind_delta)
         if self.hide_emitters:
             shown &= (at.depth > 1) | at.si.is_valid()
         later = shown & met
+        if self.queries.meets_lights:
+            self._keep_hit(more[1], at, scatter_pdf, active & met & behind_delta)
         light_pdf = self.lights.pdf_direct(origin, ds, later)
         if self.by_light:
             share_here = share_here * self.weights.next_event_weight(sums, origin, ds, later)
@@ -312,14 +326,38 @@ class QueryVisitor:
             self.classes.add("met", at.path, class_of(*history), light * times, shown)
         return dr.select(shown, light * times, 0)
 
-    def unfinished(self, state):
-        return mi.Bool(True) if self.passes_masks else state[0] <= self.bdd
+    def _keep_hit(self, left, at, scatter_pdf, met):
+        """Keeps the light that paths have met behind delta surfaces with the vertex before these,
+        which they have `left`."""
+        slot, cosine, throughput = left
+        light = at.throughput * at.si.emitter(self.scene, met).eval(at.si, met)
+        met &= dr.max(light) > 0
+        write_hit(
+            self.store.vertices["hits"],
+            slot,
+            self.lights,
+            at.si,
+            at.ray,
+            light,
+            throughput,
+            cosine,
+            scatter_pdf,
+            met & (slot < self.queries.capacity),
+        )
+
+    def unfinished(self, state, at):
+        if self.passes_masks:
+            return mi.Bool(True)
+        unfinished = state[0] <= self.bdd
+        if self.queries.meets_lights:
+            unfinished |= mi.has_flag(at.bsdf.flags(), mi.BSDFFlags.Delta)
+        return unfinished
 
     def arrive(self, state, at, rng, active):
         vertex, met, behind_delta, scatter_pdf, origin, share_here, times, sums, *more = state
         weights, bsdf = self.weights, at.bsdf
         smooth = smooth_at(at, active)
-        if self.passes_masks:
+        if self.passes_masks or self.queries.meets_lights:
             smooth &= vertex <= self.bdd
         at.ends = vertex >= self.bdd  # the path's last smooth vertex
         if self.queries.narrow is not None:
@@ -334,8 +372,8 @@ class QueryVisitor:
             share_here = dr.select(smooth, share, share_here)
             at.ends |= weights.ends(self._scattering(at), vertex, smooth)
         if self.queries.cones is not None:
-            history, cone, clear = more
-            more = [history, self.queries.cones.arrived(cone, at, active), clear]
+            history, cone, *others = more
+            more = [history, self.queries.cones.arrived(cone, at, active), *others]
         state = [vertex, met, behind_delta, scatter_pdf, origin, share_here, times, sums, *more]
         direct = mi.Spectrum(0)
         if not self.lights.dark:
@@ -343,7 +381,7 @@ class QueryVisitor:
             if self.classes is not None:
                 number = class_of(more[0][0] + 1, mi.Bool(False))
                 self.classes.add("next_event", at.path, number, direct, smooth)
-        self._ask_for_photons(state, at, smooth)
+        at.slot = self._ask_for_photons(state, at, smooth)
         return state, direct
 
     def _scattering(self, at):
@@ -373,7 +411,7 @@ class QueryVisitor:
 
     def _ask_in_medium(self, state, at, wants):
         """Stores the vertices in media at which photons are to be gathered."""
-        vertex, _, _, _, _, share_here, _, sums, history, _, _ = state
+        vertex, _, _, _, _, share_here, _, sums, history, *_ = state
         store = self.store
         section = dr.select(at.ends, mi.UInt32(self.bdd), vertex)
         slot = dr.scatter_inc(store.point_count, section, wants)
@@ -394,8 +432,8 @@ class QueryVisitor:
             dr.scatter(store.points["first"], history[0] == 0, slot, wants)
 
     def _ask_for_photons(self, state, at, smooth):
-        """Stores the vertices at which photons are to be gathered."""
-        vertex, met, _, _, _, share_here, _, sums, history, cone, _ = state
+        """Stores the vertices at which photons are to be gathered; returns their places."""
+        vertex, met, _, _, _, share_here, _, sums, history, cone, *_ = state
         weights, store, queries = self.weights, self.store, self.queries
         last = at.ends | (weights is not None)
         wants = smooth & (dr.max(at.throughput) > 0)
@@ -414,7 +452,7 @@ class QueryVisitor:
             wants &= slot < store.room
             slot += section * store.room
         if not queries.capacity:
-            return
+            return slot
         query_layout().write(store.vertices["words"], query_at(at, last), slot, wants)
         if weights is not None:
             state = {**dict(zip(STATE, weights.stored(sums))), "share": share_here}
@@ -423,14 +461,22 @@ class QueryVisitor:
             dr.scatter(store.vertices["first"], history[0] == 0, slot, wants)
         if cone:
             dr.scatter(store.vertices["pixel"], dr.select(met, 0, cone[0]), slot, wants)
+        return slot
 
     def leave(self, state, at, rng, bs, weight, delta, active):
-        vertex, met, _, scatter_pdf, origin, share_here, times, sums, history, cone, clear = state
+        vertex, met, _, scatter_pdf, origin, share_here, times, sums, history, *more = state
+        cone, left, clear = more
         if not self.traits.has_light_surfaces:
             active &= delta | ~at.ends
         if self.passes_masks:
             active &= vertex <= self.bdd
+        if self.queries.meets_lights:
+            active &= delta | (vertex <= self.bdd)
         scattered = active & ~delta
+        if left:
+            cosine = dr.abs(dr.dot(at.si.n, at.si.to_world(bs.wo)))
+            now = [at.slot, cosine, channel_mean(at.throughput * weight)]
+            left = selected(scattered, now, left)
         if self.weights is not None:
             sums = self.weights.scatter(sums, at.si, self._scattering(at), bs, vertex, scattered)
         beyond = dr.select(at.ends, mi.UInt32(self.bdd), vertex) + 1
@@ -447,13 +493,14 @@ class QueryVisitor:
             sums,
             scattered_history(history, delta, active) if history else [],
             cone,
+            left,
             clear,
         ]
         return state, weight, active
 
     def cross(self, before, after, crosses):
-        *left, _, clear = before
-        return selected(crosses, [*left, after[-2], clear], after)
+        *others, _, left, clear = before
+        return selected(crosses, [*others, after[-3], left, clear], after)
 
     def alpha(self, state, visible):
         if not self.traits.has_media:
@@ -476,7 +523,8 @@ def trace_camera_paths(
     On the way: emission seen directly or through delta surfaces; at every smooth vertex up to the
     `bdd`-th, direct light by next-event estimation combined with BSDF sampling (power heuristic).
     Light that reaches a smooth vertex through delta surfaces belongs to caustic photons and is left
-    out. Delta vertices do not count; a BSDF with both parts is a smooth vertex whose delta part
+    out; where `queries` say that paths meet lights, that which they have met there is kept with the
+    vertex. Delta vertices do not count; a BSDF with both parts is a smooth vertex whose delta part
     goes on. At `queries.narrow` vertices there is direct light, but they do not count, either.
 
     Returns `(radiance, alpha, splat position, vertices, count)`: the vertices at which photons are

@@ -17,6 +17,7 @@ from .grid import (
     Grid,
     PhotonMap,
     Table,
+    places_before,
     read_photons,
     sorted_photons,
 )
@@ -34,7 +35,8 @@ They bring at most `MOST_OF_LIGHT` of what falls within eight pixels."""
 
 class TieredMap:
     """Sorted photons, tier by tier. `arrays`: `start`, `surface` and `power` as of a `PhotonMap`,
-    and `tier_radius`, that of the first tier."""
+    perhaps `mis_words` and `place`, too; `tier_radius`, that of the first tier; and `around`, the
+    `LightAround` that tells the tiers."""
 
     def __init__(self, arrays, bbox, capacity):
         self._arrays, self.bbox, self.table = arrays, bbox, tier_table(capacity)
@@ -56,7 +58,17 @@ class TieredMap:
         grid = tier_grid(self.bbox, self.table, radius, number)
         last = self.table.first_entry(number + 1) - 1  # where no photon is
         count = dr.gather(mi.UInt32, start, last) - dr.gather(mi.UInt32, start, grid.first)
-        return PhotonMap(grid, start, surface, power), tier_radius(radius, number), count
+        words = (self._arrays.get(name) for name in ("mis_words", "place"))
+        photon_map = PhotonMap(grid, start, surface, power, *words)
+        return photon_map, tier_radius(radius, number), count
+
+    def radii_of(self, p, flux, first, narrow, left, active):
+        """Radii of the disks of photons of that `flux`, would they land at `p`; other arguments as
+        of `gather_tiers` and `tiers_of`."""
+        arrays = self._arrays
+        radius = arrays["tier_radius"]
+        number = tiers_of(arrays["around"], p, flux, radius, left, active)
+        return dr.select(number > 0, tier_radius(radius, number) * widening(narrow), first)
 
 
 def tier_table(capacity):
@@ -69,41 +81,55 @@ def tier_grid(bbox, table, radius, number):
     return Grid(bbox, tier_radius(radius, number), table, table.first_entry(number))
 
 
-def build_tiered_map(surface, power, count, bbox, radius, capacity, around, left=0):
+def tiers_of(around, p, flux, radius, left, active):
+    """Tiers of photons as of `LightAround.tier`, but those up to `left` are the first."""
+    number = around.tier(p, flux, radius, active)
+    return dr.select(number > left, number, 0)
+
+
+def widening(narrow):
+    """By what all disks but those of the first tier are larger, at vertices with `narrow` lobes."""
+    return dr.select(narrow, mi.Float(AT_NARROW_LOBES), 1)
+
+
+def build_tiered_map(surface, power, count, bbox, radius, capacity, around, left=0, mis_words=None):
     """The `TieredMap` of the caustic photons, which lie in the tiers that the light `around` them
     says (a `LightAround`), but those of tiers up to `left` in the first; other arguments as of
     `build_photon_map`."""
     record, active = read_photons(surface, count, capacity)
     landing = landing_of(record)
     active &= landing.caustic
-    number = around.tier(landing.p, flux_of(power, active), radius, active)
-    number = dr.select(number > left, number, 0)
+    number = tiers_of(around, landing.p, flux_of(power, active), radius, left, active)
     grid = tier_grid(bbox, tier_table(capacity), radius, number)
-    start, surface, power, _ = sorted_photons(grid, record, power, active, TIERS)
-    arrays = {"start": start, "surface": surface, "power": power, "tier_radius": radius}
+    start, surface, power, target = sorted_photons(grid, record, power, active, TIERS)
+    arrays = {"start": start, "surface": surface, "power": power}
+    if mis_words is not None:
+        arrays |= {"mis_words": mis_words, "place": places_before(target, active)}
+    arrays |= {"tier_radius": radius, "around": around}
     return TieredMap(arrays, bbox, capacity)
 
 
 def gather_tiers(
-    tiered, vertices, first, light_path_count, max_depth, weigh=None, marked=False, narrow=False
+    tiered, vertices, first, light_path_count, max_depth, weigher=None, marked=False, narrow=False
 ):
     """`gather_photons` of all tiers, each with its radius, which at vertices with `narrow` lobes is
     `AT_NARROW_LOBES` times as large, but the first with the radius `first` (of width one, or one a
-    vertex). Other arguments and result as there, but that there is one estimate, not one for each
-    radius."""
-    wider = dr.select(narrow, mi.Float(AT_NARROW_LOBES), 1)
+    vertex). `weigher(photon_map, radii)`: what makes `weigh` of a tier's map (None: no weights).
+    Other arguments and result as there, but that there is one estimate, not one for each radius."""
+    wider = widening(narrow)
 
     def step(number, totals):
         photon_map, radius, count = tiered.tier(number)
         there = copy.copy(vertices)
         there.active = vertices.active & (count > 0)
+        disk = dr.select(number > 0, radius * wider, first)
         parts = gather_photons(
             photon_map,
             there,
-            [dr.select(number > 0, radius * wider, first)],
+            [disk],
             light_path_count,
             max_depth,
-            weigh,
+            weigher and weigher(photon_map, [disk]),
             marked=marked,
             height=radius,
         )
