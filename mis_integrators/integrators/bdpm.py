@@ -10,27 +10,21 @@ import mitsuba as mi
 from ..core.film import as_camera_weights, expected_weight, splat_light, splat_samples, with_colour
 from ..core.packing import with_reserve
 from ..core.recording import recorder
-from ..core.spectra import channel_mean
 from ..core.traits import SceneTraits, lookup
 from ..lights.lights import Lights
+from ..mis.chance import ChanceWeights, StartDensity
 from ..paths.camera import film_sample_count, film_size
 from ..paths.layers import CHANNELS, SPLIT
-from ..paths.light_classes import CAUSTIC, CLASSES, LightClasses, by_class_of_photons
+from ..paths.light_classes import LightClasses, by_class_of_photons
 from ..paths.lobes import is_narrow, narrow_bsdfs
 from ..paths.ray_cones import cones_of
 from ..paths.sensor import Lens
 from ..paths.setting import World
 from ..photons.beams import Beams, gather_along, mean_count_along, read_beams
-from ..photons.chance import (
-    StartDensity,
-    can_meet_lights,
-    photon_weigher,
-    weight_of_hit,
-    x_of,
-)
 from ..photons.coverage import covered_share
 from ..photons.gather import QueryVertices, gather_photons, mean_photon_count
 from ..photons.grid import PhotonMap, build_photon_map
+from ..photons.hits import meets_one_light
 from ..photons.near_zone import NearZone
 from ..photons.queries import (
     Queries,
@@ -270,11 +264,11 @@ class BDPMSession(PilotedSession):
             self.cones is None or integrator.bdd > 0 or self.narrow is not None
         )
         self.by_chance = (
-            self.meets_lights
-            and self.has_caustics
+            self.cones is not None
+            and self.meets_lights
             and self.traits.has_light_surfaces
             and not self.traits.has_media
-            and can_meet_lights(scene)
+            and meets_one_light(scene)
         )
         self.one_vertex = not self.traits.has_mixed and (
             (integrator.bdd == 0 and self.narrow is None) or not self.has_caustics
@@ -603,45 +597,32 @@ class BDPMSession(PilotedSession):
         if kind == "seen_caustic":
             radii = [dr.minimum(radius, pixel_disk(record)) for radius in radii]
         light_paths, max_depth = self._light_paths, self.integrator.max_depth
-        marked, weigher = self.integrator.splits_light, None
+        marked, chance = self.integrator.splits_light, None
         if self.by_chance and kind != "indirect":
-            weigher = photon_weigher(self.lights, light_paths, vertices)
+            chance = ChanceWeights(self.lights, light_paths, vertices, record["hits"])
         if isinstance(photon_map, TieredMap):
-            narrow = False
+            narrow, first, weigher = mi.Bool(False), radii[0], chance and chance.weigher
             if self.narrow is not None:
                 narrow = is_narrow(self.narrow, vertices.bsdf, vertices.si, vertices.active)
             found = gather_tiers(
-                photon_map, vertices, radii[0], light_paths, max_depth, weigher, marked, narrow
+                photon_map, vertices, first, light_paths, max_depth, weigher, marked, narrow
             )
-            if weigher is not None:
-                flux, left = record["hits"]["flux"], self._tiers_left
-                radii = [
-                    photon_map.radii_of(vertices.p, flux, radii[0], narrow, left, vertices.active)
-                ]
+            if chance is not None:
+                flux, left = chance.hits["flux"], self._tiers_left
+                active = vertices.active & (flux > 0)
+                radii = [photon_map.radii_of(vertices.p, flux, first, narrow, left, active)]
         else:
-            weigh = weigher(photon_map, radii) if weigher is not None else weigh
+            if chance is not None:
+                weigh = chance.weigher(photon_map, radii)
             found = gather_photons(
                 photon_map, vertices, radii, light_paths, max_depth, weigh, grey, marked
             )
-        if weigher is not None:
-            found = self._with_hits(found, record["hits"], radii, vertices.active, grey)
-        return found
+        return found if chance is None else chance.with_hits(found, radii, grey)
 
     @property
     def _tiers_left(self):
         """The last tier whose photons have the radius of the first, see `build_tiered_map`."""
         return LEFT_TO_DENOISER if self.cones is not None else 0
-
-    def _with_hits(self, found, hits, radii, active, grey):
-        """What photons bring to vertices for each radius (and class), with the lights that paths
-        have met."""
-        classes = len(found) // len(radii)
-        place = CLASSES.index(CAUSTIC) if classes > 1 else 0
-        light = dr.select(active, hits["light"], 0)
-        for number, radius in enumerate(radii):
-            value = light * weight_of_hit(x_of(self._light_paths, radius, hits["ratio"]))
-            found[number * classes + place] += channel_mean(value) if grey else value
-        return found
 
     def _covered(self, scene, tables, vertices, radius, seed):
         """`covered` of the vertices of a buffer (recorded: `tables` are what it reads)."""

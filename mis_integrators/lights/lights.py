@@ -31,6 +31,8 @@ texture may have small bright spots all the same. (By `UNIFORM_SHARE` it is chos
 UNIFORM_SHARE = 0.1
 """Tuned: share of the choices among emitters that ignores power, so that a dim but near emitter is
 not starved."""
+NEVER_MET = 1e30
+"""Density per etendue of light that no camera path can meet."""
 
 
 def mis_power(pdf_a, pdf_b):
@@ -555,6 +557,13 @@ class Lights:
                 value = getattr(self, "_ratio_" + name)(ref, ds, index, chosen)
             density = dr.select(chosen, value, density)
         return density
+
+    def start_density(self, ref, ds, active):
+        """Density per etendue [1/(m^2 sr)] with which light sub-paths start from the light's point
+        or direction in `ds` towards `ref`: `NEVER_MET` for lights that no ray can meet."""
+        met = self.can_be_met(ds.emitter, active)
+        density = self.pdf_emission_origin(ref, ds, met) * self.pdf_emission_area(ref, ds, met)
+        return dr.select(met, density, NEVER_MET)
 
     def can_be_met(self, emitter, active):
         """Whether a ray can meet the emitter and see light there."""

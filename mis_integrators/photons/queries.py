@@ -23,7 +23,7 @@ from ..paths.setting import CameraPass, Limits, ListedPass, World
 from ..paths.subpaths import selected, smooth_at
 from ..paths.vertex import PhaseOrBSDF, Sides
 from .beams import FIRST, LEVEL_SHIFT, LONG, SHORT, beam_layout, new_beams
-from .chance import hit_layout, write_hit
+from .hits import hit_layout, new_hits, write_hit
 from .points import new_points, point_layout
 
 LAST_VERTEX = 1 << 31
@@ -80,7 +80,7 @@ def new_vertex_buffer(capacity, weighted=False, split=False, cones=False, hits=F
     ones are zero), if `weighted`, `weights` (records of `weight_layout`), and if light is `split`
     into classes, `first`: whether the path has scattered smoothly nowhere before. With `cones`,
     `pixel`: how wide a pixel is there; 0 where the path has scattered smoothly before. With `hits`,
-    those of lights that are met by chance (records of `chance.hit_layout`; zero: none)."""
+    those of lights that are met by chance (records of `hits.hit_layout`; zero: none)."""
     buffer = {"words": dr.zeros(mi.UInt32, query_layout().words * capacity)}
     if weighted:
         buffer["weights"] = weight_layout().room(capacity)
@@ -89,7 +89,7 @@ def new_vertex_buffer(capacity, weighted=False, split=False, cones=False, hits=F
     if cones:
         buffer["pixel"] = dr.zeros(mi.Float, capacity)
     if hits:
-        buffer["hits"] = dr.zeros(mi.UInt32, hit_layout().words * capacity)
+        buffer["hits"] = new_hits(capacity)
     return buffer
 
 
