@@ -51,6 +51,7 @@ ANALYTIC = "tests/integrators/test_analytic.py"
 LONG = "tests/app/test_long_renders.py"
 TIERS = "tests/photons/test_tiers.py"
 PIXEL_DISKS = "tests/integrators/test_pixel_disks.py"
+CHANCE = "tests/integrators/test_chance.py"
 SENSOR_LIGHT = "tests/integrators/test_sensor_light.py"
 VOLUME_RADII = "tests/photons/test_volume_radii.py"
 LOBES = "tests/integrators/test_narrow_lobes.py"
@@ -311,15 +312,15 @@ MUTATIONS = [
     ),
     Mutation(
         "photons/tiers.py",
-        "[dr.select(number > 0, radius * wider, first)]",
-        "[dr.select(number > 0, radius * wider, first * wider)]",
+        "disk = dr.select(number > 0, radius * wider, first)",
+        "disk = dr.select(number > 0, radius * wider, first * wider)",
         "well lit photons, too, have wide disks at narrow lobes",
         TIERS,
     ),
     Mutation(
         "photons/tiers.py",
-        "PhotonMap(grid, start, surface, power), tier_radius(radius, number), count",
-        "PhotonMap(grid, start, surface, power), radius, count",
+        "return photon_map, tier_radius(radius, number), count",
+        "return photon_map, radius, count",
         "photons of all tiers have the radius of the first",
         TIERS,
     ),
@@ -668,8 +669,8 @@ MUTATIONS = [
     ),
     Mutation(
         "photons/tiers.py",
-        "number = dr.select(number > left, number, 0)",
-        "number = mi.UInt32(number)",
+        "return dr.select(number > left, number, 0)",
+        "return number",
         "photons that a denoiser is to smooth have wide disks",
         f"{TIERS}::test_tiers_bring_what_brute_force_finds",
     ),
@@ -714,5 +715,33 @@ MUTATIONS = [
         "left = self.depth - 2 * self.radius - self",
         "beams end before the zone does",
         f"{SENSOR_LIGHT}::test_beams_reach_to_the_end_of_the_zone",
+    ),
+    Mutation(
+        "mis/chance.py",
+        "def weight_of_hit(x):\n    return dr.rcp(1 + x)",
+        "def weight_of_hit(x):\n    return dr.rcp(1 + 2 * x)",
+        "photons and lights that are met share caustic light unevenly",
+        CHANCE,
+    ),
+    Mutation(
+        "photons/hits.py",
+        "return density * cosine * dr.rcp",
+        "return density * dr.rcp",
+        "weights of lights that are met forget the cosine",
+        CHANCE,
+    ),
+    Mutation(
+        "lights/lights.py",
+        "return dr.select(met, density, NEVER_MET)",
+        "return dr.select(met, density, 0)",
+        "photons of lights that no ray meets count nothing",
+        CHANCE,
+    ),
+    Mutation(
+        "photons/queries.py",
+        "unfinished |= mi.has_flag(at.bsdf.flags(), mi.BSDFFlags.Delta)",
+        "pass",
+        "paths meet no lights behind glass after their last vertex",
+        CHANCE,
     ),
 ]
