@@ -267,7 +267,6 @@ class BDPMSession(PilotedSession):
             self.cones is not None
             and self.meets_lights
             and self.traits.has_light_surfaces
-            and not self.traits.has_media
             and meets_one_light(scene)
         )
         self.one_vertex = not self.traits.has_mixed and (

@@ -9,9 +9,9 @@ photons per solid angle in the vertex' merge disk. One camera path goes there wi
 the BSDF. With x = N pi r^2 D cos / p, photons have the weight x / (1 + x), and lights that are met
 1 / (1 + x).
 
-Left out are roulette, the choices at delta surfaces (taken as alike from both sides), and that
-etendue changes with the squared index of refraction. Weights are functions of the path all the
-same.
+Left out are roulette, transmittance of media, the choices at delta surfaces (taken as alike from
+both sides), and that etendue changes with the squared index of refraction. Weights are functions of
+the path all the same.
 """
 
 from __future__ import annotations
@@ -44,7 +44,9 @@ def weight_of_hit(x):
 
 
 class StartDensity:
-    """What photons carry: their D (a `mis.state.LightState`)."""
+    """What photons on surfaces carry: their D (a `mis.state.LightState`)."""
+
+    in_media = False
 
     def __init__(self, lights):
         self.lights, self.layout = lights, Layout({"density": mi.Float})

@@ -217,6 +217,8 @@ class LightState:
     vertex, or `UNFOUND`. (Hooks of `trace_light_paths`.)
     """
 
+    in_media = True
+
     def __init__(self, weights):
         self.weights = weights
         self.levels = weights.strategies - 2

@@ -465,6 +465,8 @@ class LightState:
     smoothly, nearest first (hooks of `trace_light_paths`). Of the farthest, at which strategies
     end, only `FIELDS_OF_THE_LAST`. Fields are named by vertex and number."""
 
+    in_media = True
+
     def __init__(self, weights):
         self.weights = weights
         self.whole = weights.strategies - 2

@@ -131,10 +131,12 @@ class MergeState(Protocol):
 class LightState(Protocol):
     """Sums of light sub-paths whose photons are gathered under weights.
 
-    `layout`: the record that each photon has of them (`core.records`).
+    `layout`: the record that each photon has of them (`core.records`); `in_media`: volume photons
+    have one, too, of what `volume_words` returns.
     """
 
     layout: Layout
+    in_media: bool
 
     def init(self) -> State:
         """Before the first vertex."""
@@ -148,6 +150,9 @@ class LightState(Protocol):
 
     def words(self, state: State) -> list[Array]:
         """What is stored with a photon: the words of a record of the `layout`."""
+
+    def volume_words(self, state: State) -> list[Array]:
+        """What is stored with a volume photon, where these have a record."""
 
     def read(self, level: int, mis_words: Array, index: Array, active: Array) -> Any:
         """What the words say about photons `index` that are merged at the vertex `level`."""

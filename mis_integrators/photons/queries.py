@@ -37,6 +37,8 @@ that are kept, and count for all. They take most of the time then, and their noi
 own."""
 BEAM = 1 << 24
 """Numbers of paths' vertices (see `PathNumbers.at`) that tell which beams are kept begin here."""
+NO_VERTEX = 0xFFFFFFFF
+"""Place of vertices that are not kept."""
 STATE = ("weights.0", "weights.1", "weights.2")
 """What a vertex buffer calls the state of the weights."""
 
@@ -142,7 +144,7 @@ class Queries:
     `near_zone` (a `NearZone`, or None): volume photons beyond it are joined with the sensor. Then
     photons bring all light of media on the way to the first smooth surface: all segments before it
     have long beams, the first one those within the zone. `meets_lights`: lights that paths meet
-    behind delta surfaces are kept with the smooth vertex before (not in scenes with media).
+    behind delta surfaces are kept with the smooth vertex before, if it is on a surface.
     """
 
     bdd: int
@@ -468,14 +470,16 @@ class QueryVisitor:
         cone, left, clear = more
         if not self.traits.has_light_surfaces:
             active &= delta | ~at.ends
-        if self.passes_masks:
-            active &= vertex <= self.bdd
         if self.queries.meets_lights:
             active &= delta | (vertex <= self.bdd)
+        elif self.passes_masks:
+            active &= vertex <= self.bdd
         scattered = active & ~delta
         if left:
             cosine = dr.abs(dr.dot(at.si.n, at.si.to_world(bs.wo)))
-            now = [at.slot, cosine, channel_mean(at.throughput * weight)]
+            # Light that reaches places in media is that of volume photons alone.
+            slot = dr.select(at.scatters, NO_VERTEX, at.slot) if self.flies else at.slot
+            now = [slot, cosine, channel_mean(at.throughput * weight)]
             left = selected(scattered, now, left)
         if self.weights is not None:
             sums = self.weights.scatter(sums, at.si, self._scattering(at), bs, vertex, scattered)

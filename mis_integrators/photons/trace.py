@@ -22,6 +22,7 @@ class PhotonVisitor:
 
     def __init__(self, capacity, keep_direct, light_state, marked, volume_capacity):
         self.keep_direct, self.light_state, self.marked = keep_direct, light_state, marked
+        self.in_media = light_state is not None and light_state.in_media
         surface, power = new_photons(capacity)
         self.store = Store(
             surface=surface,
@@ -35,7 +36,7 @@ class PhotonVisitor:
             self.store.place, self.store.volume_power = new_volume_photons(volume_capacity)
             self.store.volume_room = dr.opaque(mi.UInt32, volume_capacity)
             self.store.volume_count = dr.zeros(mi.UInt32, 1)
-            if light_state is not None:
+            if self.in_media:
                 self.store.volume_mis_words = light_state.layout.room(volume_capacity)
 
     def blank(self, lanes):
@@ -94,7 +95,7 @@ class PhotonVisitor:
         if self.marked:
             photon["delta_at_light"] = mark[0]
         write_volume_photon(store.place, store.volume_power, slot, photon, keep)
-        if self.light_state is not None:
+        if self.in_media:
             words = self.light_state.volume_words(sums)
             write_packets(store.volume_mis_words, words, slot, keep)
 
@@ -138,7 +139,8 @@ def trace_light_paths(
     In scenes with media, which need a `volume_capacity`, the last element of the result is a tuple
     of its own, of the photons in media: all places where sub-paths scatter there, the first one
     included. It is `(place, power, count)`, see `volume.new_volume_photons`, and with a
-    `light_state` what `volume_words` of that returns for each, as records of its `layout`.
+    `light_state` for photons `in_media` what `volume_words` of that returns for each, as records of
+    its `layout`.
     """
     visitor = PhotonVisitor(capacity, keep_direct, light_state, marked, volume_capacity)
     trace_light(world, limits, light_pass, visitor)
@@ -148,7 +150,7 @@ def trace_light_paths(
         photons = *photons, store.mis_words
     if volume_capacity:
         in_media = store.place, store.volume_power, store.volume_count
-        if light_state is not None:
+        if visitor.in_media:
             in_media = *in_media, store.volume_mis_words
         photons = *photons, in_media
     return photons

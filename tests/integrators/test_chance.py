@@ -28,9 +28,13 @@ def lamp(radiance=6.0, height=3.0, size=0.8):
     return {"type": "rectangle", "to_world": down, "emitter": emitter}
 
 
-def world(floor="diffuse", **lights):
-    """A floor that `lights` reach through a pane of glass and a ball of it alone; seen from beneath
-    the pane."""
+LIQUID = {"type": "homogeneous", "sigma_t": 0.8, "albedo": 0.0}
+MILK = {"type": "homogeneous", "sigma_t": 0.6, "albedo": 0.7}
+
+
+def world(floor="diffuse", inside=None, **lights):
+    """A floor that `lights` reach through a pane of glass and a ball of it alone, with a medium
+    `inside`; seen from beneath the pane."""
     transform = mi.ScalarTransform4f
     film = {"type": "hdrfilm", "width": SIZE, "height": SIZE, "rfilter": {"type": "box"}}
     return mi.load_dict(
@@ -51,6 +55,7 @@ def world(floor="diffuse", **lights):
                 "center": [0.8, 0.4, 0.6],
                 "radius": 0.5,
                 "bsdf": {"type": "dielectric"},
+                **({"interior": inside} if inside else {}),
             },
             "sensor": {
                 "type": "perspective",
@@ -159,9 +164,9 @@ BATCHES = 16
 
 
 @in_one_thread
-def by_path(scene, **parameters):
+def by_path(scene, plugin="path"):
     """Images by `path`, mean over the channels: (BATCHES, height, width)."""
-    integrator = mi.load_dict({"type": "path", **parameters})
+    integrator = mi.load_dict({"type": plugin, "max_depth": 6})
     images = [mi.render(scene, integrator=integrator, spp=512, seed=n) for n in range(BATCHES)]
     return np.array([np.array(image)[..., :3].mean(axis=-1) for image in images])
 
@@ -170,12 +175,21 @@ def by_path(scene, **parameters):
 def test_means_are_those_of_path(floor, lights, parameters):
     """Of four blocks, with disks that blur little (6.5 standard errors of t with 15 degrees at
     least: 1e-5 a block, 4e-5 a case); 10 % are seen."""
-    scene = world(floor, **LIGHTS[lights]())
+    compare_means(world(floor, **LIGHTS[lights]()), "path", parameters)
+
+
+@pytest.mark.parametrize(("inside", "lights"), [(LIQUID, "lamp"), (MILK, "sky and lamp")])
+def test_means_are_those_of_volpath(inside, lights):
+    """The same where the ball has a liquid inside."""
+    compare_means(world("glossy", inside, **LIGHTS[lights]()), "volpath", {"bdd": 1})
+
+
+def compare_means(scene, plugin, parameters):
     session = session_of(scene, 0.06, photon_count=16000, **parameters)
     assert session.by_chance
     blocks = [
         images.reshape(-1, 2, 12, 2, 12).mean(axis=(2, 4))
-        for images in (grey_pictures(session, 150), by_path(scene, max_depth=6))
+        for images in (grey_pictures(session, 150), by_path(scene, plugin))
     ]
     error = np.sqrt(sum(values.var(axis=0, ddof=1) / len(values) for values in blocks))
     one, other = (values.mean(axis=0) for values in blocks)
@@ -223,7 +237,7 @@ def test_noise_is_less(monkeypatch, floor):
 
 def test_who_shares():
     """Renders for a denoiser of scenes with lights that can be met, where the radius is automatic
-    and there are no media and no weights."""
+    and there are no weights."""
     fog = {"type": "cube", "bsdf": {"type": "null"}, "interior": {"type": "homogeneous"}}
     point = {"type": "point", "position": [0, 0, 3], "intensity": 1.0}
     shining = {"type": "sphere", "center": [0, 2, 1], "radius": 0.2, "bsdf": {"type": "dielectric"}}
@@ -237,7 +251,7 @@ def test_who_shares():
     assert not shares(denoised=False)
     assert not shares(initial_radius=0.1)
     assert not shares(world(point=point))
-    assert not shares(world(lamp=lamp(), fog=fog))
+    assert shares(world(lamp=lamp(), fog=fog))
     assert not shares(world(lamp=lamp(), shining=shining))
     assert not shares(plugin="bdpm_opt2")
 
