@@ -718,8 +718,8 @@ MUTATIONS = [
     ),
     Mutation(
         "mis/chance.py",
-        "def weight_of_hit(x):\n    return dr.rcp(1 + x)",
-        "def weight_of_hit(x):\n    return dr.rcp(1 + 2 * x)",
+        "return weight(0, bounded_power(x, 1))",
+        "return weight(0, bounded_power(2 * x, 1))",
         "photons and lights that are met share caustic light unevenly",
         CHANCE,
     ),

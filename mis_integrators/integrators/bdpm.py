@@ -673,8 +673,8 @@ class BDPMSession(PilotedSession):
                 return build_volume_map(
                     *in_media[:3], radius, self.volume_capacity, *in_media[3:], density=density
                 )
-        weighted = len(photons) > 3 and (kind == "indirect") != self.by_chance
-        mis_words = photons[3] if weighted else None
+        weighted = kind != "indirect" if self.by_chance else kind == "indirect"
+        mis_words = photons[3] if weighted and len(photons) > 3 else None
         return build_photon_map(
             *photons[:3],
             self.traits.bounds,

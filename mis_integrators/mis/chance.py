@@ -26,21 +26,20 @@ from ..paths.light_classes import CAUSTIC, CLASSES
 from ..paths.light_starts import seen_from
 from ..photons.hits import density_ratio
 from ..photons.kernel_sums import disk_area
-
-LARGEST_X = 1e30
+from ..weights.heuristics import bounded_power, weight
 
 
 def x_of(light_paths, radius, ratio):
     """x, by the `ratio` D cos / p [1/m^2]."""
-    return dr.minimum(light_paths * disk_area(radius) * ratio, LARGEST_X)
+    return light_paths * disk_area(radius) * ratio
 
 
 def weight_of_photon(x):
-    return x * dr.rcp(1 + x)
+    return weight(0, bounded_power(dr.rcp(x), 1))
 
 
 def weight_of_hit(x):
-    return dr.rcp(1 + x)
+    return weight(0, bounded_power(x, 1))
 
 
 class StartDensity:

@@ -317,23 +317,25 @@ class QueryVisitor:
         if self.hide_emitters:
             shown &= (at.depth > 1) | at.si.is_valid()
         later = shown & met
-        if self.queries.meets_lights:
-            self._keep_hit(more[1], at, scatter_pdf, active & met & behind_delta)
         light_pdf = self.lights.pdf_direct(origin, ds, later)
         if self.by_light:
             share_here = share_here * self.weights.next_event_weight(sums, origin, ds, later)
         share = dr.select(met, mis_power(scatter_pdf, light_pdf) * share_here, mi.Spectrum(1))
-        light = at.throughput * share * ds.emitter.eval(at.si, shown)
+        kept = mi.Bool(False)
+        if self.queries.meets_lights:
+            kept = active & met & behind_delta
+        light = at.throughput * ds.emitter.eval(at.si, shown | kept)
+        if self.queries.meets_lights:
+            self._keep_hit(more[1], at, light, scatter_pdf, kept)
+        light *= share
         if self.classes is not None:
             self.classes.add("met", at.path, class_of(*history), light * times, shown)
         return dr.select(shown, light * times, 0)
 
-    def _keep_hit(self, left, at, scatter_pdf, met):
-        """Keeps the light that paths have met behind delta surfaces with the vertex before these,
+    def _keep_hit(self, left, at, light, scatter_pdf, met):
+        """Keeps the `light` that paths have met behind delta surfaces with the vertex before these,
         which they have `left`."""
         slot, cosine, throughput = left
-        light = at.throughput * at.si.emitter(self.scene, met).eval(at.si, met)
-        met &= dr.max(light) > 0
         write_hit(
             self.store.vertices["hits"],
             slot,
@@ -344,7 +346,7 @@ class QueryVisitor:
             throughput,
             cosine,
             scatter_pdf,
-            met & (slot < self.queries.capacity),
+            met & (dr.max(light) > 0) & (slot < self.queries.capacity),
         )
 
     def unfinished(self, state, at):

@@ -35,8 +35,8 @@ They bring at most `MOST_OF_LIGHT` of what falls within eight pixels."""
 
 class TieredMap:
     """Sorted photons, tier by tier. `arrays`: `start`, `surface` and `power` as of a `PhotonMap`,
-    perhaps `mis_words` and `place`, too; `tier_radius`, that of the first tier; and `around`, the
-    `LightAround` that tells the tiers."""
+    and `tier_radius`, that of the first tier; where photons carry something for weights,
+    `mis_words` and `place`, too, and `around`, the `LightAround` that tells the tiers."""
 
     def __init__(self, arrays, bbox, capacity):
         self._arrays, self.bbox, self.table = arrays, bbox, tier_table(capacity)
@@ -63,11 +63,10 @@ class TieredMap:
         return photon_map, tier_radius(radius, number), count
 
     def radii_of(self, p, flux, first, narrow, left, active):
-        """Radii of the disks of photons of that `flux`, would they land at `p`; other arguments as
-        of `gather_tiers` and `tiers_of`."""
-        arrays = self._arrays
-        radius = arrays["tier_radius"]
-        number = tiers_of(arrays["around"], p, flux, radius, left, active)
+        """Radii of the disks of photons of that `flux`, would they land at `p` (of a map whose
+        photons carry something); other arguments as of `gather_tiers` and `tiers_of`."""
+        radius, around = self._arrays["tier_radius"], self._arrays["around"]
+        number = tiers_of(around, p, flux, radius, left, active)
         return dr.select(number > 0, tier_radius(radius, number) * widening(narrow), first)
 
 
@@ -102,10 +101,10 @@ def build_tiered_map(surface, power, count, bbox, radius, capacity, around, left
     number = tiers_of(around, landing.p, flux_of(power, active), radius, left, active)
     grid = tier_grid(bbox, tier_table(capacity), radius, number)
     start, surface, power, target = sorted_photons(grid, record, power, active, TIERS)
-    arrays = {"start": start, "surface": surface, "power": power}
+    arrays = {"start": start, "surface": surface, "power": power, "tier_radius": radius}
     if mis_words is not None:
-        arrays |= {"mis_words": mis_words, "place": places_before(target, active)}
-    arrays |= {"tier_radius": radius, "around": around}
+        place = places_before(target, active)
+        arrays |= {"mis_words": mis_words, "place": place, "around": around}
     return TieredMap(arrays, bbox, capacity)
 
 

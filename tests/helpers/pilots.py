@@ -1,6 +1,14 @@
 """What a pilot would have found, said instead."""
 
 
+def knowing(session, radii, iterations):
+    """The session, which knows its `radii` (by kind, or one for all), as in a render of so many
+    `iterations`: the more, the fewer photons are sparse."""
+    most = session.caustic_radii.most_iterations
+    session.recall(learned(session, radii, min(iterations, most)))
+    return session
+
+
 def learned(session, radii, iterations=0.0, **others):
     """What a session of photons can `recall`: `radii` by kind, or one for all; no correction at
     edges, all light sub-paths, and caustic photons with radii for a render of so many `iterations`

@@ -8,7 +8,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from comparing import grey_pictures, in_one_thread
-from pilots import learned
+from pilots import knowing
+from worlds import T, film, look
 
 SIZE = 24
 FLOORS = {
@@ -23,7 +24,7 @@ def _rgb(rgb):
 
 
 def lamp(radiance=6.0, height=3.0, size=0.8):
-    down = mi.ScalarTransform4f().translate([0, 0, height]).rotate([1, 0, 0], 180).scale(size)
+    down = T().translate([0, 0, height]).rotate([1, 0, 0], 180).scale(size)
     emitter = {"type": "area", "radiance": radiance}
     return {"type": "rectangle", "to_world": down, "emitter": emitter}
 
@@ -35,19 +36,17 @@ MILK = {"type": "homogeneous", "sigma_t": 0.6, "albedo": 0.7}
 def world(floor="diffuse", inside=None, **lights):
     """A floor that `lights` reach through a pane of glass and a ball of it alone, with a medium
     `inside`; seen from beneath the pane."""
-    transform = mi.ScalarTransform4f
-    film = {"type": "hdrfilm", "width": SIZE, "height": SIZE, "rfilter": {"type": "box"}}
     return mi.load_dict(
         {
             "type": "scene",
             "floor": {
                 "type": "rectangle",
-                "to_world": transform().scale(4),
+                "to_world": T().scale(4),
                 "bsdf": {"type": "twosided", "bsdf": FLOORS[floor]},
             },
             "pane": {
                 "type": "rectangle",
-                "to_world": transform().translate([0, 0, 2]).scale(8),
+                "to_world": T().translate([0, 0, 2]).scale(8),
                 "bsdf": {"type": "thindielectric"},
             },
             "ball": {
@@ -60,21 +59,19 @@ def world(floor="diffuse", inside=None, **lights):
             "sensor": {
                 "type": "perspective",
                 "fov": 60,
-                "film": film,
-                "to_world": transform().look_at([0, -3, 1.6], [0, 0, 0], [0, 0, 1]),
+                "film": film(SIZE),
+                "to_world": look((0, -3, 1.6), (0, 0, 0), (0, 0, 1)),
             },
             **(lights or {"lamp": lamp()}),
         }
     )
 
 
-def session_of(scene, radius=0.1, iterations=1e6, **parameters):
-    """A session that knows its radii."""
+def session_of(scene, radius=0.1, **parameters):
+    """A session that knows its radii. So long a render has no sparse photons."""
     plugin = {"type": "bdpm", "bdd": 1, "denoised": True, "direct_paths": 1, "max_depth": 6}
     plugin |= {"photon_count": 4000, **parameters}
-    session = mi.load_dict(plugin).session(scene, seed=3)
-    session.recall(learned(session, radius, min(iterations, session.caustic_radii.most_iterations)))
-    return session
+    return knowing(mi.load_dict(plugin).session(scene, seed=3), radius, 1e6)
 
 
 LIGHTS = {

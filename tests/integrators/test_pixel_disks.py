@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from comparing import grey_pictures
-from pilots import learned
+from pilots import knowing
 
 SIZE = 24
 FAR = 12.0
@@ -60,10 +60,7 @@ def session_of(scene, photons, iterations=1e6, radii=None, **parameters):
     """A session that knows its radii. So long a render has no sparse photons."""
     plugin = {"type": "bdpm", "bdd": 0, "direct_paths": 1, "photon_count": photons}
     plugin |= {"denoised": True, "max_depth": 3, "sampler": "independent", **parameters}
-    session = mi.load_dict(plugin).session(scene, seed=3)
-    iterations = min(iterations, session.caustic_radii.most_iterations)
-    session.recall(learned(session, radii or 1.0, iterations))
-    return session
+    return knowing(mi.load_dict(plugin).session(scene, seed=3), radii or 1.0, iterations)
 
 
 @pytest.mark.parametrize("kind", ["perspective", "orthographic"])
