@@ -20,6 +20,7 @@ _PACKAGE = "mis_integrators.integrators"
 MODULES: tuple[str, ...] = (
     "common",
     "piloted",
+    "photon_passes",
     "bdpm",
     "weighted",
     "bdpm_balance",

@@ -19,7 +19,8 @@ from ..photons.grid import build_photon_map
 from ..photons.pairs import list_pairs, meeting_of, parts, take
 from ..photons.photon import surface_layout
 from ..photons.queries import LAST_VERTEX
-from .bdpm import CAMERA, LIGHT, BDPMSession
+from .bdpm import BDPMSession
+from .photon_passes import CAMERA, LIGHT
 
 STRATEGIES = {2: TwoStrategies, 3: ThreeStrategies}
 """Numbers of strategies for which there are printed weights."""
