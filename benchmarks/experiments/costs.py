@@ -92,7 +92,9 @@ def measured(opened, plugins) -> list[dict]:
             continue
         for factor in RADII:
             session = mi.load_dict({"type": plugin, **given}).session(scene, sensor)
-            session.radii = {kind: radius * factor for kind, radius in pilot.radii.items()}
+            learned = pilot.learned
+            radii = {kind: radius * factor for kind, radius in learned["radii"].items()}
+            session.recall({**learned, "radii": radii})
             session.iterate()
             counted = costs.events(
                 session, segments, session.last_vertex, pilot.prediction.gathered * factor**2

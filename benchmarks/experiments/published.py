@@ -76,7 +76,7 @@ class WithBounds(PublishedWeights):
         return [gain * bounded * dr.rcp(dr.maximum(total, 1e-20)) for gain in gains]
 
 
-def no_guess(traits, z, joined):
+def no_guess(traits, z, joined, eta=0.0):
     """In place of `guessed_weight`: one."""
     return 1.0
 

@@ -177,12 +177,9 @@ def sweep(
 
 
 def free_choice(pilot: Contender, maker: SessionMaker) -> Contender:
-    """A rendering with the radii that a pilot chose, which needs no pilot of its own."""
+    """A rendering with what a pilot chose, which needs no pilot of its own."""
     free = Contender.begin(pilot.label, maker.make, seed=0)
-    free.session.radii, free.session.corrected = (
-        dict(pilot.session.radii),
-        dict(pilot.session.corrected),
-    )
+    free.session.recall(pilot.session.learned)
     return free
 
 

@@ -32,6 +32,9 @@ SMALLEST_COSINE, SMALLEST_LOBE_COSINE = 1e-6, 0.05
 SMALLEST_DENSITY = 1e-6
 SMALLEST_EXTINCTION = 1e-6
 """[1/m]: where a medium is thinner no photon is left."""
+SMALLEST_RATIO, LARGEST_ODDS = 1e-30, 1e30
+"""[1/m^2], and without a unit: bounds that float32 needs where weights of direct light are stored
+and divided."""
 
 
 class Node:
@@ -362,7 +365,8 @@ class OptimalWeights:
     def share_of_photons(found, ratio):
         """Share of direct light's photons in its weight, with `found` and `ratio` as of
         `found_photons` and `Lights.emission_over_nee_pdf`."""
-        return 1 - dr.rcp(1 + found * ratio)
+        odds = dr.minimum(found * ratio, LARGEST_ODDS)
+        return odds * dr.rcp(1 + odds)
 
     def propagate(self, state, si, bsdf, vertex, mask):
         """State at a smooth vertex, and the weight of the direct light there."""
@@ -561,18 +565,18 @@ class LightState:
 
     def volume_words(self, state):
         """As `words`, of photons in media: those that come straight from a light have what
-        `first_vertex` found, less one, below zero, in the place of a radiance."""
+        `first_vertex` found in the place of a radiance, below zero."""
         nodes, others = self._split(state)
         if not others:
             return self.words(state)
         ((direct, *fields), *farther), ((ratio,),) = nodes, others
-        direct = dr.select(direct[0] < 0, -1 - ratio, direct)
+        direct = dr.select(direct[0] < 0, -dr.maximum(ratio, SMALLEST_RATIO), direct)
         return self.words([[direct, *fields], *farther])
 
     def straight_from_light(self, mis_words, index, active):
         """What `first_vertex` found of photons that come straight from a light."""
         first = next(iter(self.layout.fields))
-        return -1 - self.layout.read(mis_words, index, active, (first,))[first][0]
+        return -self.layout.read(mis_words, index, active, (first,))[first][0]
 
     def words(self, state):
         values = [field for fields in self._split(state)[0] for field in fields]

@@ -3,6 +3,7 @@ pages."""
 
 import json
 import math
+from inspect import signature
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -665,6 +666,7 @@ def test_published_forms_change_what_they_name(module):
             )
     # `published`, `bounded` and both with path densities change nothing; all others differ.
     assert len(seen) == len(published.LADDER) - 3
+    assert signature(published.no_guess) == signature(resampled_passes.guessed_weight)
     forms = published.WithBounds, published.WithoutLengths
     assert resampled_passes.PublishedWeights not in forms
 

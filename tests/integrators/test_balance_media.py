@@ -32,7 +32,7 @@ from foggy import view, volpath
 from selection import extended, one_in_each_row
 from test_bdpm_media import RADIUS, SCENES, SLACK, SmallRadiusBatches
 from test_bdpt_media import FOG, hg, homogeneous
-from worlds import diffuse, lamp_inside
+from worlds import T, diffuse, lamp_inside
 
 COUNT = 400
 NEAR = 1e-4
@@ -40,15 +40,22 @@ NEAR = 1e-4
 DISK_PATHS, CAUSTIC_SHARE, VOLUME_SHARE = 20.0, 0.4, 1.7
 
 
-def room(light):
-    """A closed room full of fog, with a lamp."""
+def room(light, size=1.0):
+    """A closed room of edge 2 times `size` full of fog, with a lamp."""
+    lamp, scale = lamp_inside(light, radiance=5.0), T().scale(size)
+    if light == "point":
+        lamp["position"] = [size * x for x in lamp["position"]]
+    else:
+        lamp["to_world"] = scale @ lamp["to_world"]
+    sensor = view((0, -0.9 * size, -0.3 * size), (0.1 * size, 0, 0), size=8, fov=70.0)
+    walls = {"type": "cube", "bsdf": {"type": "twosided", "bsdf": diffuse(0.7)}}
     return mi.load_dict(
         {
             "type": "scene",
-            "fog": {**homogeneous(1.0, 0.9, hg(0.5)), "id": "fog"},
-            "walls": {"type": "cube", "bsdf": {"type": "twosided", "bsdf": diffuse(0.7)}},
-            "lamp": lamp_inside(light, radiance=5.0),
-            "sensor": {**view((0, -0.9, -0.3), (0.1, 0, 0), size=8, fov=70.0), "medium": FOG},
+            "fog": {**homogeneous(1 / size, 0.9, hg(0.5)), "id": "fog"},
+            "walls": {**walls, "to_world": scale},
+            "lamp": lamp,
+            "sensor": {**sensor, "medium": FOG},
         }
     )
 

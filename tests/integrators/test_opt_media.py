@@ -68,6 +68,8 @@ class OptimalPaths(JointPaths):
             dr.eval(state, stored, shares)
         return stored, shares, state
 
+    near = NEAR
+
     def in_ball(self, weights, stored, share, level, caustic, straight=False):
         """Weight of a photon in the medium, by the code of the gather."""
         ray, _, si, _, _ = self.vertices[level]
@@ -77,7 +79,7 @@ class OptimalPaths(JointPaths):
         photon["depth"] = mi.UInt32(1 if straight else 2)
         write_volume_photon(place, power, index, photon, True)
         words = self._words(weights.light_state(), level, not caustic)
-        radius = dr.opaque(mi.Float, NEAR)
+        radius = dr.opaque(mi.Float, self.near)
         photon_map = build_volume_map(place, power, mi.UInt32([COUNT]), radius, COUNT, words)
         record = {
             "p": si.p,
@@ -140,29 +142,33 @@ def weights_found(paths, weights, strategies, straight):
 
 
 @pytest.mark.parametrize(
-    "kinds, strategies, light",
+    "kinds, strategies, light, size",
     [
-        ("MM", 2, "area"),
-        ("SMM", 3, "point"),
+        ("MM", 2, "area", 1.0),
+        ("SMM", 3, "point", 1.0),
+        ("SMM", 3, "point", 1e3),
         *extended(
-            ("MMM", 2, "point"),
-            ("MS", 2, "area"),
-            ("MSM", 3, "area"),
-            ("MMMM", 3, "area"),
-            ("SMS", 3, "point"),
-            ("MMMM", 4, "area"),
+            ("MM", 2, "area", 1e3),
+            ("MMM", 2, "point", 1.0),
+            ("MS", 2, "area", 1.0),
+            ("MSM", 3, "area", 1.0),
+            ("MMMM", 3, "area", 1.0),
+            ("SMS", 3, "point", 1.0),
+            ("MMMM", 4, "area", 1.0),
         ),
     ],
 )
-def test_weights_of_a_path_sum_to_one(rgb, kinds, strategies, light):
-    """The photon's packed flux and direction round, hence the tolerance."""
-    scene = room(light)
-    session = opt(strategies).session(scene, seed=1, spp=0)
+def test_weights_of_a_path_sum_to_one(rgb, kinds, strategies, light, size):
+    """The photon's packed flux and direction round, hence the tolerance. In any unit of length: a
+    room in millimetres."""
+    scene = room(light, size)
+    session = opt(strategies, initial_radius=RADIUS * size).session(scene, seed=1, spp=0)
     session.start()
     assert session.points
     weights = SessionWeights(session)
     for straight in (True, False):
         paths = OptimalPaths(scene, kinds)
+        paths.near = NEAR * size
         found = weights_found(paths, weights, strategies, straight)
         assert np.mean(np.abs(found.sum(axis=0) - 1) < 1e-3) > 0.98, found.sum(axis=0)
         assert np.median(np.abs(found), axis=1).min() > 1e-4
