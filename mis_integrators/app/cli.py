@@ -108,6 +108,8 @@ def _render_alone(options: argparse.Namespace, interrupt: Interrupt) -> int:
                 "--all-views" if options.all_views else "--frames" if options.frames else None
             )
             opened = _request(options).open(needs_views)
+            if options.denoise:
+                denoising.check_channels(opened.session.channels)
             rival = (
                 compare.prepare(options.compare, options.reference, opened)
                 if options.compare
@@ -543,8 +545,6 @@ def _write(
         raise Failure(
             EXIT_OUTPUT, f"cannot write {writing}: {error.strerror or error}{rest}"
         ) from error
-    except ValueError as error:  # nothing to denoise
-        raise Failure(EXIT_SCENE, f"{error}; {written} is written") from error
 
 
 def _check_outputs(options: argparse.Namespace) -> None:

@@ -148,16 +148,22 @@ def denoise(
     return pixels
 
 
+def check_channels(channels: Sequence[str]) -> tuple[str, ...]:
+    """The colour channels of these.
+
+    Raises ``ValueError`` if there are none (a film of spectral bands)."""
+    names = picture_channels(channels)
+    if names is None:
+        raise ValueError("--denoise: the film has no colours, and so there is nothing to denoise")
+    return names
+
+
 def denoised_picture(
     image: np.ndarray, channels: Sequence[str], scene: mi.Scene, sensor: mi.Sensor
 ) -> tuple[np.ndarray, list[str]]:
     """A scene's image with its colour channels denoised and first, all others as they are: the
-    image and the channels' names.
-
-    Raises ``ValueError`` if it has no colour channels (a film of spectral bands)."""
-    names = picture_channels(channels)
-    if names is None:
-        raise ValueError("--denoise: the film has no colours, and so there is nothing to denoise")
+    image and the channels' names. Raises as `check_channels`."""
+    names = check_channels(channels)
     order = [*names, *(name for name in channels if name not in names)]
     image = image[..., [channels.index(name) for name in order]]
     return denoise(image, scene, sensor, order), order

@@ -257,22 +257,26 @@ def check_film(sensor, plugin):
         )
 
 
-def check_scene(scene, sensor, plugin, media=False):
+def check_scene(scene, sensor, plugin):
     """Raises `UnsupportedScene` for what the surface integrators cannot render, before any
-    sampling. `media`: this one can render participating media."""
+    sampling."""
+    check_polarisation(plugin)
+    check_emitters(scene, plugin)
+    check_bands(sensor.film(), plugin)
+
+
+def check_polarisation(plugin):
+    """Raises `UnsupportedScene` under a polarised variant."""
     if mi.is_polarized:
         raise UnsupportedScene(
             f"{plugin}: polarised variants are not supported (active: {mi.variant()}); use an "
-            "unpolarised "
-            'one such as "llvm_ad_rgb"'
+            'unpolarised one such as "llvm_ad_rgb"'
         )
-    if not media and has_media(scene, sensor):
-        raise UnsupportedScene(
-            f"{plugin}: participating media are not supported by this surface integrator; use "
-            '"bdpt", "bdpm", "bdpm_balance" or "volpath"'
-        )
-    check_emitters(scene, plugin)
-    if mi.has_flag(sensor.film().flags(), mi.FilmFlags.Special):
+
+
+def check_bands(film, plugin):
+    """Raises `UnsupportedScene` for a film of spectral bands."""
+    if mi.has_flag(film.flags(), mi.FilmFlags.Special):
         raise UnsupportedScene(f'{plugin}: film "specfilm" is not supported; use "hdrfilm"')
 
 

@@ -140,7 +140,6 @@ class BDPM(IterativeIntegrator):
     """
 
     LAYERS = *CHANNELS, *SPLIT
-    MEDIA = True
 
     def read_parameters(self, parameters):
         self.read_photon_parameters(parameters)

@@ -53,7 +53,6 @@ class BDPMBalance(WeightedBDPM):
     """
 
     bdd = 0
-    MEDIA = True
 
     def read_parameters(self, parameters):
         self.read_photon_parameters(parameters)

@@ -144,8 +144,6 @@ class BDPMOpt(WeightedBDPM):
             "frozen_photons": self.frozen_photons,
         }
 
-    MEDIA = True
-
     def refused_in_media(self):
         other = [] if self.weights == "local" else [(f'"weights" = {self.weights}', '"local"')]
         return other + super().refused_in_media()

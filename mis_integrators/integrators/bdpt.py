@@ -140,8 +140,6 @@ class BDPT(IterativeIntegrator):
             "technique_weights": self.technique_weights,
         }
 
-    MEDIA = True
-
     def new_session(self, scene, sensor, seed, iterations):
         return BDPTSession(self, scene, sensor, seed, iterations)
 

@@ -97,12 +97,9 @@ class IterativeIntegrator(mi.AdjointIntegrator):
         subclass has its own."""
         raise TypeError(f"{type(self).__name__} does not define new_session")
 
-    MEDIA = False
-    """Whether participating media are supported."""
-
     def check(self, scene, sensor):
         """Raises `UnsupportedScene` for a scene that this integrator cannot render."""
-        check_scene(scene, sensor, self.plugin, self.MEDIA)
+        check_scene(scene, sensor, self.plugin)
         if has_media(scene, sensor):
             check_media(scene, sensor, self.plugin)
             for parameter, instead in self.refused_in_media():
@@ -386,7 +383,7 @@ class IterativeSession:
             raise RuntimeError(
                 f"{self.integrator.plugin}: this render was begun under the variant "
                 f"{self.variant}, but the active one is now "
-                f"{mi.variant()}"
+                f'{mi.variant()}; call mi.set_variant("{self.variant}") before it goes on'
             )
         with dr.suspend_grad():
             self.start()

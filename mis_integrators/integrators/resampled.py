@@ -91,8 +91,6 @@ class ResampledIntegrator(IterativeIntegrator):
             "alpha": self.alpha,
         }
 
-    MEDIA = True
-
     def refused_in_media(self):
         published = [('"weights" = published', '"bounded"')] if self.published else []
         return published + super().refused_in_media()

@@ -244,6 +244,7 @@ class IrradianceCache:
             if kind in ("point", "spot", "area", "directional")
         ]
         si = self._facing_surface(self.center, self.facing)
+        near.sort(key=lambda index: -lights.choice.pmf[index])
         for index in near[:MOST_LIGHTS]:
             ds, value = lights.unoccluded(si, mi.UInt32(index), mi.Bool(True))
             value *= _cosine(ds.d, self.facing)

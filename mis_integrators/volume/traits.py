@@ -8,8 +8,8 @@ import numpy as np
 
 from ..core.traits import (
     MediaTraits,
-    UnsupportedScene,
     check_emitters,
+    check_polarisation,
     check_variant,
     used_bsdfs,
 )
@@ -64,10 +64,5 @@ def check_volume_scene(scene, plugin):
     """Raises `UnsupportedScene` for what the volumetric integrators cannot render, before any
     sampling."""
     check_variant(scene, plugin)
-    if mi.is_polarized:
-        raise UnsupportedScene(
-            f"{plugin}: polarised variants are not supported (active: {mi.variant()}); use an "
-            "unpolarised "
-            'one such as "llvm_ad_rgb"'
-        )
+    check_polarisation(plugin)
     check_emitters(scene, plugin)

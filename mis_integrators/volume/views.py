@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.random import next_2d
-from ..core.traits import UnsupportedScene
+from ..core.traits import UnsupportedScene, check_bands
 from ..paths.layers import written
 
 PARALLEL = "OrthographicCamera"
@@ -193,7 +193,10 @@ class Views:
         ]
         self.paths = sum(counts)
         if self.paths >= 1 << 32:
-            raise UnsupportedScene(f"{plugin}: the views have more than 2^32 pixels together")
+            raise UnsupportedScene(
+                f"{plugin}: an iteration has 2^32 camera paths or more; render fewer or smaller "
+                "views at once"
+            )
 
         cameras = [Camera.of(s) for s in sensors]
         self.table = {
@@ -231,8 +234,7 @@ class Views:
                     f"{' or '.join(SENSORS.values())} sensors, alone or in a batch"
                 )
         film = group.film()
-        if mi.has_flag(film.flags(), mi.FilmFlags.Special):
-            raise UnsupportedScene(f'{plugin}: film "specfilm" is not supported; use "hdrfilm"')
+        check_bands(film, plugin)
         if len(views_of(group)) > 1 and tuple(film.size()) != tuple(film.crop_size()):
             raise UnsupportedScene(f"{plugin}: the film of a batch cannot be cropped")
 

@@ -388,3 +388,20 @@ def test_views_are_not_denoised(scene, capfd, flag):
         render(scene, "--denoise", flag)
     assert exit.value.code == cli.EXIT_USAGE
     assert f"not allowed with argument {flag}" in capfd.readouterr().err
+
+
+def test_a_film_without_colours(scene, tmp_path, capfd):
+    """One line, before anything is rendered."""
+    text = scene.read_text()
+    start, end = text.index("<film "), text.index("</film>") + len("</film>")
+    bands = (
+        '<film type="specfilm"><integer name="width" value="8"/><integer name="height" value="8"/>'
+        '<spectrum name="band" value="400:1, 500:1"/></film>'
+    )
+    scene.write_text(text[:start] + bands + text[end:])
+    spectral = "--variant", "llvm_ad_spectral"
+    assert render(scene, *spectral, "-o", tmp_path / "a.exr", "--denoise") == cli.EXIT_SCENE
+    message = capfd.readouterr().err
+    assert "--denoise: the film has no colours" in message and message.count("\n") == 1
+    assert not (tmp_path / "a.exr").exists()
+    assert render(scene, *spectral, "-o", tmp_path / "a.exr") == 0
