@@ -118,7 +118,7 @@ MUTATIONS = [
         f"{BDPT}::test_weights_sum_to_one",
     ),
     Mutation(
-        "paths/camera_vertices.py",
+        "mis/step_sums.py",
         "            here += eta",
         "            here += 0 * eta",
         "weights forget merges nearer to the camera",

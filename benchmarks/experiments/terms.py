@@ -43,7 +43,7 @@ class Mixed:
     """Iterations of a session whose camera paths and light sub-paths have numbers of their own."""
 
     def __init__(self, session: Session):
-        from mis_integrators.integrators.photon_passes import CAMERA  # needs a variant
+        from mis_integrators.integrators.purposes import CAMERA  # needs a variant
 
         self.session, self.camera = session, 0
         sequence = session._sequence

@@ -135,13 +135,13 @@ class SceneTraits:
     """What a scene is made of.
 
     Attributes: `bounds` (bounding box), `extent` (its diagonal), `has_delta` (perfectly specular or
-    null scattering somewhere), `has_mixed` (BSDFs with both a smooth and a delta part), `has_rough`
-    (smooth scattering that is not Lambertian), `has_lambertian`, `has_perturbed` (bump or normal
-    maps), `has_light_surfaces` (emitters that a ray can meet: area lights, environments),
-    `has_unmet_lights` (emitters that no ray can meet: points, spots, directions),
-    `has_unsampled_lights` (emitters whose light no connection can make either: `directionalarea`),
-    `lambertian`, `perturbed` (registry tables for BSDF pointers), `has_media`, and with media those
-    of `MediaTraits`.
+    null scattering somewhere; in scenes with media as of `MediaTraits`), `has_mixed` (BSDFs with
+    both a smooth and a delta part), `has_rough` (smooth scattering that is not Lambertian),
+    `has_lambertian`, `has_perturbed` (bump or normal maps), `has_light_surfaces` (emitters that a
+    ray can meet: area lights, environments), `has_unmet_lights` (emitters that no ray can meet:
+    points, spots, directions), `has_unsampled_lights` (emitters whose light no connection can make
+    either: `directionalarea`), `lambertian`, `perturbed` (registry tables for BSDF pointers),
+    `has_media`, and with media those of `MediaTraits`.
     """
 
     def __init__(self, scene, sensor=None):

@@ -22,8 +22,9 @@ from ..pilot.setting import PilotSetting, light_shares, pilot_light_paths
 from .caustic_radii import CausticRadii
 from .common import MOST_LIGHT_PATHS, IterativeIntegrator
 from .direct_light import DirectLight
-from .photon_passes import CAMERA, LIGHT, PhotonPasses
+from .photon_passes import PhotonPasses
 from .pilot_passes import SubsetPasses
+from .purposes import CAMERA, LIGHT
 from .schedule import read_radius
 
 CAMERA_CHUNK, CHUNK_IN_MEDIA = 1 << 21, 1 << 19

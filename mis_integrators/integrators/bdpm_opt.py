@@ -19,12 +19,12 @@ from ..pilot.denoiser import LEFT
 from .common import MOST_LIGHT_PATHS
 from .parameters import ParameterError
 from .published_optimal import (
-    FROZEN,
     PHOTONS_A_PATH,
     STRATEGIES,
     USUAL_FROZEN_PATHS,
     PublishedSession,
 )
+from .purposes import FROZEN
 from .weighted import WeightedBDPM, WeightedSession
 
 USUAL_PHOTONS = 10

@@ -24,6 +24,7 @@ from ..paths.layers import CHANNELS, SPLIT
 from ..paths.light_classes import LightClasses, class_of
 from ..paths.subpaths import Kept, read_vertices, trace_camera_subpaths
 from .common import MOST_LIGHT_PATHS, IterativeIntegrator
+from .purposes import APERTURE, CAMERA, LIGHT, SHADOWS
 from .pyramid import Ledger, camera_images, sensor_images, technique_channels, with_rest
 from .subpath_session import SubpathSession
 
@@ -358,5 +359,3 @@ class BDPTSession(SubpathSession):
 
 MOST_VERTICES = 1 << 12
 """Tells apart the random numbers of a camera vertex's connections with so many light vertices."""
-LIGHT, CAMERA, APERTURE, SHADOWS = 0, 1, 3, 5
-"""Purposes of an iteration's random seeds, besides `IterativeSession.WAVELENGTH`."""

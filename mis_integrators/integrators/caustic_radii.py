@@ -7,6 +7,7 @@ from ..photons.grid import read_photons
 from ..photons.light_around import LightAround
 from ..photons.light_cells import flux_of, quantum_of
 from ..photons.photon import power_layout
+from .purposes import CAUSTIC_RADII
 
 PASS_SHARE = 1 / 16
 """Tuned: light passes that tell of the light around, for each iteration of the render."""
@@ -15,8 +16,6 @@ MOST_PASSES = 16
 WIDEST_SHARE = 1 / 4
 """Tuned: the largest radius, in units of the scene's extent over the square root of three: what of
 a disk lies beyond the surfaces is lost."""
-PURPOSE = 5
-"""Of the random seed, see `bdpm`."""
 MOST_ITERATIONS = 1e15
 """Iterations that a render may be planned for."""
 
@@ -56,7 +55,7 @@ class CausticRadii:
         session, around = self.session, None
         passes = min(max(round(PASS_SHARE * self.iterations), 1), MOST_PASSES)
         for number in range(passes):
-            surface, power, count = session.trace_photons(number, PURPOSE)[:3]
+            surface, power, count = session.trace_photons(number, CAUSTIC_RADII)[:3]
             if around is None:
                 around = LightAround.empty(
                     session.radii[self.kind],

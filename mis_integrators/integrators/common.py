@@ -31,6 +31,7 @@ from ..paths.light_classes import CLASSES
 from ..paths.setting import CameraPass, LightPass, Limits
 from ..pilot.run import PILOT_INDEX
 from .parameters import Parameters
+from .purposes import SURFACES, WAVELENGTH
 
 SAMPLERS = "sobol", "independent"
 """Values of the parameter `sampler`; the first is the default."""
@@ -450,16 +451,16 @@ class IterativeSession:
         """Adds an iteration to the sums."""
         self.accumulator.add(self._iteration(iteration), iteration)
 
-    WAVELENGTH = 2
+    wavelength = WAVELENGTH
     """Purpose of the random seed of an iteration's wavelengths."""
 
     def _spectral(self, iteration):
         """The wavelengths that all sub-paths of an iteration share, the sample that makes them, and
         their conversion to colour."""
         if self._low_discrepancy(iteration):
-            number = reversed_bits(iteration) ^ mix(self.seed, RENDER, self.WAVELENGTH)
+            number = reversed_bits(iteration) ^ mix(self.seed, RENDER, self.wavelength)
         else:
-            number = mix(self.seed, iteration, self.WAVELENGTH)
+            number = mix(self.seed, iteration, self.wavelength)
         return shared_wavelengths(self.sensor, number)
 
     def _low_discrepancy(self, iteration):
@@ -496,15 +497,12 @@ class IterativeSession:
         film = self._emptied(self.sensor.film())
         self.accumulator.put(film, self.integrator.variance, layers)
 
-    SURFACES = 6
-    """Purpose of the random seed of layers of surfaces."""
-
     @functools.cached_property
     def _layers(self):
         """The layers of surfaces by name, made when the image is first looked at."""
         layers = [layer for layer in self.integrator.layers if layer.type not in CLASSES]
         with dr.suspend_grad():
-            seed = mix(self.seed, RENDER, self.SURFACES)
+            seed = mix(self.seed, RENDER, SURFACES)
             rendered = render_layers(self.scene, self.sensor, layers, seed)
         return {layer.name: tensor for layer, tensor in zip(layers, rendered)}
 

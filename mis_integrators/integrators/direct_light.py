@@ -32,9 +32,8 @@ from ..pilot.direct_paths import (
 from ..pilot.noise import MEASURES
 from ..pilot.run import PILOT_INDEX
 from ..pilot.setting import UNPLANNED_ITERATIONS
+from .purposes import DIRECT
 
-PURPOSE = 4
-"""Of the random seed, see `bdpm`."""
 INDICES = 2**32
 """Of the paths that share a sequence: iterations that would need more have others."""
 LARGEST_PART = 1 << 21
@@ -186,7 +185,7 @@ class DirectLight:
         most = MOST_PATHS * session.camera_paths
         block, done = divmod(iteration, INDICES // most)
         sequence = SampleSequence(
-            session._pass_seed(iteration, PURPOSE, block),
+            session._pass_seed(iteration, DIRECT, block),
             dr.opaque(mi.UInt32, 0),
             1,
             session._low_discrepancy(iteration),

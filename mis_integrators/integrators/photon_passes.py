@@ -31,10 +31,8 @@ from ..photons.tiers import LEFT_TO_DENOISER, TieredMap, build_tiered_map, gathe
 from ..photons.trace import trace_light_paths
 from ..photons.volume import VolumeMap, build_volume_map
 from .piloted import PilotedSession
+from .purposes import LIGHT, SENSOR
 
-LIGHT, CAMERA, SENSOR = 0, 1, 6
-"""Purposes of an iteration's random seeds, besides `IterativeSession.WAVELENGTH`,
-`bdpm_opt.FROZEN`, `direct_light.PURPOSE` and `caustic_radii.PURPOSE`."""
 SPARE_PHOTONS = 1 << 20
 """Unused room beyond half of a photon buffer that is worth the time to record the passes anew."""
 

@@ -20,15 +20,13 @@ from ..photons.pairs import list_pairs, meeting_of, parts, take
 from ..photons.photon import surface_layout
 from ..photons.queries import LAST_VERTEX
 from .bdpm import BDPMSession
-from .photon_passes import CAMERA, LIGHT
+from .purposes import CAMERA, FROZEN, LIGHT
 
 STRATEGIES = {2: TwoStrategies, 3: ThreeStrategies}
 """Numbers of strategies for which there are printed weights."""
 USUAL_FROZEN_PATHS = 1 << 16
 """Tuned: light sub-paths of the frozen pass, of all weights, unless the parameter says
 otherwise."""
-FROZEN = 3
-"""Purpose of the frozen pass's random seed."""
 CHAIN_CHUNK = 1 << 18
 """Camera paths traced at once at most (bounds memory)."""
 PHOTONS_A_PATH = 5

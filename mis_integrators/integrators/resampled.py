@@ -20,6 +20,7 @@ from ..resampling.cache_targets import TARGETS, integrals
 from ..resampling.proposals import arriving
 from .common import IterativeIntegrator
 from .merging import automatic_radius
+from .purposes import APERTURE, CAMERA, DRAW, LIGHT, START
 from .resampled_passes import ResampledPasses
 from .schedule import read_radius
 
@@ -402,8 +403,6 @@ class ResampledSession(ResampledPasses):
         )
 
 
-LIGHT, CAMERA, APERTURE, START, DRAW = 0, 1, 3, 4, 5
-"""Purposes of an iteration's random seeds, besides `IterativeSession.WAVELENGTH`."""
 PILOT = 1 << 31
 """The number of the iteration that never is: what only the weights and the cache are made of draws
 from its seeds."""

@@ -19,8 +19,9 @@ from ..core.recording import lanes
 from ..core.spectra import channel_mean
 from ..mis.published_resampling import PublishedWeights, unknown_tables
 from ..mis.resampling import ResampledWeights, guessed_weight, uniform_tables
+from ..mis.step_sums import LightEnd, sum_before
 from ..paths.camera import with_gaps
-from ..paths.camera_vertices import STEP, LightEnd, hit_layout, sum_before, trace_camera_vertices
+from ..paths.camera_vertices import STEP, hit_layout, trace_camera_vertices
 from ..paths.light_classes import LightClasses, class_of
 from ..paths.light_starts import sample_light_starts
 from ..paths.media import SHADOW_SALT

@@ -18,7 +18,7 @@ slower."""
 CHUNK = 1 << 21
 """Camera paths traced at once at most (bounds memory)."""
 PATHS = 0
-"""Purpose of an iteration's random seeds, besides `PathSession.WAVELENGTH`."""
+"""Purpose of an iteration's random seeds, besides `PathSession.wavelength`."""
 
 
 class PathSampler(mi.Sampler):
@@ -46,7 +46,7 @@ class PathSession(IterativeSession):
     """Iterations of `path`: `camera_paths` samples a pixel each, or, if that is 0 and no number of
     iterations is planned, as many as keep the processor busy."""
 
-    WAVELENGTH = 1
+    wavelength = 1
 
     def __init__(self, integrator, scene, sensor, seed, iterations):
         super().__init__(integrator, scene, sensor, seed, iterations)

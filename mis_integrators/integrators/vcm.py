@@ -11,9 +11,10 @@ from ..mis.vertex_merging import ConnectionWeights
 from ..paths.subpaths import STATES, read_vertices
 from ..photons.vertex_map import state_of
 from ..pilot.run import PILOT_INDEX
-from .bdpt import BDPT, CAMERA, BDPTSession
+from .bdpt import BDPT, BDPTSession
 from .common import MOST_LIGHT_PATHS
 from .merging import automatic_radius, merged_light, merging_of, with_merged
+from .purposes import CAMERA
 from .schedule import LARGEST_RADIUS, SMALLEST_RADIUS, read_radius, shrunk
 
 

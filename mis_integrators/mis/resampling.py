@@ -1,8 +1,9 @@
 """Where resampled connections and their weights meet.
 
-The state (`mis.state.ConnectionState`) of `paths.subpaths` and `paths.camera_vertices`, and what
-resampling makes of each technique of a joint path. All techniques of a path evaluate one function:
-a technique that joins a light sub-path Y to the camera vertex z is taken to draw it with
+The state of light sub-paths (that half of `mis.state.ConnectionState`), what camera sub-paths ask
+(`paths.camera_vertices`), and what resampling makes of each technique of a joint path. All
+techniques of a path evaluate one function: a technique that joins a light sub-path Y to the camera
+vertex z is taken to draw it with
 
     q/p = (a + c) r + b,
     r = f_y rho G softened,    G softened = G d^2 / (d^2 + h^2)
@@ -26,13 +27,13 @@ import numpy as np
 
 from ..core.packing import from_numpy
 from ..core.spectra import channel_mean
-from ..paths.camera_vertices import LightEnd, sum_before
 from ..paths.light_starts import seen_from
 from ..paths.vertex import facing, in_medium
 from ..resampling.light_vertices import END
 from ..resampling.proposals import BLIND_SHARE, uniform_share
 from ..weights import bidirectional as theory
 from ..weights import resampling
+from .step_sums import LightEnd, sum_before
 from .vertex_merging import eta_at
 
 LENGTHS = 16

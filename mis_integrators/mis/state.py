@@ -14,7 +14,10 @@ There are three protocols, for three kinds of sums: `ConnectionState` for vertic
 (`bdpt`, `vcm`, `pcbpt`, `bdpt_ris`), `MergeState` for camera paths that gather photons (`bdpm_opt`,
 `bdpm_balance`), and `LightState` for the photons that these gather. All arguments are Dr.Jit
 arrays, one element a path; `active` or `mask` selects the elements that count. A state is a list
-of arrays.
+of arrays. What photons have kept is read by the theory that has written it.
+
+Resampled camera sub-paths keep steps in place of sums: what they ask of weights, their docstring
+says (`paths.camera_vertices.trace_camera_vertices`).
 """
 
 from __future__ import annotations
@@ -35,6 +38,8 @@ class ConnectionState(Protocol):
 
     states: tuple[str, ...]
     """Names of the numbers of a state, under which vertices keep them."""
+    merging: Any
+    """A `vertex_merging.Merging`, where vertices are merged, too; else `None`."""
 
     def blank(self, width: int) -> State:
         """A state before the first vertex."""
@@ -153,6 +158,3 @@ class LightState(Protocol):
 
     def volume_words(self, state: State) -> list[Array]:
         """What is stored with a volume photon, where these have a record."""
-
-    def read(self, level: int, mis_words: Array, index: Array, active: Array) -> Any:
-        """What the words say about photons `index` that are merged at the vertex `level`."""

@@ -7,8 +7,6 @@ A vertex remembers the step that led to it, from the last vertex that scattered 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-
 import drjit as dr
 import mitsuba as mi
 
@@ -19,27 +17,27 @@ from .camera import trace_camera, whole_or_nothing, within_crop
 from .media import next_hit
 from .sensor import Lens
 from .setting import CameraPass, Limits, World
-from .subpaths import NO_PARENT, keep_vertex, new_vertices, selected, smooth_at, vertex_layout
+from .subpaths import NO_PARENT, keep_vertex, new_vertices, selected, smooth_at
 from .vertex import VertexBSDF, facing
 
 STEP = ("d_vcm", "geometry", "forward", "back", "scattered", "row")
 """What vertices and hits remember of the step from their parent: one over the area density with
 which it was made [m^2] (over that per solid angle [sr] for hits; zero where a delta function
-scattered on the way); the geometric term [1/m^2] (hits: the cosine at the parent), as `soften`
+scattered on the way); the geometric term [1/m^2] (hits: the cosine at the parent), as `weights`
 leaves it; densities per projected solid angle at the parent, of the camera's side for this step and
 of the light's for the one before; the parent's BSDF, channel mean [1/sr]; its row (see
-`soften`)."""
+`weights`)."""
 LEFT = 5
-"""Entries of what `leave` returns before those that `soften` adds."""
+"""Entries of what `leave` returns before those that `weights` adds."""
 HIT = ("light_mean", "start", "across")
 """What a hit knows besides: `Lights.pdf_emission_origin` and `pdf_emission_area` of the emitter's
 point, and its light, channel mean, over the former."""
 
 
-def hit_layout(soften):
+def hit_layout(weights):
     """Fields of a hit of an emitter beyond the first vertex: `value` (throughput included), number
     of the path, `depth` in segments, `parent`, the fields of `STEP` and `HIT`, and the kernels of
-    `soften`: those of the parent, and those of the emitter."""
+    `weights`: those of the parent, and those of the emitter."""
     return Layout(
         {
             "value": mi.Spectrum,
@@ -47,48 +45,48 @@ def hit_layout(soften):
             **dict.fromkeys(STEP, mi.Float),
             "depth": mi.UInt32,
             "parent": mi.UInt32,
-            **dict.fromkeys((*HIT, *soften.kernels, *soften.light_kernels), mi.Float),
+            **dict.fromkeys((*HIT, *weights.kernels, *weights.light_kernels), mi.Float),
         }
     )
 
 
-def not_left(soften, width):
+def not_left(weights, width):
     """What `leave` returns before anything was left: densities of both sides, BSDF, row and cosine
     of the last vertex that scattered smoothly, and its kernels."""
-    others = LEFT - 1 + len(soften.kernels)
+    others = LEFT - 1 + len(weights.kernels)
     return [dr.ones(mi.Float, width), *[dr.zeros(mi.Float, width) for _ in range(others)]]
 
 
-def leave(soften, left, si, vertex_bsdf, value, p_forward, p_back, wo, mask):
+def leave(weights, left, si, vertex_bsdf, value, p_forward, p_back, wo, mask):
     """After the lanes `mask` have scattered smoothly towards `wo`: what the next vertex must know
     of this one."""
-    row = mi.Float(soften.row(si.p, si.n, wo))
+    row = mi.Float(weights.row(si.p, si.n, wo))
     mean = vertex_bsdf.scattered_mean(value, wo, mask)
     new = [p_forward, p_back, mean, row, facing(vertex_bsdf.traits, si.n, wo)]
-    new += soften.kernels_of_vertex(left[3], si.p, vertex_bsdf, wo, mask)
+    new += weights.kernels_of_vertex(left[3], si.p, vertex_bsdf, wo, mask)
     return [dr.select(mask, a, b) for a, b in zip(new, left)]
 
 
-def step_to_vertex(soften, left, density, cosine, squared):
+def step_to_vertex(weights, left, density, cosine, squared):
     """The fields of `STEP`, and the parent's kernels, at a vertex that was sampled with `density`
     per solid angle (zero: by a delta function) and meets the ray under `cosine`."""
     forward, back, scattered, row, there, *kernels = left
     d_vcm = dr.select(density > 0, squared * dr.rcp(dr.maximum(density * cosine, 1e-20)), 0)
-    geometry = soften.softened(there * cosine * dr.rcp(squared), squared)
+    geometry = weights.softened(there * cosine * dr.rcp(squared), squared)
     return [dr.minimum(d_vcm, 1e15), geometry, forward, back, scattered, row, *kernels]
 
 
-def step_to_hit(lights, soften, left, density, origin, ds, light, squared, mask):
+def step_to_hit(lights, weights, left, density, origin, ds, light, squared, mask):
     """The fields of `STEP` and `HIT`, and the kernels, of emission `light` met in the point or
     direction `ds`, seen from the vertex `origin`."""
     forward, back, scattered, row, there, *kernels = left
     start = lights.pdf_emission_origin(origin, ds, mask)
-    geometry = soften.softened(there, squared)
+    geometry = weights.softened(there, squared)
     d_vcm = dr.select(density > 0, dr.rcp(dr.maximum(density, 1e-20)), 0)
     light_mean = channel_mean(light) * dr.rcp(dr.maximum(start, 1e-20))
     return dict(
         zip(
-            (*STEP, *HIT, *soften.kernels, *soften.light_kernels),
+            (*STEP, *HIT, *weights.kernels, *weights.light_kernels),
             (
                 d_vcm,
                 geometry,
@@ -100,7 +98,7 @@ def step_to_hit(lights, soften, left, density, origin, ds, light, squared, mask)
                 start,
                 lights.pdf_emission_area(origin, ds, mask),
                 *kernels,
-                *soften.kernels_of_light(row, ds, light_mean, mask),
+                *weights.kernels_of_light(row, ds, light_mean, mask),
             ),
         )
     )
@@ -115,11 +113,11 @@ class StepVisitor:
     vertex of whichever kind, and what `leave` returns.
     """
 
-    def __init__(self, world, limits, sensor, soften, ratio, capacity, hit_capacity):
+    def __init__(self, world, limits, sensor, weights, ratio, capacity, hit_capacity):
         self.scene, self.lights, self.traits = world.scene, world.lights, world.traits
         self.film, self.lens = sensor.film(), Lens(sensor)
-        self.soften, self.ratio = soften, ratio
-        self.steps, self.hit = (*STEP, *soften.kernels), hit_layout(soften)
+        self.weights, self.ratio = weights, ratio
+        self.steps, self.hit = (*STEP, *weights.kernels), hit_layout(weights)
         self.hide_emitters = limits.hide_emitters
         self.store = Store(
             vertices=new_vertices(self.traits, capacity, self.steps),
@@ -133,7 +131,7 @@ class StepVisitor:
     def begin(self, n_paths, splat, aperture):
         self.inside, self.aperture = within_crop(self.film, splat), aperture
         origin = dr.zeros(mi.Interaction3f)
-        left = not_left(self.soften, n_paths)
+        left = not_left(self.weights, n_paths)
         return [mi.UInt32(0), mi.UInt32(NO_PARENT), mi.Float(0), origin, left]
 
     def travel(self, state, ray, flight, numbers, throughput, path, depth, active):
@@ -155,7 +153,7 @@ class StepVisitor:
         squared = dr.maximum(dr.squared_norm(si.p - origin.p), 1e-20)
         squared = dr.select(si.is_valid(), squared, dr.inf)
         values = step_to_hit(
-            self.lights, self.soften, left, density, origin, ds, light, squared, met
+            self.lights, self.weights, left, density, origin, ds, light, squared, met
         )
         values |= {"value": value, "path": at.path, "depth": at.depth, "parent": parent}
         self.hit.write(store.hits, values, slot, met)
@@ -170,14 +168,14 @@ class StepVisitor:
         smooth = smooth_at(at, active)
         squared = dr.maximum(dr.squared_norm(si.p - origin.p), 1e-20)
         cosine = facing(self.traits, si.n, at.towards)
-        step = step_to_vertex(self.soften, left, density, cosine, squared)
+        step = step_to_vertex(self.weights, left, density, cosine, squared)
         if self.lens.connects:
             first = active & (at.depth == 1)
             seen = first & self.inside
             of_rays = cosine * self.lens.density(si.p, si.time, self.aperture, seen)
             of_rays = dr.select(of_rays > 0, self.ratio * dr.rcp(dr.maximum(of_rays, 1e-20)), 0)
             step[0] = dr.select(first, of_rays, step[0])
-        merges = self.soften.merging is not None
+        merges = self.weights.merging is not None
         at.vertex_bsdf = VertexBSDF.at(self.traits, si, at.bsdf, smooth, at.medium, merges)
         wanted = smooth & (dr.max(at.throughput) > 0)
         at.slot = keep_vertex(
@@ -191,7 +189,7 @@ class StepVisitor:
         si, wo, smoothly = at.si, at.si.to_world(bs.wo), active & ~delta
         value, p_forward, p_back = at.vertex_bsdf.f_and_pdfs(at.towards, wo, smoothly)
         parent = dr.select(smoothly, at.slot, parent)
-        left = leave(self.soften, left, si, at.vertex_bsdf, value, p_forward, p_back, wo, smoothly)
+        left = leave(self.weights, left, si, at.vertex_bsdf, value, p_forward, p_back, wo, smoothly)
         density = dr.select(delta, 0, p_forward * facing(self.traits, si.n, wo))
         return [number, parent, density, mi.Interaction3f(si), left], weight, active
 
@@ -206,7 +204,7 @@ def trace_camera_vertices(
     world: World,
     limits: Limits,
     camera_pass: CameraPass,
-    soften,
+    weights,
     ratio,
     capacity: int,
     hit_capacity: int,
@@ -219,86 +217,13 @@ def trace_camera_vertices(
     surplus is missing. The first vertex has one over the density of camera rays there, over the
     whole crop window, times `ratio`, as its `d_vcm`, and no parent.
 
-    `soften.row(p, n, d)` numbers places with geometric normals `n`, from which the light is in the
-    direction `d`; `soften.softened(geometry, squared)` may change the geometric term of a step that
-    starts there, with its squared distance (infinite for environments). `soften.kernels` and
+    `weights.row(p, n, d)` numbers places with geometric normals `n`, from which the light is in the
+    direction `d`; `weights.softened(geometry, squared)` may change the geometric term of a step
+    that starts there, with its squared distance (infinite for environments). `weights.kernels` and
     `light_kernels` name more numbers that vertices keep of their parents, and hits of themselves;
     `kernels_of_vertex` and `kernels_of_light` compute them (lists).
     """
-    visitor = StepVisitor(world, limits, camera_pass.sensor, soften, ratio, capacity, hit_capacity)
+    visitor = StepVisitor(world, limits, camera_pass.sensor, weights, ratio, capacity, hit_capacity)
     radiance, alpha, splat = trace_camera(world, limits, camera_pass, visitor)
     store = visitor.store
     return radiance, alpha, splat, store.vertices, store.count, store.hits, store.hit_count
-
-
-@dataclass(frozen=True)
-class LightEnd:
-    """What the light's side of a joint path is at the camera's last vertex, or at the light that it
-    met.
-
-    `p_made` [1/m^2]: the density with which the light's side makes that; `strength`: flux, over the
-    density of that; `scattered`, `back`: BSDF there, and density per projected solid angle with
-    which the light's side goes on to the parent; `segments`: of the joint path; `kernels`: as of
-    `kernels_of_vertex` or `kernels_of_light`; `eta` [m^2]: as of `weights.eta_at` (zero at lights).
-    """
-
-    p_made: mi.Float
-    strength: mi.Float
-    scattered: mi.Float
-    back: mi.Float
-    segments: mi.UInt32
-    kernels: list[mi.Float] = field(default_factory=list)
-    eta: mi.Float | float = 0.0
-
-
-@dr.syntax
-def sum_before(vertices, step, parent, end: LightEnd, weights, active):
-    """Sum over the techniques nearer to the camera than the one at hand, of their samples times
-    densities, over the density of the latter.
-
-    `step`, `parent`: those of the vertex, or hit, at the camera's end. `weights.gain(r, row, s,
-    active)`: what resampling makes of the technique that joins a light sub-path of s vertices,
-    which sends r = q*/p (`weights.sent`), to a vertex of that row. Joining to the sensor (the last
-    step, without a parent) has the gain one. With `weights.merging` each vertex may also be merged
-    with light sub-paths that end there, `weights.eta_at` [m^2] times as likely as it is made.
-    """
-    names, merges = (*STEP, *weights.kernels), weights.merging is not None
-    count = len(weights.kernels)
-    layout = vertex_layout(names)
-    d_vcm, geometry, forward, back_there, scattered_there, row = (
-        mi.Float(step[name]) for name in STEP
-    )
-    kernels = [mi.Float(kernel) for kernel in end.kernels]
-    kernels_there = [mi.Float(step[name]) for name in weights.kernels]
-    parent = mi.UInt32(parent)
-    # What the loop reads must be plain variables: Dr.Jit would take a dataclass for its state.
-    segments = end.segments
-    ratio = mi.Float(end.p_made)
-    strength = mi.Float(end.strength)
-    scattered, back = mi.Float(end.scattered), mi.Float(end.back)
-    active = mi.Bool(active)
-    total, eta = mi.Float(0), mi.Float(end.eta)
-    while dr.hint(active, label="techniques"):
-        joined = parent != NO_PARENT
-        depth = layout.read(vertices["words"], parent, active & joined, ("depth",))["depth"]
-        sent = weights.sent(strength, scattered * geometry, kernels)
-        better = weights.gain(sent, mi.UInt32(row), segments - depth, active & joined)
-        here = d_vcm * dr.select(joined, better, 1)
-        if dr.hint(merges, mode="scalar"):
-            here += eta
-        total = dr.select(active, total + ratio * here, total)
-        ratio = dr.minimum(ratio * (back * dr.rcp(dr.maximum(forward, 1e-20))), 1e15)
-        strength = dr.minimum(strength * (scattered * dr.rcp(dr.maximum(back, 1e-20))), 1e15)
-        back, scattered = mi.Float(back_there), mi.Float(scattered_there)
-        active &= joined & (ratio > 0)
-        record = layout.read(vertices["words"], parent, active, names)
-        if dr.hint(merges, mode="scalar"):
-            there = layout.read(vertices["words"], parent, active, ("n", "density"))
-            eta = mi.Float(weights.eta_at(there))
-        for number in dr.hint(range(count), mode="scalar"):
-            kernels[number] = mi.Float(kernels_there[number])
-            kernels_there[number] = record[names[number - count]]
-        d_vcm, geometry, forward = record["d_vcm"], record["geometry"], record["forward"]
-        back_there, scattered_there, row = record["back"], record["scattered"], record["row"]
-        parent = dr.gather(mi.UInt32, vertices["parent"], parent, active)
-    return total

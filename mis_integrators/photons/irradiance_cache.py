@@ -8,6 +8,8 @@ photons. In media it is the fluence, times the albedo there; normals are zero.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -44,25 +46,26 @@ light."""
 OWN_STREAM = 0x64697265
 
 
+@dataclass
 class Irradiance:
-    """What a cell knows. Spectra: `direct` (irradiance by direct light and caustics), `second` (by
-    light scattered once), `later` (more often). `direction`: mean direction from which the direct
-    part comes. `slot`: the cell's number. `light`: number of the emitter that brings most of the
-    direct part, `visible_share`: how much of that emitter's unoccluded light the direct part is (0:
-    none is known). `noise`: relative variance of next-event estimation with one sample.
-    `caustic_share`: share of caustics in the direct part."""
+    """What a cell knows."""
 
-    def __init__(
-        self, direct, second, later, direction, slot, light, visible_share, noise, caustic_share
-    ):
-        self.direct, self.second, self.later, self.direction = direct, second, later, direction
-        self.slot, self.light, self.visible_share, self.noise, self.caustic_share = (
-            slot,
-            light,
-            visible_share,
-            noise,
-            caustic_share,
-        )
+    direct: mi.Spectrum
+    """Irradiance by direct light and caustics."""
+    second: mi.Spectrum
+    """By light scattered once."""
+    later: mi.Spectrum
+    """By light scattered more often."""
+    direction: mi.Vector3f
+    """Mean direction from which the direct part comes."""
+    light: mi.UInt32
+    """Number of the emitter that brings most of the direct part."""
+    visible_share: mi.Float
+    """How much of that emitter's unoccluded light the direct part is; 0: none is known."""
+    noise: mi.Float
+    """Relative variance of next-event estimation with one sample."""
+    caustic_share: mi.Float
+    """Share of caustics in the direct part."""
 
     def replaced(self, other, mask):
         """The same, and on the lanes `mask` what the `other` cell knows."""
@@ -326,7 +329,7 @@ class IrradianceCache:
         ]
         rest = words[3 * channels :]
         light, visible_share = _unpack_light(rest[3])
-        return Irradiance(*spectra, mi.Vector3f(*rest[:3]), slot, light, visible_share, *rest[4:6])
+        return Irradiance(*spectra, mi.Vector3f(*rest[:3]), light, visible_share, *rest[4:6])
 
 
 def _cosine(d, facing):

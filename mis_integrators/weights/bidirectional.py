@@ -62,42 +62,42 @@ def reciprocal(density: Array) -> Array:
 
 
 def nearer(d_vcm: Array, d_vc: Array, p_back: Array, beta: float, eta: Array = 0.0) -> Array:
-    """A_i = near_i + P' far_i + eta (the brackets of equations 40 and 41): all techniques nearer to
-    the sub-path's start than the one that joins x_i with the other side, over p<(x_i). `p_back`:
+    """A_i = d_vcm_i + P' d_vc_i + eta (the brackets of equations 40 and 41): all techniques nearer
+    to the sub-path's start than the one that joins x_i with the other side, over p<(x_i). `p_back`:
     P', the other side's density at x_i for the direction to x_{i-1}."""
     inner = norm(d_vcm, at_most(p_back * d_vc, LARGEST_RATIO), beta)
     return inner if isinstance(eta, float) and eta == 0 else norm(inner, eta, beta)
 
 
 def d_vcm_of(p_forward: Array, geometry: Array) -> Array:
-    """near_i = 1 / (P(x_{i-1}) G) (equation 34): x_i was sampled from x_{i-1} with density
+    """d_vcm_i = 1 / (P(x_{i-1}) G) (equation 34): x_i was sampled from x_{i-1} with density
     `p_forward`, over a segment with G = `geometry`. To be replaced by zero where x_{i-1} scattered
     by a delta function."""
     return reciprocal(p_forward * geometry)
 
 
 def d_vc_of(a: Array, p_forward: Array) -> Array:
-    """far_{i+1} = A_i / P(x_i) (equation 35), where `a` is A_i and x_i scattered with density
-    `p_forward`; beyond a delta surface far stays what it was (equation 35 with both densities
+    """d_vc_{i+1} = A_i / P(x_i) (equation 35), where `a` is A_i and x_i scattered with density
+    `p_forward`; beyond a delta surface d_vc stays what it was (equation 35 with both densities
     cancelled)."""
     return at_most(a * reciprocal(p_forward), LARGEST_RATIO)
 
 
 def light_start(emission: Array, direct: Array) -> tuple[Array, Array]:
-    """(near_1, far_1) of the vertex that a light sub-path meets first (equations 31 and 32).
+    """(d_vcm_1, d_vc_1) of the vertex that a light sub-path meets first (equations 31 and 32).
 
     `emission` [1/m^2]: area density at the vertex with which light sub-paths start, over that of
     next-event estimation for the light's point (which is technique s = 1). `direct` [1/sr]: the
     latter density, per projected solid angle at the vertex; what it divides is technique s = 0.
-    Where the light cannot be met far_1 is to be replaced by zero, where next-event estimation does
+    Where the light cannot be met d_vc_1 is to be replaced by zero, where next-event estimation does
     not work both are."""
     d_vcm = reciprocal(emission)
     return d_vcm, at_most(d_vcm * reciprocal(direct), LARGEST_RATIO)
 
 
 def camera_start(density: Array, ratio: Array) -> Array:
-    """near_1 of the vertex that a camera sub-path meets first (equation 31); far_1 is zero, for no
-    technique hits the lens.
+    """d_vcm_1 of the vertex that a camera sub-path meets first (equation 31); d_vc_1 is zero, for
+    no technique hits the lens.
 
     `density` [1/m^2]: area density there of camera rays through the whole film; `ratio`: light
     sub-paths over camera paths, both of all the film. To be replaced by zero where the vertex

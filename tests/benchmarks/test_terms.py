@@ -26,7 +26,7 @@ class KnownSession:
         return number
 
     def _render(self, iteration):
-        from mis_integrators.integrators.photon_passes import CAMERA, LIGHT
+        from mis_integrators.integrators.purposes import CAMERA, LIGHT
 
         c, w = (self._sequence(iteration, purpose, 1) for purpose in (CAMERA, LIGHT))
         value = 10.0

@@ -9,14 +9,13 @@ from functools import partial
 from pathlib import Path
 
 from mis_integrators.core.random import streams
+from mis_integrators.mis.step_sums import LightEnd, sum_before
 from mis_integrators.paths.camera_vertices import (
     STEP,
-    LightEnd,
     leave,
     not_left,
     step_to_hit,
     step_to_vertex,
-    sum_before,
 )
 from mis_integrators.paths.connect import join_sensor
 from mis_integrators.paths.setting import Limits, World

@@ -116,20 +116,18 @@ def test_sessions_of_a_render_send_the_same_paths(rgb):
     np.testing.assert_allclose(one.image(), other.image(), rtol=1e-5)
 
 
-def test_purposes_differ(rgb):
-    """What paths that gather draw, and others, and light, and what only weights learn from."""
-    from mis_integrators.integrators import bdpm, bdpm_opt, caustic_radii, direct_light
-    from mis_integrators.integrators.common import IterativeSession
+def test_purposes_differ():
+    """Those of the sessions of photon maps, and of those that connect sub-paths."""
+    from mis_integrators.integrators import purposes
 
-    purposes = [
-        bdpm.LIGHT,
-        bdpm.CAMERA,
-        direct_light.PURPOSE,
-        caustic_radii.PURPOSE,
-        bdpm_opt.FROZEN,
-        IterativeSession.WAVELENGTH,
-    ]
-    assert len(set(purposes)) == len(purposes)
+    shared = purposes.LIGHT, purposes.CAMERA, purposes.WAVELENGTH
+    for own in (
+        ("FROZEN", "DIRECT", "CAUSTIC_RADII", "SENSOR"),
+        ("APERTURE", "SHADOWS"),
+        ("APERTURE", "START", "DRAW"),
+    ):
+        numbers = [*shared, *(getattr(purposes, name) for name in own)]
+        assert len(set(numbers)) == len(numbers)
 
 
 def test_range(rgb):
