@@ -71,7 +71,7 @@ def measure(path: Path, scale: float) -> list[Row]:
 def new_session(opened: OpenScene, put_back: str = ""):
     """A session of the plugin, with a part put back."""
     integrator = Method(PLUGIN, PLUGIN, PARAMETERS.get(put_back, {})).integrator(opened)
-    module = sys.modules["mis_integrators.integrators.bdpm"]
+    module = sys.modules["mis_integrators.integrators.common"]
 
     def traits(scene, sensor=None):
         found = SceneTraits(scene, sensor)

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from ..core.film import as_camera_weights, expected_weight, with_colour
 from ..core.recording import recorder
-from ..core.traits import SceneTraits
-from ..lights.lights import Lights
 from ..paths.camera import film_sample_count, film_size
 from ..paths.layers import CHANNELS, SPLIT
 from ..paths.lobes import narrow_bsdfs
 from ..paths.ray_cones import cones_of
 from ..paths.sensor import Lens
-from ..paths.setting import World
 from ..photons.hits import meets_one_light
 from ..photons.near_zone import NearZone
 from ..photons.volume_radii import VolumeDensity
@@ -196,11 +193,7 @@ class BDPMSession(PhotonPasses):
 
     def __init__(self, integrator, scene, sensor, seed, iterations):
         super().__init__(integrator, scene, sensor, seed, iterations)
-        self.traits = SceneTraits(scene, sensor)
-        self.lights = Lights.seen_by(scene, sensor, integrator.plugin)
-        if self.traits.has_media:
-            self.lights.find_media(sensor, integrator.plugin)
-        self.world = World(scene, self.lights, self.traits)
+        self._find_world()
         self.iteration_light_paths = self.light_path_count = integrator.photon_count or min(
             film_sample_count(sensor), MOST_LIGHT_PATHS
         )  # the latter are fewer in a pilot, and where so many do not pay

@@ -57,15 +57,10 @@ class BDPMBalance(WeightedBDPM):
     def read_parameters(self, parameters):
         self.read_photon_parameters(parameters)
         self.strategies = parameters.integer("strategies", 3, 1, "from 1 to 6", high=6)
-        self.beta = parameters.number(
-            "beta",
-            1.0,
-            lambda beta: 1 <= beta <= 8,
-            "from 1 (balance) to 8; 2 is the power heuristic",
-        )
+        self.beta = parameters.exponent("beta")
 
     def settings(self):
-        return {**super().settings(), "beta": self.beta}
+        return {**super().settings(), "beta": float(self.beta)}
 
     def new_session(self, scene, sensor, seed, iterations):
         return BDPMBalanceSession(self, scene, sensor, seed, iterations)
@@ -76,13 +71,12 @@ class BDPMBalanceSession(WeightedSession):
 
     def weights(self, merge_settings):
         integrator = self.integrator
-        beta = int(integrator.beta) if integrator.beta == int(integrator.beta) else integrator.beta
         return HeuristicWeights(
             self.lights,
             merge_settings["disk_paths"],
             merge_settings["caustic_share"],
             integrator.strategies,
-            beta,
+            integrator.beta,
             merge_settings.get("volume_share"),
         )
 

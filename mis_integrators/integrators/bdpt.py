@@ -121,12 +121,7 @@ class BDPT(IterativeIntegrator):
 
     def read_heuristic(self, parameters):
         """Reads the exponent."""
-        self.beta = parameters.number(
-            "beta",
-            1.0,
-            lambda beta: 1 <= beta <= 8,
-            "from 1 (balance) to 8; 2 is the power heuristic",
-        )
+        self.beta = parameters.exponent("beta")
 
     def estimated_channels(self):
         return super().estimated_channels() + (
@@ -136,7 +131,7 @@ class BDPT(IterativeIntegrator):
     def settings(self):
         return {
             **super().settings(),
-            "beta": self.beta,
+            "beta": float(self.beta),
             "techniques": self.techniques,
             "technique_weights": self.technique_weights,
         }
@@ -187,9 +182,8 @@ class BDPTSession(SubpathSession):
     def weights(self, spectral):
         """The weights of an iteration."""
         integrator = self.integrator
-        beta = int(integrator.beta) if integrator.beta == int(integrator.beta) else integrator.beta
         ratio = self.light_path_count / self.pixel_paths
-        return ConnectionWeights(self.lights, beta, ratio, media=self.traits.has_media)
+        return ConnectionWeights(self.lights, integrator.beta, ratio, media=self.traits.has_media)
 
     # ------------------------------------------------------------------ passes
 

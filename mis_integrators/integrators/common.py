@@ -16,6 +16,7 @@ from ..core.recording import settle
 from ..core.render_lock import render_lock, under_render_lock
 from ..core.sequences import SampleSequence
 from ..core.traits import (
+    SceneTraits,
     UnsupportedScene,
     check_film,
     check_media,
@@ -25,10 +26,11 @@ from ..core.traits import (
     unfinite_data,
 )
 from ..core.untrusted import Fields
+from ..lights.lights import Lights
 from ..paths.camera import film_sample_count, with_gaps
 from ..paths.layers import CHANNELS, channel_names, render_layers, written
 from ..paths.light_classes import CLASSES
-from ..paths.setting import CameraPass, LightPass, Limits
+from ..paths.setting import CameraPass, LightPass, Limits, World
 from ..pilot.run import PILOT_INDEX
 from .parameters import Parameters
 from .purposes import SURFACES, WAVELENGTH
@@ -290,6 +292,15 @@ class IterativeSession:
         )
         self.variant = mi.variant()
         settle(scene)
+
+    def _find_world(self, guided=True):
+        """What the scene is made of, and its lights (`guided`: as of `Lights.seen_by`)."""
+        plugin = self.integrator.plugin
+        self.traits = SceneTraits(self.scene, self.sensor)
+        self.lights = Lights.seen_by(self.scene, self.sensor, plugin, guided)
+        if self.traits.has_media:
+            self.lights.find_media(self.sensor, plugin)
+        self.world = World(self.scene, self.lights, self.traits)
 
     @property
     def sums(self):

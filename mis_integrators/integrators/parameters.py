@@ -62,6 +62,17 @@ class Parameters:
             self._fail(name, value, f"a number, {allowed}")
         return float(value)
 
+    def exponent(self, name):
+        """That of Veach's heuristics, an integer where it is a whole number: powers are cheap
+        then."""
+        value = self.number(
+            name,
+            1.0,
+            lambda beta: 1 <= beta <= 8,
+            "from 1 (balance) to 8; 2 is the power heuristic",
+        )
+        return int(value) if value == int(value) else value
+
     def boolean(self, name, default):
         """True or false."""
         value = self._get(name, default)

@@ -10,12 +10,9 @@ from ..core.film import expected_weight
 from ..core.packing import with_reserve
 from ..core.random import next_2d, vertex_streams
 from ..core.recording import lanes, recorder
-from ..core.traits import SceneTraits
-from ..lights.lights import Lights
 from ..paths.connect import join_sensor
 from ..paths.light_classes import by_class, class_of
 from ..paths.sensor import Lens
-from ..paths.setting import World
 from ..paths.subpaths import STATES, read_vertices, trace_light_subpaths
 from .common import IterativeSession
 
@@ -33,11 +30,7 @@ class SubpathSession(IterativeSession):
 
     def __init__(self, integrator, scene, sensor, seed, iterations, largest, guided=True):
         super().__init__(integrator, scene, sensor, seed, iterations)
-        self.traits = SceneTraits(scene, sensor)
-        self.lights = Lights.seen_by(scene, sensor, integrator.plugin, guided)
-        if self.traits.has_media:
-            self.lights.find_media(sensor, integrator.plugin)
-        self.world = World(scene, self.lights, self.traits)
+        self._find_world(guided)
         self.split_paths(largest)
         width, height = sensor.film().crop_size()
         self.pixel_paths = width * height * integrator.camera_paths
