@@ -66,6 +66,22 @@ def collision(medium, p, majorant, time, wavelengths, active, wi=None):
     return null, dr.select(total > 0, sigma_s * dr.rcp(dr.maximum(total, 1e-30)), 0), probability
 
 
+def beyond_boundary(traits, hit, ray, medium, met):
+    """Where the lanes `met` of a `ray` meet a surface that only lets light pass: which do, the
+    share of light that passes (a spectrum), and the medium and the ray's origin beyond; those of
+    before on all other lanes."""
+    surface = hit.compute_surface_interaction(ray, traits.boundary_flags, met)
+    bsdf = surface.bsdf()
+    scattering = int(mi.BSDFFlags.Delta) | int(mi.BSDFFlags.Smooth)  # Null among them
+    passes = (bsdf.flags() & scattering) == int(mi.BSDFFlags.Null)
+    crosses = met & ~hit.shape.is_emitter() & passes
+    share = bsdf.eval_null_transmission(surface, crosses)
+    beyond = dr.select(
+        crosses & surface.is_medium_transition(), surface.target_medium(ray.d), medium
+    )
+    return crosses, share, beyond, dr.select(crosses, surface.spawn_ray(ray.d).o, ray.o)
+
+
 @dr.syntax
 def transmittance(scene, traits, ray, medium, rng, active):
     """Share of light that gets along `ray` (to its `maxt`) through media and null boundaries: exact
@@ -149,7 +165,6 @@ def fly(scene, traits, ray, medium, draws, active, keep=None):
     passed = mi.Float(0)
     normal = None if keep is None else mi.Normal3f(0, 0, 1)
     fresh = mi.Bool(True)  # the next surface is not known yet
-    scattering = int(mi.BSDFFlags.Delta) | int(mi.BSDFFlags.Smooth)  # Null among them
     while dr.hint(flying, label="free flight"):
         look = flying & fresh
         hit[look] = scene.ray_intersect_preliminary(ray, coherent=False, active=look)
@@ -185,14 +200,8 @@ def fly(scene, traits, ray, medium, draws, active, keep=None):
 
         # ---- Boundaries
         met = flying & ~collided & hit.is_valid()
-        surface = hit.compute_surface_interaction(ray, traits.boundary_flags, met)
-        bsdf = surface.bsdf()
-        crosses = (
-            met & ~hit.shape.is_emitter() & ((bsdf.flags() & scattering) == int(mi.BSDFFlags.Null))
-        )
-        weight[crosses] = weight * bsdf.eval_null_transmission(surface, crosses)
-        medium[crosses & surface.is_medium_transition()] = surface.target_medium(ray.d)
-        ray.o[crosses] = surface.spawn_ray(ray.d).o
+        crosses, share, medium, ray.o = beyond_boundary(traits, hit, ray, medium, met)
+        weight[crosses] = weight * share
         passed[crosses] = 0
         fresh |= crosses
         flying &= passes | crosses
@@ -229,7 +238,6 @@ def pass_straight(scene, traits, ray, medium, draws, keep, active):
     passed = mi.Float(0)
     normal = mi.Normal3f(0, 0, 1)
     fresh = mi.Bool(True)  # the next surface is not known yet
-    scattering = int(mi.BSDFFlags.Delta) | int(mi.BSDFFlags.Smooth)  # Null among them
     while dr.hint(going, label="straight on"):
         look = going & fresh
         hit[look] = scene.ray_intersect_preliminary(ray, coherent=False, active=look)
@@ -272,14 +280,8 @@ def pass_straight(scene, traits, ray, medium, draws, keep, active):
 
         # ---- Boundaries
         met = going & ~cut & hit.is_valid()
-        surface = hit.compute_surface_interaction(ray, traits.boundary_flags, met)
-        bsdf = surface.bsdf()
-        crosses = (
-            met & ~hit.shape.is_emitter() & ((bsdf.flags() & scattering) == int(mi.BSDFFlags.Null))
-        )
-        kept[crosses] = kept * bsdf.eval_null_transmission(surface, crosses)
-        medium[crosses & surface.is_medium_transition()] = surface.target_medium(ray.d)
-        ray.o[crosses] = surface.spawn_ray(ray.d).o
+        crosses, share, medium, ray.o = beyond_boundary(traits, hit, ray, medium, met)
+        kept[crosses] = kept * share
         passed[crosses] = 0
         fresh |= crosses
 
