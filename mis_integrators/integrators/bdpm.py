@@ -288,23 +288,22 @@ class BDPMSession(PhotonPasses):
 
     def pilot_setting(self):
         integrator = self.integrator
+        chooses = self.chooses_light_paths and not integrator.photon_count
         return PilotSetting(
-            film_size(self.sensor)[0],
-            film_sample_count(self.sensor),
-            self.traits.extent,
-            tuple(self.kinds()),
-            integrator.bdd == 0,
-            self.narrow is not None,
-            self.camera_paths,
-            self.iterations_planned,
-            self.seconds,
-            self.iteration_light_paths / self.light_path_count,
-            integrator.denoised,
-            light_shares(self.iteration_light_paths)
-            if self.chooses_light_paths and not integrator.photon_count
-            else (1.0,),
-            3 if self.points else 2,
-            self.near_zone is not None,
+            width=film_size(self.sensor)[0],
+            pixels=film_sample_count(self.sensor),
+            extent=self.traits.extent,
+            kinds=tuple(self.kinds()),
+            at_first_vertex=integrator.bdd == 0,
+            passes_lobes=self.narrow is not None,
+            camera_paths=self.camera_paths,
+            iterations=self.iterations_planned,
+            seconds=self.seconds,
+            light_paths=self.iteration_light_paths / self.light_path_count,
+            denoised=integrator.denoised,
+            light_shares=light_shares(self.iteration_light_paths) if chooses else (1.0,),
+            volume_dimensions=3 if self.points else 2,
+            joins_sensor=self.near_zone is not None,
         )
 
     def pilot_passes(self, setting, pixels):

@@ -40,7 +40,9 @@ LARGEST_PART = 1 << 21
 """Paths traced at once at most (bounds memory)."""
 LARGEST = 1e18
 """Number that `Beside` can hold."""
-NOTHING_GATHERED = Queries(0, 0, False, False, True)
+NOTHING_GATHERED = Queries(
+    bdd=0, capacity=0, has_caustics=False, has_indirect=False, one_vertex=True
+)
 
 
 class Beside(NamedTuple):

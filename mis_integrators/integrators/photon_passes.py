@@ -161,17 +161,17 @@ class PhotonPasses(PilotedSession):
         """Traces the paths of a `CameraPass`, with room for so many vertices and beams; other
         arguments as of `trace_camera_paths`."""
         queries = Queries(
-            self.last_vertex,
-            capacity,
-            self.has_caustics,
-            self.has_indirect,
-            self.one_vertex,
-            0 if self.points else beams,
-            self.narrow,
-            self.points,
-            self.cones,
-            self.near_zone,
-            self.by_chance,
+            bdd=self.last_vertex,
+            capacity=capacity,
+            has_caustics=self.has_caustics,
+            has_indirect=self.has_indirect,
+            one_vertex=self.one_vertex,
+            beams=0 if self.points else beams,
+            narrow=self.narrow,
+            points=self.points,
+            cones=self.cones,
+            near_zone=self.near_zone,
+            meets_lights=self.by_chance,
         )
         return trace_camera_paths(
             self.world,

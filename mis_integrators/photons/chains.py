@@ -89,7 +89,10 @@ class ChainVisitor(QueryVisitor):
     smoothly, the place of this one, and `f` and `p` of that scattering."""
 
     def __init__(self, world, limits, first, last, capacity, beyond):
-        super().__init__(world, limits, Queries(last, 0, True, True, True), None, 1.0, beyond, None)
+        queries = Queries(
+            bdd=last, capacity=0, has_caustics=True, has_indirect=True, one_vertex=True
+        )
+        super().__init__(world, limits, queries, None, 1.0, beyond, None)
         self.kept_to, self.capacity, room = first, capacity, capacity * (last + 1)
         self.store = Store(
             words=dr.zeros(mi.UInt32, query_layout().words * room),

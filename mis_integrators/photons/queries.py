@@ -130,7 +130,7 @@ def pixel_disk(record):
     return PIXEL_DISK * record["pixel"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Queries:
     """Where photons are asked for.
 
