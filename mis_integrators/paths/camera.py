@@ -14,7 +14,7 @@ from .media import begin_flights, interaction_at, medium_behind, sample_phase
 from .roulette import russian_roulette
 from .setting import CameraPass, Limits, ListedPass, World
 
-Array = Any
+Array = State = Any
 
 
 def film_samples(sensor, pixel, rng):
@@ -141,16 +141,16 @@ class CameraArrival:
 
 
 class CameraVisitor(Protocol):
-    """What is done where camera sub-paths meet surfaces and lights. Its state, a list of arrays,
-    travels with them. Radiance is a spectrum, zero on all other lanes, throughput included."""
+    """What is done where camera sub-paths meet surfaces and lights. Its state, arrays in
+    lists or dictionaries, travels with them. Radiance is a spectrum, zero on all other lanes, throughput included."""
 
-    def begin(self, n_paths: int, splat: Array, aperture: Array) -> list[Any]:
+    def begin(self, n_paths: int, splat: Array, aperture: Array) -> State:
         """The state before the first surface. `splat`: positions on the film; `aperture`: samples
         that chose the points of the lens."""
 
     def travel(
         self,
-        state: list[Any],
+        state: State,
         ray: Array,
         flight: list[Any],
         numbers: Any,
@@ -158,39 +158,39 @@ class CameraVisitor(Protocol):
         path: Array,
         depth: Array,
         active: Array,
-    ) -> tuple[list[Any], Array, Array, list[Any], Array]:
+    ) -> tuple[State, Array, Array, list[Any], Array]:
         """In scenes with media: moves sub-paths after `depth` segments to where they scatter or
         meet a surface next: `(state, hit, ray, flight, throughput)`, as `media.next_hit`."""
 
-    def emission(self, state: list[Any], at: CameraArrival, active: Array) -> Array:
+    def emission(self, state: State, at: CameraArrival, active: Array) -> Array:
         """Radiance of a light that is met. Not called in scenes without lights that can be met."""
 
-    def unfinished(self, state: list[Any], at: CameraArrival) -> Array:
+    def unfinished(self, state: State, at: CameraArrival) -> Array:
         """Which sub-paths may scatter at what they have met."""
 
     def arrive(
-        self, state: list[Any], at: CameraArrival, rng: Any, active: Array
-    ) -> tuple[list[Any], Array]:
+        self, state: State, at: CameraArrival, rng: Any, active: Array
+    ) -> tuple[State, Array]:
         """The state at a surface, and radiance of direct light there."""
 
     def leave(
         self,
-        state: list[Any],
+        state: State,
         at: CameraArrival,
         rng: Any,
         bs: Any,
         weight: Array,
         delta: Array,
         active: Array,
-    ) -> tuple[list[Any], Array, Array]:
+    ) -> tuple[State, Array, Array]:
         """After scattering, by a delta function or not: the state, the throughput's factor (at
         first `weight`), and which sub-paths go on."""
 
-    def cross(self, before: list[Any], after: list[Any], crosses: Array) -> list[Any]:
+    def cross(self, before: State, after: State, crosses: Array) -> State:
         """In scenes with media: the state, where sub-paths have passed straight through a surface,
         from those before they arrived and after they left."""
 
-    def alpha(self, state: list[Any], visible: Array) -> Array:
+    def alpha(self, state: State, visible: Array) -> Array:
         """Coverage of the paths in the end; `visible`: as of `CameraArrival`."""
 
 

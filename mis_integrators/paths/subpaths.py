@@ -172,11 +172,12 @@ def seen_normal(vertex):
 
 
 def selected(mask, yes, no):
-    """Element by element, of states that hold lists, too."""
-    return [
-        selected(mask, a, b) if isinstance(a, list) else dr.select(mask, a, b)
-        for a, b in zip(yes, no)
-    ]
+    """Element by element, of states that hold lists or dictionaries, too."""
+    if isinstance(yes, dict):
+        return {name: selected(mask, yes[name], no[name]) for name in yes}
+    if isinstance(yes, list):
+        return [selected(mask, a, b) for a, b in zip(yes, no)]
+    return dr.select(mask, yes, no)
 
 
 def _either(mask, yes, no):

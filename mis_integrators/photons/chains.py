@@ -85,7 +85,7 @@ class ChainVisitor(QueryVisitor):
     """Stores camera vertices up to number `last` as `CameraChains`. Direct light at vertices beyond
     number `first` is kept with them, and does not count for the path's radiance.
 
-    Its state: that of a `QueryVisitor`, and a link: the place of the last vertex that scattered
+    Its state: that of a `QueryVisitor`, and the `link`: the place of the last vertex that scattered
     smoothly, the place of this one, and `f` and `p` of that scattering."""
 
     def __init__(self, world, limits, first, last, capacity, beyond):
@@ -104,19 +104,19 @@ class ChainVisitor(QueryVisitor):
 
     def begin(self, n_paths, splat, aperture):
         link = [mi.UInt32(NONE), mi.UInt32(NONE), mi.Float(0), mi.Float(0)]
-        return [*super().begin(n_paths, splat, aperture), link]
+        return {**super().begin(n_paths, splat, aperture), "link": link}
 
     def emission(self, state, at, active):
-        *base, (before, _, _, _) = state
-        light = super().emission(base, at, active)
-        apart = active & (base[0] > self.kept_to + 1) & (before != NONE)
+        before = state["link"][0]
+        light = super().emission(state, at, active)
+        apart = active & (state["vertex"] > self.kept_to + 1) & (before != NONE)
         dr.scatter(self.store.met, light, before, apart & (dr.max(light) > 0))
         return dr.select(apart, 0, light)
 
     def arrive(self, state, at, rng, active):
-        *base, (before, _, f, p) = state
-        number = base[0]
-        base, direct = super().arrive(base, at, rng, active)
+        before, _, f, p = state["link"]
+        number = state["vertex"]
+        state, direct = super().arrive(state, at, rng, active)
         smooth = active & mi.has_flag(at.bsdf.flags(), mi.BSDFFlags.Smooth)
         wants = smooth & (dr.max(at.throughput) > 0)
         here = dr.scatter_inc(self.store.count, number, wants)
@@ -128,23 +128,23 @@ class ChainVisitor(QueryVisitor):
         apart = number > self.kept_to
         dr.scatter(self.store.found, direct, here, wants & apart)
         here = dr.select(wants, here, mi.UInt32(NONE))
-        return [*base, [before, here, f, p]], dr.select(apart, 0, direct)
+        return {**state, "link": [before, here, f, p]}, dr.select(apart, 0, direct)
 
     def _ask_for_photons(self, state, at, smooth):
         """All vertices are stored, see `arrive`."""
 
     def leave(self, state, at, rng, bs, weight, delta, active):
-        *base, (before, here, f, p) = state
+        before, here, f, p = state["link"]
         scattered = active & ~delta
         new_f, new_p = f_and_p(at.si, at.bsdf, bs.wo, scattered)
-        base, weight, active = super().leave(base, at, rng, bs, weight, delta, active)
+        state, weight, active = super().leave(state, at, rng, bs, weight, delta, active)
         link = [
             dr.select(scattered, here, before),
             here,
             dr.select(scattered, new_f, f),
             dr.select(scattered, new_p, p),
         ]
-        return [*base, link], weight, active
+        return {**state, "link": link}, weight, active
 
 
 def trace_camera_chains(world, limits, camera_pass, first, last, capacity, beyond=None):

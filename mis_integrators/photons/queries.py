@@ -166,14 +166,15 @@ class QueryVisitor:
     `first` is what emission, and direct light at the first smooth vertex, count, which other paths
     see, too; `beyond` what direct light counts beyond that, if it is not the same.
 
-    Its state: smooth vertices left behind, `narrow` ones not counted (the last one counts as the
-    `bdd`-th); whether there was any of these; whether the last vertex scattered by a delta
-    function; the density of the last smooth scattering; the last smooth vertex; the weight of
-    direct light there; how many times light counts that is found there; the state of `weights`;
-    with `classes` what these carry along; with the queries' `cones` the path's; where paths meet
-    lights by chance, the place of the last smooth vertex, the cosine at which they left it, and the
-    mean throughput with which they did; and in scenes with media the share of light that has got
-    through these without being scattered.
+    Its state, by name: `vertex`, smooth vertices left behind, `narrow` ones not counted (the last
+    one counts as the `bdd`-th); `met`, whether there was any of these; `behind_delta`, whether the
+    last vertex scattered by a delta function; `scatter_pdf`, the density of the last smooth
+    scattering; `origin`, the last smooth vertex; `share`, the weight of direct light there;
+    `times`, how many times light counts that is found there; `sums`, the state of `weights`;
+    `history`, what `classes` carry along; `cone`, with the queries' `cones` the path's; `left`,
+    where paths meet lights by chance, the place of the last smooth vertex, the cosine at which they
+    left it, and the mean throughput with which they did; and `clear`, in scenes with media, the
+    share of light that has got through these without being scattered. The last five are lists.
 
     In media, paths scatter until they have left `bdd` smooth vertices behind, and go straight on
     from there; where photons are asked for at points, until they have left one more behind. Where
@@ -223,18 +224,23 @@ class QueryVisitor:
             self.store.point_count = dr.zeros(mi.UInt32, self.sections)
 
     def begin(self, n_paths, splat, aperture):
-        sums = [] if self.weights is None else self.weights.init(n_paths)
-        origin = dr.zeros(mi.Interaction3f)
         one = mi.Float(1)
-        history = [] if self.classes is None else start_of_camera_path()
-        begun = [mi.UInt32(0), mi.Bool(False), mi.Bool(False), one, origin, mi.Spectrum(1)]
-        cone = [] if self.queries.cones is None else self.queries.cones.begin()
-        left = [mi.UInt32(0), one, one] if self.queries.meets_lights else []
-        clear = [mi.Spectrum(1)] if self.traits.has_media else []
-        return [*begun, mi.Float(self.first), sums, history, cone, left, clear]
+        return {
+            "vertex": mi.UInt32(0),
+            "met": mi.Bool(False),
+            "behind_delta": mi.Bool(False),
+            "scatter_pdf": one,
+            "origin": dr.zeros(mi.Interaction3f),
+            "share": mi.Spectrum(1),
+            "times": mi.Float(self.first),
+            "sums": [] if self.weights is None else self.weights.init(n_paths),
+            "history": [] if self.classes is None else start_of_camera_path(),
+            "cone": [] if self.queries.cones is None else self.queries.cones.begin(),
+            "left": [mi.UInt32(0), one, one] if self.queries.meets_lights else [],
+            "clear": [mi.Spectrum(1)] if self.traits.has_media else [],
+        }
 
     def travel(self, state, ray, flight, numbers, throughput, path, depth, active):
-        *others, left, clear = state
         brought = throughput
         if self.queries.near_zone is not None:
             kept = numbers.at(BEAM + depth).next_float32() < BEAMS_KEPT
@@ -245,9 +251,9 @@ class QueryVisitor:
             keep_short = None
             if SHORT in self.kinds:
                 keep_short = self._keep_beams(state, brought, path, depth + 1, SHORT)
-            flies = state[0] < self.flights
+            flies = state["vertex"] < self.flights
             if self.queries.near_zone is not None:
-                flies &= state[0] > 0
+                flies &= state["vertex"] > 0
             hit, ray, flight, kept = next_hit_either(
                 self.scene, self.traits, ray, flight, numbers, keep_short, keep, flies, active
             )
@@ -255,18 +261,19 @@ class QueryVisitor:
             hit, ray, flight, kept = next_hit_straight_on(
                 self.scene, self.traits, ray, flight, numbers, keep, active
             )
+        state = {**state, "clear": [state["clear"][0] * kept]}
         if self.queries.cones is not None:  # boundaries have been passed on the way
-            *others, cone = others
             passed = dr.norm(ray.o - begun)
-            others += [self.queries.cones.grown(cone, ray.d, passed, depth == 0, active)]
-        return [*others, left, [clear[0] * kept]], hit, ray, flight, throughput * kept
+            cone = self.queries.cones.grown(state["cone"], ray.d, passed, depth == 0, active)
+            state["cone"] = cone
+        return state, hit, ray, flight, throughput * kept
 
     def _keep_beams(self, state, throughput, path, depth, kind):
         """What keeps the beams of paths (see `pass_straight`, `fly`): long ones after `bdd` smooth
         vertices, short ones before; with a near zone also long ones before the first vertex."""
         if not self.queries.beams:
             return lambda *piece: None
-        vertex, *_, sums, history, _, _, _ = state
+        vertex = state["vertex"]
         store, wanted = self.store, mi.Bool(True)
         if kind == LONG:
             wanted &= vertex == self.bdd
@@ -280,9 +287,9 @@ class QueryVisitor:
         stored = {}
         if self.weights is not None:
             depth |= vertex << LEVEL_SHIFT
-            stored = dict(zip(STATE, self.weights.stored(sums)), share=mi.Spectrum(1))
+            stored = dict(zip(STATE, self.weights.stored(state["sums"])), share=mi.Spectrum(1))
         if self.classes is not None:
-            depth |= dr.select(history[0] == 0, mi.UInt32(FIRST), 0)
+            depth |= dr.select(state["history"][0] == 0, mi.UInt32(FIRST), 0)
 
         def keep(start, medium, length, kept, normal, surface, mask):
             if zone is not None:
@@ -311,7 +318,8 @@ class QueryVisitor:
         return keep
 
     def emission(self, state, at, active):
-        _, met, behind_delta, scatter_pdf, origin, share_here, times, sums, history, *more = state
+        met, behind_delta, share_here = state["met"], state["behind_delta"], state["share"]
+        origin, scatter_pdf = state["origin"], state["scatter_pdf"]
         ds = mi.DirectionSample3f(self.scene, at.si, origin)
         shown = active & (~met | ~behind_delta)
         if self.hide_emitters:
@@ -319,18 +327,21 @@ class QueryVisitor:
         later = shown & met
         light_pdf = self.lights.pdf_direct(origin, ds, later)
         if self.by_light:
-            share_here = share_here * self.weights.next_event_weight(sums, origin, ds, later)
+            share_here = share_here * self.weights.next_event_weight(
+                state["sums"], origin, ds, later
+            )
         share = dr.select(met, mis_power(scatter_pdf, light_pdf) * share_here, mi.Spectrum(1))
         kept = mi.Bool(False)
         if self.queries.meets_lights:
             kept = active & met & behind_delta
         light = at.throughput * ds.emitter.eval(at.si, shown | kept)
         if self.queries.meets_lights:
-            self._keep_hit(more[1], at, light, scatter_pdf, kept)
+            self._keep_hit(state["left"], at, light, scatter_pdf, kept)
         light *= share
+        light *= state["times"]
         if self.classes is not None:
-            self.classes.add("met", at.path, class_of(*history), light * times, shown)
-        return dr.select(shown, light * times, 0)
+            self.classes.add("met", at.path, class_of(*state["history"]), light, shown)
+        return dr.select(shown, light, 0)
 
     def _keep_hit(self, left, at, light, scatter_pdf, met):
         """Keeps the `light` that paths have met behind delta surfaces with the vertex before these,
@@ -352,15 +363,14 @@ class QueryVisitor:
     def unfinished(self, state, at):
         if self.passes_masks:
             return mi.Bool(True)
-        unfinished = state[0] <= self.bdd
+        unfinished = state["vertex"] <= self.bdd
         if self.queries.meets_lights:
             unfinished |= mi.has_flag(at.bsdf.flags(), mi.BSDFFlags.Delta)
         return unfinished
 
     def arrive(self, state, at, rng, active):
-        vertex, met, behind_delta, scatter_pdf, origin, share_here, times, sums, *more = state
-        weights, bsdf = self.weights, at.bsdf
-        smooth = smooth_at(at, active)
+        vertex, weights, bsdf = state["vertex"], self.weights, at.bsdf
+        state, smooth = dict(state), smooth_at(at, active)
         if self.passes_masks or self.queries.meets_lights:
             smooth &= vertex <= self.bdd
         at.ends = vertex >= self.bdd  # the path's last smooth vertex
@@ -369,21 +379,22 @@ class QueryVisitor:
             at.ends &= ~at.narrow
         if self.beyond is not None:
             # Other paths go straight through media.
-            unseen = met | at.scatters if self.flies else met
-            times = dr.select(smooth & unseen, self.beyond, times)
+            unseen = state["met"] | at.scatters if self.flies else state["met"]
+            state["times"] = dr.select(smooth & unseen, self.beyond, state["times"])
         if weights is not None:
-            sums, share = weights.propagate(sums, at.si, self._scattering(at), vertex, smooth)
-            share_here = dr.select(smooth, share, share_here)
-            at.ends |= weights.ends(self._scattering(at), vertex, smooth)
+            scattering = self._scattering(at)
+            state["sums"], share = weights.propagate(
+                state["sums"], at.si, scattering, vertex, smooth
+            )
+            state["share"] = dr.select(smooth, share, state["share"])
+            at.ends |= weights.ends(scattering, vertex, smooth)
         if self.queries.cones is not None:
-            history, cone, *others = more
-            more = [history, self.queries.cones.arrived(cone, at, active), *others]
-        state = [vertex, met, behind_delta, scatter_pdf, origin, share_here, times, sums, *more]
+            state["cone"] = self.queries.cones.arrived(state["cone"], at, active)
         direct = mi.Spectrum(0)
         if not self.lights.dark:
-            direct = self._direct(state, at, rng, smooth) * times
+            direct = self._direct(state, at, rng, smooth) * state["times"]
             if self.classes is not None:
-                number = class_of(more[0][0] + 1, mi.Bool(False))
+                number = class_of(state["history"][0] + 1, mi.Bool(False))
                 self.classes.add("next_event", at.path, number, direct, smooth)
         at.slot = self._ask_for_photons(state, at, smooth)
         return state, direct
@@ -394,8 +405,7 @@ class QueryVisitor:
 
     def _direct(self, state, at, rng, smooth):
         """Radiance of direct light at smooth vertices, by next-event estimation."""
-        vertex, _, _, _, _, share_here, _, sums, *_ = state
-        si, weights = at.si, self.weights
+        si, weights, share_here = at.si, self.weights, state["share"]
         if self.traits.has_media:
             sides = Sides.at(si, at.medium)
             ds, light, light_pdf = direct_light(
@@ -408,16 +418,17 @@ class QueryVisitor:
         scattering, lit = self._scattering(at), reached if self.flies else smooth
         response, response_pdf = scattering.eval_pdf(mi.BSDFContext(), si, wo, lit)
         if self.by_light:
-            left = weights.scatter(sums, si, scattering, mi.BSDFSample3f(wo), vertex, reached)
+            left = weights.scatter(
+                state["sums"], si, scattering, mi.BSDFSample3f(wo), state["vertex"], reached
+            )
             share_here = share_here * weights.next_event_weight(left, si, ds, reached)
         share = dr.select(ds.delta, 1, mis_power(light_pdf, response_pdf)) * share_here
         return dr.select(smooth, at.throughput * share * response * light, 0)
 
     def _ask_in_medium(self, state, at, wants):
         """Stores the vertices in media at which photons are to be gathered."""
-        vertex, _, _, _, _, share_here, _, sums, history, *_ = state
         store = self.store
-        section = dr.select(at.ends, mi.UInt32(self.bdd), vertex)
+        section = dr.select(at.ends, mi.UInt32(self.bdd), state["vertex"])
         slot = dr.scatter_inc(store.point_count, section, wants)
         wants &= slot < store.room
         slot += section * store.room
@@ -430,14 +441,16 @@ class QueryVisitor:
             "medium": at.medium,
         }
         point_layout().write(store.points["words"], point, slot, wants)
-        state = {**dict(zip(STATE, self.weights.stored(sums))), "share": share_here}
-        weight_layout().write(store.points["weights"], state, slot, wants)
+        weight_layout().write(store.points["weights"], self._stored(state), slot, wants)
         if self.classes is not None:
-            dr.scatter(store.points["first"], history[0] == 0, slot, wants)
+            dr.scatter(store.points["first"], state["history"][0] == 0, slot, wants)
+
+    def _stored(self, state):
+        """What is kept with a vertex for the weights."""
+        return {**dict(zip(STATE, self.weights.stored(state["sums"]))), "share": state["share"]}
 
     def _ask_for_photons(self, state, at, smooth):
         """Stores the vertices at which photons are to be gathered; returns their places."""
-        vertex, met, _, _, _, share_here, _, sums, history, cone, *_ = state
         weights, store, queries = self.weights, self.store, self.queries
         last = at.ends | (weights is not None)
         wants = smooth & (dr.max(at.throughput) > 0)
@@ -451,7 +464,7 @@ class QueryVisitor:
         if not queries.one_vertex:
             section = mi.UInt32(0)
             if weights is not None:
-                section = dr.select(at.ends, mi.UInt32(self.bdd), vertex)
+                section = dr.select(at.ends, mi.UInt32(self.bdd), state["vertex"])
             slot = dr.scatter_inc(store.count, section, wants)
             wants &= slot < store.room
             slot += section * store.room
@@ -459,17 +472,16 @@ class QueryVisitor:
             return slot
         query_layout().write(store.vertices["words"], query_at(at, last), slot, wants)
         if weights is not None:
-            state = {**dict(zip(STATE, weights.stored(sums))), "share": share_here}
-            weight_layout().write(store.vertices["weights"], state, slot, wants)
+            weight_layout().write(store.vertices["weights"], self._stored(state), slot, wants)
         if self.classes is not None:
-            dr.scatter(store.vertices["first"], history[0] == 0, slot, wants)
-        if cone:
-            dr.scatter(store.vertices["pixel"], dr.select(met, 0, cone[0]), slot, wants)
+            dr.scatter(store.vertices["first"], state["history"][0] == 0, slot, wants)
+        if state["cone"]:
+            width = dr.select(state["met"], 0, state["cone"][0])
+            dr.scatter(store.vertices["pixel"], width, slot, wants)
         return slot
 
     def leave(self, state, at, rng, bs, weight, delta, active):
-        vertex, met, _, scatter_pdf, origin, share_here, times, sums, history, *more = state
-        cone, left, clear = more
+        vertex, state = state["vertex"], dict(state)
         if not self.traits.has_light_surfaces:
             active &= delta | ~at.ends
         if self.queries.meets_lights:
@@ -477,41 +489,37 @@ class QueryVisitor:
         elif self.passes_masks:
             active &= vertex <= self.bdd
         scattered = active & ~delta
-        if left:
+        if state["left"]:
             cosine = dr.abs(dr.dot(at.si.n, at.si.to_world(bs.wo)))
             # Light that reaches places in media is that of volume photons alone.
             slot = dr.select(at.scatters, NO_VERTEX, at.slot) if self.flies else at.slot
             now = [slot, cosine, channel_mean(at.throughput * weight)]
-            left = selected(scattered, now, left)
+            state["left"] = selected(scattered, now, state["left"])
         if self.weights is not None:
-            sums = self.weights.scatter(sums, at.si, self._scattering(at), bs, vertex, scattered)
+            state["sums"] = self.weights.scatter(
+                state["sums"], at.si, self._scattering(at), bs, vertex, scattered
+            )
+        if state["history"]:
+            state["history"] = scattered_history(state["history"], delta, active)
         beyond = dr.select(at.ends, mi.UInt32(self.bdd), vertex) + 1
         if self.queries.narrow is not None:
             beyond = dr.select(at.narrow & ~at.ends, vertex, beyond)
-        state = [
-            dr.select(scattered, beyond, vertex),
-            met | scattered,
-            mi.Bool(delta),
-            dr.select(scattered, bs.pdf, scatter_pdf),
-            dr.select(scattered, mi.Interaction3f(at.si), origin),
-            share_here,
-            times,
-            sums,
-            scattered_history(history, delta, active) if history else [],
-            cone,
-            left,
-            clear,
-        ]
+        state |= {
+            "vertex": dr.select(scattered, beyond, vertex),
+            "met": state["met"] | scattered,
+            "behind_delta": mi.Bool(delta),
+            "scatter_pdf": dr.select(scattered, bs.pdf, state["scatter_pdf"]),
+            "origin": dr.select(scattered, mi.Interaction3f(at.si), state["origin"]),
+        }
         return state, weight, active
 
     def cross(self, before, after, crosses):
-        *others, _, left, clear = before
-        return selected(crosses, [*others, after[-3], left, clear], after)
+        return selected(crosses, {**before, "cone": after["cone"]}, after)
 
     def alpha(self, state, visible):
         if not self.traits.has_media:
             return whole_or_nothing(visible)
-        return dr.select(visible, 1, 1 - channel_mean(state[-1][0]))
+        return dr.select(visible, 1, 1 - channel_mean(state["clear"][0]))
 
 
 def trace_camera_paths(
