@@ -142,7 +142,8 @@ class CameraArrival:
 
 class CameraVisitor(Protocol):
     """What is done where camera sub-paths meet surfaces and lights. Its state, arrays in
-    lists or dictionaries, travels with them. Radiance is a spectrum, zero on all other lanes, throughput included."""
+    lists or dictionaries, travels with them. Radiance is a spectrum, zero on all other lanes,
+    throughput included."""
 
     def begin(self, n_paths: int, splat: Array, aperture: Array) -> State:
         """The state before the first surface. `splat`: positions on the film; `aperture`: samples
