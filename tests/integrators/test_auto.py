@@ -387,9 +387,8 @@ def test_prediction_is_checked(rgb, sampler):
     samples = round(64 * session.decision.usual_cost / trial.cost)
     images = []
     for seed in range(12):
-        one = Unidirectional(sampler=sampler).session(scene, 0, seed, 0)
-        for _ in range(samples):
-            one.iterate()
+        one = Unidirectional(sampler=sampler, camera_paths=samples).session(scene, 0, seed, 0)
+        one.iterate()
         images.append(one.image().mean(axis=-1))
     mean = np.mean(images, axis=0)
     weights = 1 / (mean**2 + 0.1 * np.mean(np.minimum(mean, np.quantile(mean, 0.95))) ** 2)

@@ -153,7 +153,7 @@ SCENES = {
 }
 
 
-BY_DEFAULT = "many kinds", "lens within", "rough glass"
+BY_DEFAULT = "many kinds", "rough glass"
 """All kinds of media, phase functions, boundaries and emitters, in this file and in those of other
 plugins."""
 

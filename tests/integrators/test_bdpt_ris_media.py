@@ -48,8 +48,8 @@ there."""
     "name, scene, parameters",
     [
         ("bdpt_ris", "grid", {"target": "f_y_f_yz", "resamples": 2}),
-        ("pcbpt", "coloured", {"light_paths": 50}),
         *extended(
+            ("pcbpt", "coloured", {"light_paths": 50}),
             *(("bdpt_ris", name, {}) for name in ("glass", *MORE)),
             ("pcbpt", "half the light", {"light_paths": 10, "cache_neighbors": 1}),
             ("pcbpt", "lamp within", {"light_tracing": 0.125}),

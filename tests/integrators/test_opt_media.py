@@ -246,7 +246,7 @@ class SmallRadius(SmallRadiusBatches):
 
 @pytest.mark.parametrize(
     "name, strategies",
-    one_in_each_row(sorted(SCENES), (2, 3), [("coloured", 2), ("glass", 3)]),
+    one_in_each_row(sorted(SCENES), (2, 3), [("glass", 3)]),
 )
 def test_agrees_with_volpath(rgb, name, strategies):
     """The radii are twice those of other tests: a ball of this size has few photons."""
@@ -277,6 +277,7 @@ def noise_of(integrator, scene, count=40):
     return variance.mean() / images.mean() ** 2, np.median(variance / images.mean(axis=0) ** 2)
 
 
+@pytest.mark.extended
 def test_less_noise_than_single_strategies(rgb):
     """Merging in balls at the first vertex alone, at the second alone, and at both under optimal
     weights: the mixture has half of the noise of the better one at most (an eighth is seen; most of

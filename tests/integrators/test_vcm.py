@@ -109,7 +109,9 @@ def test_light_that_only_merging_makes_in_media(rgb):
     assert_merged(scene, 0.6 / np.pi * np.exp(-2 * height * sigma_t), 0.02, 0.05)
 
 
-@pytest.mark.parametrize("plugin", [{"type": "vcm"}, {"type": "bdpt_ris", "merging": True}])
+@pytest.mark.parametrize(
+    "plugin", [{"type": "vcm"}, *extended({"type": "bdpt_ris", "merging": True})]
+)
 def test_fog_that_only_merging_lights(rgb, plugin):
     """The same tank full of fog: what scatters once, straight back, and the floor, both through the
     surface of the tank. Balls are 0.016 wide, and lose 2 % of the fog's light at its boundaries."""
