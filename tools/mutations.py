@@ -485,8 +485,8 @@ MUTATIONS = [
     # ------------------------------------------------------------------ photons in media
     Mutation(
         "photons/queries.py",
-        "unseen = met | at.scatters if self.flies else met",
-        "unseen = met",
+        'unseen = state["met"] | at.scatters if self.flies else state["met"]',
+        'unseen = state["met"]',
         "direct light in media counts as if the paths for direct light saw it",
         f"{MEDIA}::test_agrees_with_volpath",
     ),
