@@ -13,10 +13,16 @@ import mitsuba as mi
 from ..core.film import splat_samples
 from ..core.packing import rounded_up, with_reserve
 from ..core.recording import no_garbage_collection
-from ..mis.published_optimal import FrozenMap, Limits, ThreeStrategies, TwoStrategies, typical_flux
+from ..mis.published_optimal import (
+    FrozenMap,
+    PhotonLengths,
+    ThreeStrategies,
+    TwoStrategies,
+    typical_flux,
+)
 from ..photons.chains import NONE, PhotonChains, trace_camera_chains, trace_photon_chains
 from ..photons.grid import build_photon_map
-from ..photons.pairs import list_pairs, meeting_of, parts, take
+from ..photons.pairs import meeting_of, parts, photon_pairs, take
 from ..photons.photon import surface_layout
 from ..photons.queries import LAST_VERTEX
 from .bdpm import BDPMSession
@@ -80,7 +86,7 @@ class PublishedSession(BDPMSession):
             paths,
             radii.get("indirect", radii.get("caustic")),
             spectral["wavelengths"],
-            Limits(integrator.max_depth, integrator.first_vertex),
+            PhotonLengths(integrator.max_depth, integrator.first_vertex),
             integrator.strategies,
         )
 
@@ -290,7 +296,7 @@ class LightOfIteration:
         session, photon_map, radius = self.session, self.maps["indirect"], self.radii["indirect"]
         vertices = session.frozen.vertices(record)
         values = dr.zeros(mi.Spectrum, dr.width(vertices.p))
-        vertex, photon = list_pairs(photon_map, vertices, radius, -1)
+        vertex, photon = photon_pairs(photon_map, vertices, radius, -1)
         depth, max_depth = record["depth"] & (LAST_VERTEX - 1), session.limits.max_depth
         for some in parts(dr.width(vertex)):
             index, mine = (dr.gather(mi.UInt32, x, some) for x in (photon, vertex))

@@ -23,7 +23,7 @@ from ..core.records import Layout
 from ..core.spectra import channel_mean
 from ..lights.lights import NEVER_MET
 from ..paths.light_classes import CAUSTIC, CLASSES
-from ..paths.light_starts import seen_from
+from ..paths.light_starts import light_seen_from
 from ..photons.hits import density_ratio
 from ..photons.kernel_sums import disk_area
 from ..weights.heuristics import bounded_power, weight
@@ -54,7 +54,7 @@ class StartDensity:
         return [mi.Float(NEVER_MET)]
 
     def first_vertex(self, state, si, source, straight):
-        density = self.lights.start_density(si, seen_from(si, source, straight), straight)
+        density = self.lights.start_density(si, light_seen_from(si, source, straight), straight)
         return [dr.select(straight, density, state[0])]
 
     def scatter(self, state, si, bsdf, wo, mask):
@@ -70,8 +70,8 @@ class StartDensity:
 
 
 class ChanceWeights:
-    """Weights at `vertices` that caustic photons and `hits` (records of `hits.hit_layout`) reach.
-    `light_paths`: N."""
+    """Weights at `vertices` that caustic photons and `hits` (records of `hits.chance_layout`)
+    reach. `light_paths`: N."""
 
     def __init__(self, lights, light_paths, vertices, hits):
         self.carried, self.light_paths = StartDensity(lights), light_paths

@@ -53,7 +53,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.records import Layout
-from ..paths.light_starts import seen_from
+from ..paths.light_starts import light_seen_from
 from ..paths.vertex import in_medium
 from ..photons.queries import STATE
 from ..weights.heuristics import add_ratio, bounded_power, weight
@@ -243,7 +243,7 @@ class LightState:
         """State at a vertex that the light of `source` reaches on the lanes `straight`: there
         next-event estimation competes, elsewhere caustic photons do."""
         weights = self.weights
-        ds = seen_from(si, source, straight)
+        ds = light_seen_from(si, source, straight)
         expected = weights.expected_photons(si, ds, straight)
         state, others = self._split(state)
         return [

@@ -16,7 +16,7 @@ import mitsuba as mi
 from ..core.records import Layout
 from ..core.spectra import channel_mean
 from ..core.traits import lookup
-from ..paths.light_starts import seen_from
+from ..paths.light_starts import light_seen_from
 from ..paths.vertex import in_medium
 from ..weights import recursion
 from .neighbour_radiance import HALVES
@@ -545,7 +545,7 @@ class LightState:
         nodes, others = self._split(state)
         if not others:
             return state
-        ds = seen_from(si, source, straight)
+        ds = light_seen_from(si, source, straight)
         ratio = self.weights.lights.emission_over_nee_pdf(si, ds, straight)
         return [*nodes, [dr.select(straight, ratio, others[0][0])]]
 

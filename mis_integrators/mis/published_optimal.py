@@ -27,7 +27,7 @@ from ..core.spectra import channel_mean
 from ..photons.chains import NONE
 from ..photons.gather import QueryVertices
 from ..photons.grid import build_photon_map
-from ..photons.pairs import list_pairs, meeting_of, parts, sum_photons, take
+from ..photons.pairs import meeting_of, parts, photon_pairs, sum_photons, take
 from ..photons.photon import read_landing, read_power, surface_layout
 from ..weights import mis2, mis3
 
@@ -49,7 +49,7 @@ def light_layout():
 
 
 @dataclass(frozen=True)
-class Limits:
+class PhotonLengths:
     """How long photons may be, in segments (negative: unlimited), that are gathered at z0, z1, ...:
     longer ones would make paths beyond `max_depth`. z_0 is the camera vertex `first`."""
 
@@ -308,7 +308,7 @@ class ThreeStrategies:
         frozen = self.frozen
         vertices = frozen.vertices(record)
         photon_map, longest = frozen.photon_map, frozen.limits.at(0)
-        vertex, photon = list_pairs(photon_map, vertices, frozen.radius, longest)
+        vertex, photon = photon_pairs(photon_map, vertices, frozen.radius, longest)
         sums = [dr.zeros(mi.Float, dr.width(vertices.p)) for _ in range(4)]
         for some in parts(dr.width(vertex)):
             number, index = (dr.gather(mi.UInt32, x, some) for x in (vertex, photon))

@@ -27,7 +27,7 @@ import numpy as np
 
 from ..core.packing import from_numpy
 from ..core.spectra import channel_mean
-from ..paths.light_starts import seen_from
+from ..paths.light_starts import light_seen_from
 from ..paths.vertex import facing, in_medium
 from ..resampling.light_vertices import END
 from ..resampling.proposals import BLIND_SHARE, uniform_share
@@ -126,7 +126,7 @@ class ResampledWeights:
         return [dr.zeros(mi.Float, width) for _ in range(3)]
 
     def init_light(self, si, source, reachable, active, flux):
-        ds = seen_from(si, source, active)
+        ds = light_seen_from(si, source, active)
         infinite = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
         ds.d = dr.select(active & infinite, si.to_world(si.wi), ds.d)
         start = self.lights.pdf_emission_origin(si, ds, active)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from ..paths.light_starts import seen_from
+from ..paths.light_starts import light_seen_from
 from ..paths.subpaths import STATES
 from ..paths.vertex import in_medium
 from ..weights import bidirectional as theory
@@ -68,7 +68,7 @@ class ConnectionWeights:
     # ------------------------------------------------------------------ hooks of the sub-paths
 
     def init_light(self, si, source, reachable, active, flux=None):
-        ds = seen_from(si, source, active)
+        ds = light_seen_from(si, source, active)
         cosine = dr.maximum(dr.abs(dr.dot(si.n, ds.d)), 1e-6)
         if self.media:
             cosine = dr.select(in_medium(si.n), 1, cosine)

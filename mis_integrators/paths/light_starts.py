@@ -31,7 +31,7 @@ def read_starts(starts, index, active):
     return {name: dr.gather(type(values), values, index, active) for name, values in starts.items()}
 
 
-def seen_from(si, source, active):
+def light_seen_from(si, source, active):
     """The point of a light where a sub-path starts, as `sample_emission` tells of it, as a
     direction sample at the sub-path's first vertex `si`."""
     ds = dr.copy(source)

@@ -26,7 +26,7 @@ def density_ratio(density, cosine, pdf):
     return density * cosine * dr.rcp(dr.maximum(pdf, SMALLEST_PDF))
 
 
-def hit_layout():
+def chance_layout():
     """What a camera vertex keeps of the light that its path has met: radiance, `light`, throughput
     included; its `ratio` as of `density_ratio`; and the `flux` of photons that come from there (for
     one light sub-path, channel mean)."""
@@ -35,7 +35,7 @@ def hit_layout():
 
 def new_hits(capacity):
     """Room for the hits of so many vertices: none."""
-    return dr.zeros(mi.UInt32, hit_layout().words * capacity)
+    return dr.zeros(mi.UInt32, chance_layout().words * capacity)
 
 
 def write_hit(hits, slot, lights, si, ray, light, left, cosine, pdf, active):
@@ -52,4 +52,4 @@ def write_hit(hits, slot, lights, si, ray, light, left, cosine, pdf, active):
         "ratio": density_ratio(density, cosine, pdf),
         "flux": dr.select(sent > 0, channel_mean(light) * dr.rcp(sent), 0),
     }
-    hit_layout().write(hits, hit, slot, active)
+    chance_layout().write(hits, hit, slot, active)

@@ -2,7 +2,7 @@
 
 A sum visits the photons of each vertex and keeps a few numbers (`sum_photons`). Where what is to be
 known of one photon and one vertex needs a gather of its own, the pairs are written out first
-(`list_pairs`), and that gather is made once for all of them.
+(`photon_pairs`), and that gather is made once for all of them.
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ def sum_photons(photon_map, vertices, radius, light_path_count, longest: int, co
     return totals
 
 
-def list_pairs(photon_map, vertices, radius, longest: int):
+def photon_pairs(photon_map, vertices, radius, longest: int):
     """All pairs of a vertex and a photon that merges with it: `(vertex, photon)`, numbers of both
     (uint32, sorted by vertex). Reads how many there are."""
 

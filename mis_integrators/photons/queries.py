@@ -23,7 +23,7 @@ from ..paths.setting import CameraPass, Limits, ListedPass, World
 from ..paths.subpaths import selected, smooth_at
 from ..paths.vertex import PhaseOrBSDF, Sides
 from .beams import FIRST, LEVEL_SHIFT, LONG, SHORT, beam_layout, new_beams
-from .hits import hit_layout, new_hits, write_hit
+from .hits import chance_layout, new_hits, write_hit
 from .points import new_points, point_layout
 
 LAST_VERTEX = 1 << 31
@@ -82,7 +82,7 @@ def new_vertex_buffer(capacity, weighted=False, split=False, cones=False, hits=F
     ones are zero), if `weighted`, `weights` (records of `weight_layout`), and if light is `split`
     into classes, `first`: whether the path has scattered smoothly nowhere before. With `cones`,
     `pixel`: how wide a pixel is there; 0 where the path has scattered smoothly before. With `hits`,
-    those of lights that are met by chance (records of `hits.hit_layout`; zero: none)."""
+    those of lights that are met by chance (records of `hits.chance_layout`; zero: none)."""
     buffer = {"words": dr.zeros(mi.UInt32, query_layout().words * capacity)}
     if weighted:
         buffer["weights"] = weight_layout().room(capacity)
@@ -110,7 +110,7 @@ def read_queries(vertices, first=0, count=None):
     if "pixel" in vertices:
         record["pixel"] = dr.gather(mi.Float, vertices["pixel"], index)
     if "hits" in vertices:
-        record["hits"] = hit_layout().read(vertices["hits"], index)
+        record["hits"] = chance_layout().read(vertices["hits"], index)
     return record
 
 

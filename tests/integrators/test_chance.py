@@ -97,7 +97,6 @@ def test_density_of_starts_is_light_over_flux(name):
     sky's histograms rounding decides.)"""
     from mis_integrators.core.sequences import SampleSequence
     from mis_integrators.lights.lights import Lights
-    from mis_integrators.paths.light_starts import seen_from
 
     scene = world(**LIGHTS[name]())
     lights = Lights.seen_by(scene, scene.sensors()[0], "bdpm")
@@ -106,7 +105,7 @@ def test_density_of_starts_is_light_over_flux(name):
     ray, flux, _, source = lights.sample_emission(rng, 0.0, mi.Color0f())
     hit = scene.ray_intersect(ray)
     valid = hit.is_valid() & (dr.max(flux) > 0)
-    density = lights.start_density(hit, seen_from(hit, source, valid), valid)
+    density = lights.start_density(hit, light_seen_from(hit, source, valid), valid)
     back = hit.spawn_ray(-ray.d)
     met = scene.ray_intersect(back)
     ref = mi.Interaction3f(hit)
