@@ -97,6 +97,7 @@ def test_density_of_starts_is_light_over_flux(name):
     sky's histograms rounding decides.)"""
     from mis_integrators.core.sequences import SampleSequence
     from mis_integrators.lights.lights import Lights
+    from mis_integrators.paths.light_starts import light_seen_from
 
     scene = world(**LIGHTS[name]())
     lights = Lights.seen_by(scene, scene.sensors()[0], "bdpm")
