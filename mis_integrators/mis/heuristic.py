@@ -54,13 +54,12 @@ import mitsuba as mi
 
 from ..core.records import Layout
 from ..paths.light_starts import light_seen_from
-from ..paths.vertex import in_medium
+from ..paths.vertex import in_medium, per_projected
 from ..photons.queries import STATE
 from ..weights.heuristics import add_ratio, bounded_power, weight
 
 SMALLEST_DENSITY = 1e-20
 """Stands for zero densities, so that the ratio of two of them is one."""
-SMALLEST_COSINE = 1e-6
 UNFOUND = 1e18
 """Stands for the expected photons of direct light that next-event estimation cannot make."""
 
@@ -90,7 +89,7 @@ class HeuristicWeights:
     def per_disk(self, n, density, cosine):
         """A density per solid angle at a vertex with normal `n`, per projected solid angle and unit
         of the disk A there."""
-        value = density * dr.rcp(dr.maximum(dr.abs(cosine), SMALLEST_COSINE))
+        value = density * per_projected(cosine)
         if self.volume_share is None:
             return value
         return dr.select(in_medium(n), density * dr.rcp(self.volume_share), value)

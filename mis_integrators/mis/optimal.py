@@ -17,7 +17,7 @@ from ..core.records import Layout
 from ..core.spectra import channel_mean
 from ..core.traits import lookup
 from ..paths.light_starts import light_seen_from
-from ..paths.vertex import in_medium
+from ..paths.vertex import f_and_p, in_medium, per_projected, upright
 from ..weights import recursion
 from .neighbour_radiance import HALVES
 
@@ -28,7 +28,7 @@ the vertex."""
 TRUSTED_PHOTONS = 128
 """Tuned: photons in a disk up to which the radiance of typical neighbours is known well enough for
 the means over directions."""
-SMALLEST_COSINE, SMALLEST_LOBE_COSINE = 1e-6, 0.05
+SMALLEST_LOBE_COSINE = 0.05
 SMALLEST_DENSITY = 1e-6
 SMALLEST_EXTINCTION = 1e-6
 """[1/m]: where a medium is thinner no photon is left."""
@@ -179,16 +179,10 @@ class OptimalWeights:
         """BSDF value without cosine and density per projected solid angle of the camera path that
         goes on to `wo`; in media scaled (see above)."""
         if self.fluence is None:
-            return self.bsdf_scattering(si, bsdf, wo, mask)
+            return f_and_p(si, bsdf, wo, mask)
         value, pdf = bsdf.eval_pdf(self.context, si, wo, mask)
-        scale = dr.rcp(dr.maximum(dr.abs(wo.z), SMALLEST_COSINE))
+        scale = per_projected(wo.z)
         return self.per_disk(si, bsdf, mask, value * scale, pdf * scale, value, pdf)
-
-    def bsdf_scattering(self, si, bsdf, wo, mask):
-        """The same of a BSDF."""
-        value, pdf = bsdf.eval_pdf(self.context, si, wo, mask)
-        scale = dr.rcp(dr.maximum(dr.abs(wo.z), SMALLEST_COSINE))
-        return value * scale, pdf * scale
 
     def per_disk(self, si, bsdf, mask, f, p, phase, phase_pdf):
         """`f` and `p` on surfaces, and in media those of the phase function, scaled."""
@@ -215,14 +209,11 @@ class OptimalWeights:
 
     def surface_lobe(self, si, bsdf, mask):
         """The same of a BSDF."""
-        upright = mi.Vector3f(
-            0, 0, dr.select(mi.Frame3f.cos_theta(si.wi) > 0, mi.Float(1), mi.Float(-1))
-        )
         if not self.traits.has_rough:
-            f, p = self.bsdf_scattering(si, bsdf, upright, mask)
+            f, p = f_and_p(si, bsdf, upright(si), mask)
             return f, dr.maximum(p, SMALLEST_DENSITY)
         lambertian = lookup(self.traits.lambertian, bsdf, mi.Bool, mask)
-        f, p = self.bsdf_scattering(si, bsdf, upright, mask & lambertian)
+        f, p = f_and_p(si, bsdf, upright(si), mask & lambertian)
         bs, weight = bsdf.sample(
             self.smooth, si, mi.Float(0.5), mi.Point2f(0.5), mask & ~lambertian
         )

@@ -33,6 +33,25 @@ def facing(traits, n, d):
     return dr.select(in_medium(n), 1, cosine) if traits.has_media else cosine
 
 
+def per_projected(cosine):
+    """One over the size of a cosine, bounded: it turns densities per solid angle, and values that
+    hold the cosine, into those per projected solid angle."""
+    return dr.rcp(dr.maximum(dr.abs(cosine), SMALLEST_COSINE))
+
+
+def upright(si):
+    """The local direction along the shading normal, on the side of `si.wi`."""
+    return mi.Vector3f(0, 0, dr.select(mi.Frame3f.cos_theta(si.wi) > 0, mi.Float(1), mi.Float(-1)))
+
+
+def f_and_p(si, bsdf, wo, active):
+    """BSDF without cosine [1/sr] (a spectrum), and density per projected solid angle, of a camera
+    path that arrives from `si.wi` and goes on to the local direction `wo`."""
+    value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, wo, active)
+    scale = per_projected(wo.z)
+    return value * scale, pdf * scale
+
+
 class Sides:
     """Media on both sides of vertices: `above`, where the geometric normal points to, and `below`;
     of vertices in media both are the medium. `p`: the vertices."""
@@ -137,10 +156,7 @@ class VertexBSDF:
                 if traits.has_rough
                 else active
             )
-            upright = mi.Vector3f(
-                0, 0, dr.select(mi.Frame3f.cos_theta(si.wi) > 0, mi.Float(1), mi.Float(-1))
-            )
-            value, density = bsdf.eval_pdf(mi.BSDFContext(), si, upright, lambertian)
+            value, density = bsdf.eval_pdf(mi.BSDFContext(), si, upright(si), lambertian)
             density = dr.select(lambertian, density, ROUGH)
         if traits.has_media:
             extinction = mi.Float(0)
@@ -159,8 +175,7 @@ class VertexBSDF:
         traits = self.traits
         shading_camera, shading_light = dr.dot(self.ns, to_camera), dr.dot(self.ns, to_light)
         geometric_camera, geometric_light = dr.dot(self.n, to_camera), dr.dot(self.n, to_light)
-        per_camera = dr.rcp(dr.maximum(dr.abs(geometric_camera), SMALLEST_COSINE))
-        per_light = dr.rcp(dr.maximum(dr.abs(geometric_light), SMALLEST_COSINE))
+        per_camera, per_light = per_projected(geometric_camera), per_projected(geometric_light)
         one_side = shading_camera * shading_light > 0
         value = dr.select(one_side, self.value * dr.abs(shading_light), 0)
         p_camera = dr.select(one_side, self.density * dr.abs(shading_light), 0)

@@ -18,7 +18,7 @@ from ..core.records import Layout
 from ..core.spectra import channel_mean
 from ..paths.camera import trace_camera
 from ..paths.light import trace_light
-from .gather import SMALLEST_COSINE
+from ..paths.vertex import f_and_p
 from .queries import LAST_VERTEX, Queries, QueryVisitor, query_at, query_layout
 from .trace import PhotonVisitor
 
@@ -34,12 +34,10 @@ def link_layout():
     return Layout({"before": mi.UInt32, "f": mi.Float, "p": mi.Float})
 
 
-def f_and_p(si, bsdf, wo, mask):
-    """BSDF [1/sr], mean over the channels, and density of a camera path that arrives from `si.wi`
-    and goes on to `wo`, per projected solid angle."""
-    value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, wo, mask)
-    scale = dr.rcp(dr.maximum(dr.abs(wo.z), SMALLEST_COSINE))
-    return dr.select(mask, channel_mean(value) * scale, 0), dr.select(mask, pdf * scale, 0)
+def mean_f_and_p(si, bsdf, wo, mask):
+    """`paths.vertex.f_and_p`, the BSDF's mean over the channels; zero but for the lanes `mask`."""
+    value, pdf = f_and_p(si, bsdf, wo, mask)
+    return dr.select(mask, channel_mean(value), 0), dr.select(mask, pdf, 0)
 
 
 # ---------------------------------------------------------------- camera sub-paths
@@ -136,7 +134,7 @@ class ChainVisitor(QueryVisitor):
     def leave(self, state, at, rng, bs, weight, delta, active):
         before, here, f, p = state["link"]
         scattered = active & ~delta
-        new_f, new_p = f_and_p(at.si, at.bsdf, bs.wo, scattered)
+        new_f, new_p = mean_f_and_p(at.si, at.bsdf, bs.wo, scattered)
         state, weight, active = super().leave(state, at, rng, bs, weight, delta, active)
         link = [
             dr.select(scattered, here, before),
@@ -225,7 +223,7 @@ class ChainedPhotonVisitor(PhotonVisitor):
         scattered = active & ~delta
         view = mi.SurfaceInteraction3f(at.si)
         view.wi = mi.Vector3f(wo)
-        new_f, new_p = f_and_p(view, at.bsdf, at.si.wi, scattered)
+        new_f, new_p = mean_f_and_p(view, at.bsdf, at.si.wi, scattered)
         # A ray from the other side, as long as the one that led here.
         towards = at.si.to_world(wo)
         length = dr.select(scattered, at.hit.t, 1)

@@ -12,6 +12,7 @@ import mitsuba as mi
 
 from ..core.traits import lookup
 from ..paths.subpaths import vertex_bsdf_of
+from ..paths.vertex import SMALLEST_COSINE, per_projected, upright
 from .grid import for_each_photon
 from .kernel_sums import KernelSums, disk_area
 from .queries import LAST_VERTEX
@@ -27,7 +28,6 @@ SAME_PLANE_COSINE_SQUARED = 0.9999
 LARGEST_COSINE_RATIO = 4.0
 """Tuned: bound on shading over geometric cosine of a photon's direction, which grazing light on
 smoothed meshes would exceed."""
-SMALLEST_COSINE = 1e-6
 
 
 class QueryVertices:
@@ -55,9 +55,8 @@ class QueryVertices:
         if traits.has_rough:
             self.lambertian = lookup(traits.lambertian, self.bsdf, mi.Bool, active)
         if traits.has_lambertian:
-            upright = mi.Vector3f(0, 0, dr.select(self.facing > 0, mi.Float(1), mi.Float(-1)))
             constant, self.pdf = self.bsdf.eval_pdf(
-                mi.BSDFContext(), si, upright, active & self.lambertian
+                mi.BSDFContext(), si, upright(si), active & self.lambertian
             )
             self.f = mi.Spectrum(constant)
             self.factor *= dr.select(self.lambertian, constant, 1)
@@ -76,7 +75,7 @@ class QueryVertices:
             rough = active & ~self.lambertian
             if weighted:
                 rough_value, pdf = self.bsdf.eval_pdf(mi.BSDFContext(), self.si, wo, rough)
-                scale = dr.rcp(dr.maximum(dr.abs(wo.z), SMALLEST_COSINE))
+                scale = per_projected(wo.z)
                 f = dr.select(self.lambertian, f, rough_value * scale)
                 p = dr.select(self.lambertian, p, pdf * scale)
             else:
@@ -95,7 +94,7 @@ class QueryVertices:
         view.wi = mi.Vector3f(wo)
         context = mi.BSDFContext(mi.TransportMode.Importance)
         pdf = self.bsdf.pdf(context, view, self.si.wi, active & ~self.lambertian)
-        pdf *= dr.rcp(dr.maximum(dr.abs(self.facing), SMALLEST_COSINE))
+        pdf *= per_projected(self.facing)
         return dr.select(self.lambertian, self.pdf, pdf)
 
 
