@@ -26,20 +26,21 @@ from report.figures import draw_mape_over_time
 BASE = "bdpt:camera_paths=4"
 PAPER = (
     BASE,
-    "pcbpt:weights=published,light_paths=100",
-    "bdpt_ris:weights=published",
-    "bdpt_ris:weights=published,target=f_y_f_yz",
-    "pcbpt",
-    "bdpt_ris",
+    "pcbpt:weights=published,resamples=1,light_paths=100",
+    "bdpt_ris:weights=published,resamples=1",
+    "bdpt_ris:weights=published,resamples=1,target=f_y_f_yz",
+    "pcbpt:resamples=1",
+    "bdpt_ris:resamples=1",
 )
 """What is compared over time: the paper's three, PCBPT with M = 100 and the others with M = 200,
-the other target, and the package's own forms. Ratios are to the first."""
+the other target, and the package's own forms. All have the paper's N = 1. Ratios are to the
+first."""
 METHODS = (
     BASE,
-    "pcbpt:weights=published",
-    "pcbpt:weights=published,target=f_y_f_yz",
-    "bdpt_ris:weights=published",
-    "bdpt_ris:weights=published,target=f_y_f_yz",
+    "pcbpt:weights=published,resamples=1",
+    "pcbpt:weights=published,resamples=1,target=f_y_f_yz",
+    "bdpt_ris:weights=published,resamples=1",
+    "bdpt_ris:weights=published,resamples=1,target=f_y_f_yz",
 )
 """What is swept."""
 SNAPSHOTS = 6
@@ -81,26 +82,30 @@ def no_guess(traits, z, joined, eta=0.0):
     return 1.0
 
 
-PUBLISHED, WEIGHTS = "bdpt_ris:weights=published", "mis.published_resampling.PublishedWeights"
+PUBLISHED, WEIGHTS = (
+    "bdpt_ris:weights=published,resamples=1",
+    "mis.published_resampling.PublishedWeights",
+)
+BOUNDED = "bdpt_ris:resamples=1"
 GUESS: Mapping[str, object] = {"mis.resampling.guessed_weight": no_guess}
 POLE: Mapping[str, object] = {"mis.resampling.ResampledWeights": Unsoftened}
 LADDER: dict[str, tuple[str, Mapping[str, object]]] = {
     "published": (PUBLISHED, {}),
     "published, Q in place of Q_s": (PUBLISHED, {WEIGHTS: WithoutLengths}),
     "published, with the bounds of gains": (PUBLISHED, {WEIGHTS: WithBounds}),
-    "bounded": ("bdpt_ris", {}),
-    "bounded, without blind shares": ("bdpt_ris", BLIND),
-    "bounded, uniform share 1/(N_c + 1)": ("bdpt_ris", UNIFORM),
-    "bounded, without the guessed weight in pmfs": ("bdpt_ris", GUESS),
-    "bounded, G with its pole": ("bdpt_ris", POLE),
-    "bounded, without least gain": ("bdpt_ris", LEAST),
-    "bounded, without most gain": ("bdpt_ris", MOST),
+    "bounded": (BOUNDED, {}),
+    "bounded, without blind shares": (BOUNDED, BLIND),
+    "bounded, uniform share 1/(N_c + 1)": (BOUNDED, UNIFORM),
+    "bounded, without the guessed weight in pmfs": (BOUNDED, GUESS),
+    "bounded, G with its pole": (BOUNDED, POLE),
+    "bounded, without least gain": (BOUNDED, LEAST),
+    "bounded, without most gain": (BOUNDED, MOST),
     "bounded, without any of these": (
-        "bdpt_ris",
+        BOUNDED,
         {**BLIND, **UNIFORM, **GUESS, **POLE, **LEAST, **MOST},
     ),
-    "published pmfs, path densities": ("pcbpt:weights=published", {}),
-    "bounded pmfs, path densities": ("pcbpt", {}),
+    "published pmfs, path densities": ("pcbpt:weights=published,resamples=1", {}),
+    "bounded pmfs, path densities": ("pcbpt:resamples=1", {}),
 }
 """What the bounded form changes, one at a time: method and constants. Q_s, q* at the cache point
 and techniques of single cache points are in the published form alone."""
@@ -205,7 +210,9 @@ def estimates_of_Q(opened: OpenScene, counts: tuple[int, ...]) -> list[Row]:
     rows: list[Row] = []
     for target in ("f_y_rho_g_v", "f_y_f_yz"):
         for M in counts:
-            method = parse_method(f"bdpt_ris:weights=published,target={target},light_paths={M}")
+            method = parse_method(
+                f"bdpt_ris:weights=published,resamples=1,target={target},light_paths={M}"
+            )
             session = SessionMaker(method, opened, 1.0, warm_up=False).make(0)
             session.start()
             found = []

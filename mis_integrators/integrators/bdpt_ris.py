@@ -57,7 +57,7 @@ class BDPTRIS(ResampledIntegrator):
      * - resamples
        - |int|
        - Connections (N) of each camera vertex, each to a light vertex drawn anew; from 1 to 1024.
-         (Default: 1)
+         (Default: 2)
      * - cache_neighbors
        - |int|
        - Cache points whose pmfs a camera vertex mixes (N_c); from 1 to 16. (Default: 3)
