@@ -14,9 +14,12 @@ class PCBPT(ResampledIntegrator):
 
     .. pluginparameters::
 
-     * - light_paths, resamples, cache_neighbors, target, weights, light_tracing, merging,
-         guided_lights, initial_radius, alpha, camera_paths, variance, aovs, max_depth, rr_depth,
-         hide_emitters, sampler
+     * - resamples
+       - |int|
+       - As of :monosp:`bdpt_ris`. (Default: 1)
+     * - light_paths, cache_neighbors, target, weights, light_tracing, merging, guided_lights,
+         initial_radius, alpha, camera_paths, variance, aovs, max_depth, rr_depth, hide_emitters,
+         sampler
        -
        - As of :monosp:`bdpt_ris`.
 

@@ -57,7 +57,9 @@ class ResampledIntegrator(IterativeIntegrator):
         self.resampled_light_paths = parameters.integer(
             "light_paths", 200, 1, "from 1 to 100000", high=100000
         )
-        self.resamples = parameters.integer("resamples", 2, 1, "from 1 to 1024", high=1024)
+        # More than one pays only where weights know of the draws.
+        usual = 2 if self.aware else 1
+        self.resamples = parameters.integer("resamples", usual, 1, "from 1 to 1024", high=1024)
         self.cache_neighbors = parameters.integer("cache_neighbors", 3, 1, "from 1 to 16", high=16)
         self.target = parameters.choice("target", TARGETS[0], TARGETS)
         self.weights = parameters.choice("weights", WEIGHTS[0], WEIGHTS)
