@@ -180,11 +180,6 @@ def selected(mask, yes, no):
     return dr.select(mask, yes, no)
 
 
-def _either(mask, yes, no):
-    """Element by element, of two states."""
-    return [dr.select(mask, a, b) for a, b in zip(yes, no)]
-
-
 def vertex_bsdf_of(traits, record, wavelengths, active):
     """The `VertexBSDF` of kept vertices, as read by `read_vertices`; without `hit` only where they
     are Lambertian."""
@@ -254,7 +249,7 @@ class VertexVisitor:
         first = active & at.first
         squared = dr.maximum(dr.squared_norm(si.p - origin), 1e-20)
         arrival = density * facing(self.traits, si.n, at.towards) * dr.rcp(squared)
-        sums = _either(
+        sums = selected(
             first,
             weights.init_light(si, at.source, ~at.had_delta, first, at.sent),
             weights.propagate(sums, arrival, si, squared, at.depth),
@@ -276,7 +271,7 @@ class VertexVisitor:
         value, p_back, p_forward = at.vertex_bsdf.f_and_pdfs(away, at.towards, active & ~delta)
         mean = at.vertex_bsdf.scattered_mean(value, at.towards, active)
         left = self.weights.scatter(sums, p_forward, p_back, delta, mean, at.vertex_bsdf)
-        sums = self.weights.depart(_either(active, left, sums), si, active)
+        sums = self.weights.depart(selected(active, left, sums), si, active)
         density = dr.select(delta, 0, p_forward * facing(self.traits, si.n, away))
         mark = [dr.select(at.first, delta, before) for before in mark]
         return [number, parent, density, mi.Point3f(si.p), sums, mark]
@@ -373,7 +368,7 @@ class CameraVertexVisitor:
             of_rays = cosine * self.lens.density(si.p, si.time, self.aperture, seen)
         squared = dr.maximum(dr.squared_norm(si.p - origin.p), 1e-20)
         arrival = density * cosine * dr.rcp(squared)
-        sums = _either(
+        sums = selected(
             first,
             weights.init_camera(of_rays, first),
             weights.propagate(sums, arrival, si, squared, at.depth),
@@ -430,7 +425,7 @@ class CameraVertexVisitor:
         value, p_forward, p_back = at.vertex_bsdf.f_and_pdfs(at.towards, wo, active & ~delta)
         mean = at.vertex_bsdf.scattered_mean(value, wo, active)
         left = self.weights.scatter(sums, p_forward, p_back, delta, mean, at.vertex_bsdf)
-        sums = _either(active, left, sums)
+        sums = selected(active, left, sums)
         density = dr.select(delta, 0, p_forward * facing(self.traits, si.n, wo))
         history = scattered_history(history, delta, active) if history else []
         return [number, parent, density, mi.Interaction3f(si), sums, history], weight, active

@@ -287,7 +287,7 @@ class QueryVisitor:
         stored = {}
         if self.weights is not None:
             depth |= vertex << LEVEL_SHIFT
-            stored = dict(zip(STATE, self.weights.stored(state["sums"])), share=mi.Spectrum(1))
+            stored = {**self._stored(state), "share": mi.Spectrum(1)}
         if self.classes is not None:
             depth |= dr.select(state["history"][0] == 0, mi.UInt32(FIRST), 0)
 

@@ -609,10 +609,8 @@ def test_whether_methods_should_share_the_time(tmp_path, module, capsys):
     assert "1.5 is not a number below 1" in capsys.readouterr().err
 
 
-def test_whether_bdpm_auto_is_behind(tmp_path, module, monkeypatch):
-    """A row a scene and time, random rooms among them (here as simple as the other scene), with
-    what was chosen; shares over all."""
-    monkeypatch.setattr(module("common.rooms"), "room", lambda number: TINY)
+def test_whether_bdpm_auto_is_behind(tmp_path, module):
+    """A row a scene and time, random rooms among them, with what was chosen; shares over all."""
     scene = tmp_path / "tiny.xml"
     scene.write_text(TINY)
     module("run").main(

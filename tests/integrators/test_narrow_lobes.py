@@ -94,7 +94,7 @@ def test_means(rgb, bdd, more):
     integrator = mi.load_dict(
         {"type": "bdpm", "bdd": bdd, "initial_radius": 0.03, **settings, **more}
     )
-    agree(integrator, path(**settings), scene, whole=0.015, block=0.08)
+    agree(integrator, path(**settings), scene, block=0.08)
 
 
 @in_one_thread

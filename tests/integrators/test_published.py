@@ -200,7 +200,6 @@ def test_agrees(emitter, family, parameters, variant_name):
         weighted(weights="published", **parameters),
         oracle(emitter, 5),
         tray(family, emitter, PERSPECTIVE),
-        whole=0.02,
         block=0.08,
         most=600,
     )

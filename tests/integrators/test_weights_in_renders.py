@@ -23,7 +23,7 @@ from comparing import (
 )
 from selection import extended
 from test_against_path import LENS, MONO, ORTHO, PERSPECTIVE, RGB, SPECTRAL, oracle
-from worlds import EMITTERS, RADIUS, T, colour, has_delta, look, sensor, tray
+from worlds import EMITTERS, RADIUS, T, colour, diffuse, has_delta, look, sensor, tray
 
 
 def weighted(plugin="bdpm_opt", **parameters):
@@ -623,6 +623,26 @@ def test_what_the_cache_knows_of_direct_light():
         )
     assert facts[0][0] < 5 and facts[0][1] > 0.5
     np.testing.assert_allclose(facts[1], facts[0], rtol=0.1)
+
+
+def test_the_strongest_of_many_lights_is_known(rgb):
+    """However many lights stand before it in the scene."""
+    scene = {
+        "type": "scene",
+        "floor": {"type": "rectangle", "to_world": T().scale(2.5), "bsdf": diffuse(0.7)},
+        "sensor": sensor(size=16),
+    }
+    for number in range(70):
+        scene[f"dim{number:02d}"] = {"type": "point", "position": [0, 0, 2], "intensity": 1e-4}
+    scene["strong"] = {"type": "point", "position": [0, 0, 2], "intensity": 10.0}
+    session = mi.load_dict(
+        {"type": "bdpm_opt2", "mix_diffuse": True, "weights": "full", "frozen_photons": 20000}
+    ).session(mi.load_dict(scene), seed=1)
+    session.start()
+    known = session.cache.lookup(session.cache.center, session.cache.facing)
+    lit = np.array(known.visible_share) > 0
+    strong = int(np.argmax(session.lights.choice.pmf))
+    assert lit.sum() > 10 and strong >= 64 and np.all(np.array(known.light)[lit] == strong)
 
 
 @pytest.mark.parametrize("given", [True, False])

@@ -197,14 +197,14 @@ class Extrapolated(SmallRadiusBatches):
 
 @pytest.mark.parametrize("bdd", [0, *extended(1)])
 def test_single_scattering_in_closed_form(rgb, bdd):
-    """Radii differ by thirty times, and the light is right. (False-alarm rate 1e-6; errors of 4 %
-    and 10 % are seen, as all pixels share the photons close to the sensor.)"""
+    """Radii differ by thirty times, and the light is right. (False-alarm rate 1e-6; errors of 3 %
+    and 8 % are seen, as all pixels share the photons close to the sensor.)"""
     scene = lamp_in_fog(16)
     picture = single_scattering(0.7, 0.9, 0.0, POINT, 16, 0.5, 2.0)
     exact = Estimate.exact(np.repeat(block_means(picture[:, :, None], 2), 3, axis=1))
     batches = Extrapolated(scene, 2, 0.06, bdd=bdd, camera_paths=16)
     batches.add(2)
-    assert_same(*collect_until(batches, exact, 0.04, 0.1), 0.04, 0.1, slack=2e-3)
+    assert_same(*collect_until(batches, exact, 0.03, 0.08), 0.03, 0.08, slack=2e-3)
 
 
 def squared_error(session, exact, iterations):
