@@ -31,8 +31,10 @@ def render_views(scene: Any, integrator: Any = None, spp: int = 0, seed: int = 0
     return volpath_multiview.render_views(scene, integrator, spp, seed)
 
 
-def denoise(image: Any, scene: Any = None, sensor: Any = 0, channels: Any = ()) -> Any:
+def denoise(
+    image: Any, scene: Any = None, sensor: Any = 0, channels: Any = (), hide_emitters: bool = False
+) -> Any:
     """A denoised copy of a rendered image; see `mis_integrators.app.denoising.denoise`."""
     from .app import denoising
 
-    return denoising.denoise(image, scene, sensor, channels)
+    return denoising.denoise(image, scene, sensor, channels, hide_emitters)

@@ -57,6 +57,7 @@ VOLUME_RADII = "tests/photons/test_volume_radii.py"
 LOBES = "tests/integrators/test_narrow_lobes.py"
 VCM = "tests/integrators/test_vcm.py"
 OPT_FOG = "tests/integrators/test_opt_media.py"
+HIDDEN = "tests/integrators/test_hidden_emitters_in_media.py"
 
 MUTATIONS = [
     # ------------------------------------------------------------------ weights
@@ -197,7 +198,7 @@ MUTATIONS = [
     # ------------------------------------------------------------------ paths
     Mutation(
         "paths/camera_vertices.py",
-        "return [after[0], *selected(crosses, before[1:], after[1:])]",
+        "return crossed(before, after, crosses)",
         "return after",
         "steps of camera paths end at half transparent surfaces that they pass",
         f"{RIS_FOG}::test_half_transparent_surfaces",
@@ -743,5 +744,33 @@ MUTATIONS = [
         "pass",
         "paths meet no lights behind glass after their last vertex",
         CHANCE,
+    ),
+    Mutation(
+        "paths/media.py",
+        "crosses |= met & lamp & unseen",
+        "pass",
+        "hidden lamps stop camera paths in fog",
+        HIDDEN,
+    ),
+    Mutation(
+        "paths/media.py",
+        "stands &= ~surface.shape.is_emitter()",
+        "pass",
+        "hidden lamps stop light in fog on its way to the sensor",
+        HIDDEN,
+    ),
+    Mutation(
+        "paths/connect.py",
+        "active &= ~on_emitter(scene",
+        "active &= mi.Bool(True) | on_emitter(scene",
+        "light that hidden lamps scatter in fog comes to the sensor",
+        HIDDEN,
+    ),
+    Mutation(
+        "paths/guides.py",
+        "unseen &= passes | ",
+        "unseen &= ",
+        "denoisers are told of the second of two hidden lamps",
+        f"{DENOISING}::test_guides_do_not_show_what_is_hidden",
     ),
 ]

@@ -187,11 +187,12 @@ def _denoised(measured: Measured, measurement: Measurement) -> list[np.ndarray]:
     """The denoised images, one a seed; none where they are not denoised."""
     if not measurement.opened.denoise:
         return []
-    scene = measurement.opened.scene
+    opened = measurement.opened
+    scene, hide_emitters = opened.scene, bool(opened.inherited.get("hide_emitters", False))
     pictures = []
     for run in measured.runs:
         denoised, _ = denoising.denoised_picture(
-            run.last.whole, run.last.channels, scene, scene.sensors()[0]
+            run.last.whole, run.last.channels, scene, scene.sensors()[0], hide_emitters
         )
         pictures.append(denoised[..., :3])
     return pictures

@@ -8,6 +8,7 @@ import json
 import math
 import os
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -253,9 +254,7 @@ def _render_rival(
         raise broken
     image, clean = session.image(), None
     if options.denoise:
-        clean, _ = denoising.denoised_picture(
-            image, session.channels, rival.opened.loaded.scene, rival.opened.sensor
-        )
+        clean, _ = _denoised(image, session.channels, rival.opened)
     return compare.Rendered(rival.opened, image, clean, clock.rendering)
 
 
@@ -500,6 +499,15 @@ def _image_so_far(session: Any, options: argparse.Namespace) -> np.ndarray | Non
     return output.contact_sheet(session.view_images()) if options.all_views else session.image()
 
 
+def _denoised(
+    image: np.ndarray, channels: Sequence[str], opened: Opened
+) -> tuple[np.ndarray, list[str]]:
+    """As `denoising.denoised_picture` returns it."""
+    loaded = opened.loaded
+    hide_emitters = bool(loaded.parameters.get("hide_emitters", False))
+    return denoising.denoised_picture(image, channels, loaded.scene, opened.sensor, hide_emitters)
+
+
 def _write(
     options: argparse.Namespace,
     opened: Opened,
@@ -525,9 +533,7 @@ def _write(
                 output.write_png(writing, view, channels)
             written += f", {len(views)} frames from {output.frame_path(path, 0)}"
         if options.denoise:
-            clean, names = denoising.denoised_picture(
-                image, channels, opened.loaded.scene, opened.sensor
-            )
+            clean, names = _denoised(image, channels, opened)
             writing = output.denoised_path(path)
             output.write_exr(writing, clean, names, {**metadata, "denoiser": denoising.version()})
             written += f", denoised {writing}"

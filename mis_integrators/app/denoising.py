@@ -84,6 +84,7 @@ def denoise(
     scene: mi.Scene | None = None,
     sensor: int | mi.Sensor = 0,
     channels: Sequence[str] = (),
+    hide_emitters: bool = False,
 ) -> np.ndarray:
     """A denoised copy of a rendered image.
 
@@ -101,6 +102,9 @@ def denoise(
     channels
         The names of the image's channels. Where there are those of direct light (an integrator
         with the parameter `denoised` makes them), it is denoised apart.
+    hide_emitters
+        Whether the image was rendered with that parameter: what stands behind emitters' shapes is
+        then looked at in place of these.
 
     Returns
     -------
@@ -130,7 +134,7 @@ def denoise(
                 f"the image has {pixels.shape[1]} x {pixels.shape[0]} pixels, the sensor's film "
                 f"{size[0]} x {size[1]}"
             )
-        guides = albedo_and_normal(scene, sensor)
+        guides = albedo_and_normal(scene, sensor, hide_emitters=hide_emitters)
     planes = pixels[..., None] if pixels.ndim == 2 else pixels
     colours = planes[..., : 3 if planes.shape[2] >= 3 else 1]
     finite = np.maximum(np.nan_to_num(colours, nan=0, posinf=0, neginf=0), 0)
@@ -159,11 +163,15 @@ def check_channels(channels: Sequence[str]) -> tuple[str, ...]:
 
 
 def denoised_picture(
-    image: np.ndarray, channels: Sequence[str], scene: mi.Scene, sensor: mi.Sensor
+    image: np.ndarray,
+    channels: Sequence[str],
+    scene: mi.Scene,
+    sensor: mi.Sensor,
+    hide_emitters: bool = False,
 ) -> tuple[np.ndarray, list[str]]:
     """A scene's image with its colour channels denoised and first, all others as they are: the
-    image and the channels' names. Raises as `check_channels`."""
+    image and the channels' names. `hide_emitters`: as of `denoise`. Raises as `check_channels`."""
     names = check_channels(channels)
     order = [*names, *(name for name in channels if name not in names)]
     image = image[..., [channels.index(name) for name in order]]
-    return denoise(image, scene, sensor, order), order
+    return denoise(image, scene, sensor, order, hide_emitters), order

@@ -119,8 +119,8 @@ class BDPM(IterativeIntegrator):
     the first smooth surface then.
 
     The estimate is consistent: its bias vanishes with the radius (but for that of photons very
-    close to the sensor). Polarised variants, gradients and the film ``specfilm`` are refused by
-    name; in media also phase functions of flakes and ``hide_emitters``.
+    close to the sensor). Polarised variants, gradients, the film ``specfilm`` and media of flakes
+    are refused by name.
 
     .. tabs::
         .. code-tab:: xml

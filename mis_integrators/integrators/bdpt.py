@@ -94,9 +94,8 @@ class BDPT(IterativeIntegrator):
     (1997, chapter 10).
 
     Unbiased, without any parameter to choose. In participating media all techniques work as on
-    surfaces, and boundaries with the BSDF ``null`` do not count as segments, as in ``volpath``;
-    media of flakes and ``hide_emitters`` are refused there. Polarised variants, gradients and the
-    film ``specfilm`` are refused by name.
+    surfaces, and boundaries with the BSDF ``null`` do not count as segments, as in ``volpath``.
+    Media of flakes, polarised variants, gradients and the film ``specfilm`` are refused by name.
 
     .. tabs::
         .. code-tab:: xml

@@ -135,9 +135,9 @@ class BDPTRIS(ResampledIntegrator):
     connections were resampled (Nabata, Iwasaki and Dobashi 2020). Unbiased, but for the bias of
     ``merging``, which vanishes with the radius.
 
-    In participating media vertices are drawn, joined and merged as on surfaces; media of flakes,
-    ``hide_emitters`` and the value ``published`` of ``weights`` are refused there. Polarised
-    variants, gradients and the film ``specfilm`` are refused by name.
+    In participating media vertices are drawn, joined and merged as on surfaces; media of flakes and
+    the value ``published`` of ``weights`` are refused there. Polarised variants, gradients and the
+    film ``specfilm`` are refused by name.
 
     .. tabs::
         .. code-tab:: xml

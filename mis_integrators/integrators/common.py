@@ -114,7 +114,7 @@ class IterativeIntegrator(mi.AdjointIntegrator):
     def refused_in_media(self):
         """Parameters whose values are not supported there, as a message has them, each with what to
         use instead."""
-        return [('"hide_emitters"', '"volpath"')] if self.hide_emitters else []
+        return []
 
     def estimated_channels(self):
         """Names of the channels beside the image's that iterations are summed for."""

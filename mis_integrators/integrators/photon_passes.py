@@ -188,6 +188,7 @@ class PhotonPasses(PilotedSession):
         """The `SensorLight` of an iteration's volume photons: its values are radiance."""
         light = join_photons(
             self.world,
+            self.limits,
             Lens(sensor),
             self.near_zone,
             in_media[:3],

@@ -159,9 +159,11 @@ class CameraVisitor(Protocol):
         path: Array,
         depth: Array,
         active: Array,
+        unseen: Array | None,
     ) -> tuple[State, Array, Array, list[Any], Array]:
         """In scenes with media: moves sub-paths after `depth` segments to where they scatter or
-        meet a surface next: `(state, hit, ray, flight, throughput)`, as `media.next_hit`."""
+        meet a surface next: `(state, hit, ray, flight, throughput)`, as `media.next_hit`. `unseen`:
+        as of `media.beyond_boundary`."""
 
     def emission(self, state: State, at: CameraArrival, active: Array) -> Array:
         """Radiance of a light that is met. Not called in scenes without lights that can be met."""
@@ -222,14 +224,15 @@ def trace_camera(
         active &= False
 
     flight = begin_flights(traits, camera_pass.sensor.get_medium())
+    unseen = ~visible if hide_emitters else None
     if dr.hint(traits.has_media, mode="scalar"):
         state, hit, ray, flight, throughput = visitor.travel(
-            state, ray, flight, numbers, throughput, path, depth, active
+            state, ray, flight, numbers, throughput, path, depth, active, unseen
         )
     else:
         hit = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
-    if dr.hint(hide_emitters, mode="scalar"):
-        hit, ray = behind_emitters(scene, camera_pass.integrator, hit, ray, active)
+        if dr.hint(hide_emitters, mode="scalar"):
+            hit, ray = behind_emitters(scene, camera_pass.integrator, hit, ray, active)
 
     while dr.hint(active, label="camera sub-paths"):
         depth += 1
@@ -283,8 +286,9 @@ def trace_camera(
             rng, throughput, dr.max(throughput), eta, begun, active
         )
         if dr.hint(traits.has_media, mode="scalar"):
+            unseen = ~visible if hide_emitters else None
             state, hit, ray, flight, throughput = visitor.travel(
-                state, ray, flight, numbers, throughput, path, depth, active
+                state, ray, flight, numbers, throughput, path, depth, active, unseen
             )
         else:
             hit = scene.ray_intersect_preliminary(ray, coherent=False, active=active)

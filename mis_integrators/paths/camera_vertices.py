@@ -17,7 +17,7 @@ from .camera import trace_camera, whole_or_nothing, within_crop
 from .media import next_hit
 from .sensor import Lens
 from .setting import CameraPass, Limits, World
-from .subpaths import NO_PARENT, keep_vertex, new_vertices, selected, smooth_at
+from .subpaths import NO_PARENT, crossed, keep_vertex, new_vertices, smooth_at
 from .vertex import VertexBSDF, facing
 
 STEP = ("d_vcm", "geometry", "forward", "back", "scattered", "row")
@@ -108,9 +108,9 @@ class StepVisitor:
     """Keeps the smooth vertices of camera sub-paths with the steps that led to them, and the lights
     that they meet (a `CameraVisitor`).
 
-    Its state: how many vertices a sub-path has kept, the place of the last one that scattered
-    smoothly, the density of its direction (per solid angle; zero after a delta function), the last
-    vertex of whichever kind, and what `leave` returns.
+    Its state, by name: `number`, how many vertices a sub-path has kept; `parent`, the place of the
+    last one that scattered smoothly; `density` of its direction (per solid angle; zero after a
+    delta function); `origin`, the last vertex of whichever kind; and `left`, what `leave` returns.
     """
 
     def __init__(self, world, limits, sensor, weights, ratio, capacity, hit_capacity):
@@ -130,17 +130,20 @@ class StepVisitor:
 
     def begin(self, n_paths, splat, aperture):
         self.inside, self.aperture = within_crop(self.film, splat), aperture
-        origin = dr.zeros(mi.Interaction3f)
-        left = not_left(self.weights, n_paths)
-        return [mi.UInt32(0), mi.UInt32(NO_PARENT), mi.Float(0), origin, left]
+        return {
+            "number": mi.UInt32(0),
+            "parent": mi.UInt32(NO_PARENT),
+            "density": mi.Float(0),
+            "origin": dr.zeros(mi.Interaction3f),
+            "left": not_left(self.weights, n_paths),
+        }
 
-    def travel(self, state, ray, flight, numbers, throughput, path, depth, active):
-        hit = next_hit(self.scene, self.traits, ray, flight, numbers, throughput, active)
+    def travel(self, state, ray, flight, numbers, throughput, path, depth, active, unseen):
+        hit = next_hit(self.scene, self.traits, ray, flight, numbers, throughput, active, unseen)
         return state, *hit
 
     def emission(self, state, at, active):
-        _, parent, density, origin, left = state
-        store, si = self.store, at.si
+        store, si, origin = self.store, at.si, state["origin"]
         ds = mi.DirectionSample3f(self.scene, si, origin)
         shown = active & (ds.emitter != None)  # noqa: E711 (array comparison)
         if self.hide_emitters:
@@ -152,10 +155,11 @@ class StepVisitor:
         met &= slot < store.hit_room
         squared = dr.maximum(dr.squared_norm(si.p - origin.p), 1e-20)
         squared = dr.select(si.is_valid(), squared, dr.inf)
+        left, density = state["left"], state["density"]
         values = step_to_hit(
             self.lights, self.weights, left, density, origin, ds, light, squared, met
         )
-        values |= {"value": value, "path": at.path, "depth": at.depth, "parent": parent}
+        values |= {"value": value, "path": at.path, "depth": at.depth, "parent": state["parent"]}
         self.hit.write(store.hits, values, slot, met)
         return dr.select(shown & (at.depth == 1), value, 0)
 
@@ -163,12 +167,11 @@ class StepVisitor:
         return mi.Bool(True)
 
     def arrive(self, state, at, rng, active):
-        number, parent, density, origin, left = state
-        si = at.si
+        si, number = at.si, state["number"]
         smooth = smooth_at(at, active)
-        squared = dr.maximum(dr.squared_norm(si.p - origin.p), 1e-20)
+        squared = dr.maximum(dr.squared_norm(si.p - state["origin"].p), 1e-20)
         cosine = facing(self.traits, si.n, at.towards)
-        step = step_to_vertex(self.weights, left, density, cosine, squared)
+        step = step_to_vertex(self.weights, state["left"], state["density"], cosine, squared)
         if self.lens.connects:
             first = active & (at.depth == 1)
             seen = first & self.inside
@@ -178,23 +181,25 @@ class StepVisitor:
         merges = self.weights.merging is not None
         at.vertex_bsdf = VertexBSDF.at(self.traits, si, at.bsdf, smooth, at.medium, merges)
         wanted = smooth & (dr.max(at.throughput) > 0)
-        at.slot = keep_vertex(
-            self.store, at, at.throughput, number, parent, dict(zip(self.steps, step)), wanted
-        )
-        number = dr.select(wanted, number + 1, number)
-        return [number, parent, density, origin, left], mi.Spectrum(0)
+        step, parent = dict(zip(self.steps, step)), state["parent"]
+        at.slot = keep_vertex(self.store, at, at.throughput, number, parent, step, wanted)
+        return {**state, "number": dr.select(wanted, number + 1, number)}, mi.Spectrum(0)
 
     def leave(self, state, at, rng, bs, weight, delta, active):
-        number, parent, _, _, left = state
         si, wo, smoothly = at.si, at.si.to_world(bs.wo), active & ~delta
         value, p_forward, p_back = at.vertex_bsdf.f_and_pdfs(at.towards, wo, smoothly)
-        parent = dr.select(smoothly, at.slot, parent)
-        left = leave(self.weights, left, si, at.vertex_bsdf, value, p_forward, p_back, wo, smoothly)
-        density = dr.select(delta, 0, p_forward * facing(self.traits, si.n, wo))
-        return [number, parent, density, mi.Interaction3f(si), left], weight, active
+        scattered = at.vertex_bsdf, value, p_forward, p_back, wo, smoothly
+        state = {
+            **state,
+            "parent": dr.select(smoothly, at.slot, state["parent"]),
+            "density": dr.select(delta, 0, p_forward * facing(self.traits, si.n, wo)),
+            "origin": mi.Interaction3f(si),
+            "left": leave(self.weights, state["left"], si, *scattered),
+        }
+        return state, weight, active
 
     def cross(self, before, after, crosses):
-        return [after[0], *selected(crosses, before[1:], after[1:])]
+        return crossed(before, after, crosses)
 
     def alpha(self, state, visible):
         return whole_or_nothing(visible)

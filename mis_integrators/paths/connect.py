@@ -15,7 +15,7 @@ import mitsuba as mi
 
 from ..core.packing import Store
 from .media import transmitted
-from .sensor import unblocked, unblocked_by_visible
+from .sensor import on_emitter, unblocked, unblocked_by_visible
 from .setting import Limits, World
 from .subpaths import Kept, read_vertices, sides_of, vertex_bsdf_of
 from .vertex import SMALLEST_COSINE, facing
@@ -179,10 +179,11 @@ def join_sensor(
     landing = dr.maximum(facing(traits, light["n"], light["towards"]), SMALLEST_COSINE)
     active = active & (dr.max(value) > 0)
     if traits.has_media:
-        sides = sides_of(light, wavelengths)
-        value *= transmitted(
-            scene, traits, light["p"], light["n"], sides, d, distance, wavelengths, rng, active
-        )
+        sides, hide = sides_of(light, wavelengths), limits.hide_emitters
+        if hide:
+            active &= ~on_emitter(scene, light["p"], d, distance, active)
+        way = light["p"], light["n"], sides, d, distance, wavelengths
+        value *= transmitted(scene, traits, *way, rng, active, hide)
         active &= dr.max(value) > 0
     elif limits.hide_emitters:
         active &= unblocked_by_visible(scene, integrator, light["p"], d, distance, active)

@@ -20,9 +20,9 @@ MOST_DELTA_SURFACES = 16
 
 
 @dr.syntax
-def first_smooth_surface(scene, camera_pass):
+def first_smooth_surface(scene, camera_pass, hide_emitters=False):
     """Follows the camera paths of a pass to the first surface that does not scatter by delta
-    functions only.
+    functions only; with `hide_emitters`, through emitters' shapes that they meet before all else.
 
     Returns `(albedo, normal)`, zero where there is none: the share of light that it scatters, by
     one sample of its BSDF, times that of the delta surfaces before; and the shading normal.
@@ -31,6 +31,7 @@ def first_smooth_surface(scene, camera_pass):
     throughput, albedo = mi.UnpolarizedSpectrum(1), mi.UnpolarizedSpectrum(0)
     normal = mi.Normal3f(0)
     depth = mi.UInt32(0)
+    unseen = mi.Bool(hide_emitters)
     while dr.hint(active, label="to the first smooth surface"):
         si = scene.ray_intersect(ray, active)
         active &= si.is_valid()
@@ -38,11 +39,19 @@ def first_smooth_surface(scene, camera_pass):
         bsdf = si.bsdf(ray)
         rng = numbers.at(depth)
         bs, weight = bsdf.sample(mi.BSDFContext(), si, *next_1d_and_2d(rng, active), active)
+        arriving = mi.UnpolarizedSpectrum(throughput)
         throughput *= mi.unpolarized_spectrum(weight)
         smooth = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+        d = si.to_world(bs.wo)
+        if dr.hint(hide_emitters, mode="scalar"):
+            passes = active & unseen & si.shape.is_emitter()
+            d = dr.select(passes, ray.d, d)
+            throughput = dr.select(passes, arriving, throughput)
+            smooth &= ~passes
+            unseen &= passes | mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
         albedo = dr.select(smooth, throughput, albedo)
         normal = dr.select(smooth, mi.Normal3f(si.sh_frame.n), normal)
-        ray = si.spawn_ray(si.to_world(bs.wo))
+        ray = si.spawn_ray(d)
         active &= ~smooth & (depth <= MOST_DELTA_SURFACES)
     return albedo, normal
 
@@ -67,7 +76,9 @@ def displayed_albedo(albedo):
     return albedo
 
 
-def albedo_and_normal(scene, sensor, samples: int = SAMPLES) -> tuple[np.ndarray, np.ndarray]:
+def albedo_and_normal(
+    scene, sensor, samples: int = SAMPLES, hide_emitters: bool = False
+) -> tuple[np.ndarray, np.ndarray]:
     """Guides for a denoiser: the means over camera paths of `first_smooth_surface`, under a box
     filter.
 
@@ -76,7 +87,7 @@ def albedo_and_normal(scene, sensor, samples: int = SAMPLES) -> tuple[np.ndarray
     """
     total = np.zeros((6, film_sample_count(sensor)))
     for camera_pass in camera_passes(sensor, samples):
-        albedo, normal = first_smooth_surface(scene, camera_pass)
+        albedo, normal = first_smooth_surface(scene, camera_pass, hide_emitters)
         albedo = displayed_albedo(albedo)
         dr.eval(albedo, normal)
         found = np.concatenate([np.array(albedo), np.array(normal)])

@@ -15,7 +15,7 @@ from .perturbed import sample_perturbed
 from .roulette import russian_roulette
 from .setting import LightPass, Limits, World
 
-Array = Any
+Array = State = Any
 
 PATHS_PER_LANE = 8
 """Tuned: light sub-paths that a SIMD lane of a CPU traces one after the other: a lane whose path
@@ -93,24 +93,24 @@ class LightArrival:
 
 
 class LightVisitor(Protocol):
-    """What is done at the surfaces that light sub-paths meet. Its state, a list of arrays, travels
-    with them."""
+    """What is done at the surfaces that light sub-paths meet. Its state, arrays in lists or
+    dictionaries, travels with them."""
 
-    def blank(self, lanes: int) -> list[Any]:
+    def blank(self, lanes: int) -> State:
         """The state before any sub-path."""
 
-    def begin(self, state: list[Any]) -> list[Any]:
+    def begin(self, state: State) -> State:
         """The state of a sub-path that starts."""
 
-    def arrive(self, state: list[Any], at: LightArrival, active: Array) -> list[Any]:
+    def arrive(self, state: State, at: LightArrival, active: Array) -> State:
         """The state at a surface; here photons and vertices are stored."""
 
     def leave(
-        self, state: list[Any], at: LightArrival, wo: Array, delta: Array, active: Array
-    ) -> list[Any]:
+        self, state: State, at: LightArrival, wo: Array, delta: Array, active: Array
+    ) -> State:
         """The state after scattering into the local direction `wo`, by a delta function or not."""
 
-    def cross(self, before: list[Any], after: list[Any], crosses: Array) -> list[Any]:
+    def cross(self, before: State, after: State, crosses: Array) -> State:
         """As of `CameraVisitor`."""
 
 

@@ -66,27 +66,33 @@ def collision(medium, p, majorant, time, wavelengths, active, wi=None):
     return null, dr.select(total > 0, sigma_s * dr.rcp(dr.maximum(total, 1e-30)), 0), probability
 
 
-def beyond_boundary(traits, hit, ray, medium, met):
+def beyond_boundary(traits, hit, ray, medium, met, unseen=None):
     """Where the lanes `met` of a `ray` meet a surface that only lets light pass: which do, the
     share of light that passes (a spectrum), and the medium and the ray's origin beyond; those of
-    before on all other lanes."""
+    before on all other lanes. On the lanes `unseen` (``None``: nowhere) emitters' shapes let all
+    light pass, as if they were not there."""
     surface = hit.compute_surface_interaction(ray, traits.boundary_flags, met)
     bsdf = surface.bsdf()
     scattering = int(mi.BSDFFlags.Delta) | int(mi.BSDFFlags.Smooth)  # Null among them
     passes = (bsdf.flags() & scattering) == int(mi.BSDFFlags.Null)
-    crosses = met & ~hit.shape.is_emitter() & passes
+    lamp = hit.shape.is_emitter()
+    crosses = met & ~lamp & passes
     share = bsdf.eval_null_transmission(surface, crosses)
     beyond = dr.select(
         crosses & surface.is_medium_transition(), surface.target_medium(ray.d), medium
     )
+    if unseen is not None:
+        crosses |= met & lamp & unseen
+        share = dr.select(lamp, 1, share)
     return crosses, share, beyond, dr.select(crosses, surface.spawn_ray(ray.d).o, ray.o)
 
 
 @dr.syntax
-def transmittance(scene, traits, ray, medium, rng, active):
-    """Share of light that gets along `ray` (to its `maxt`) through media and null boundaries: exact
-    in homogeneous media, in others estimated without bias by ratio tracking (Novak et al. 2014),
-    with roulette once it is faint. Returns it and the advanced `rng`."""
+def transmittance(scene, traits, ray, medium, rng, active, through_emitters=False):
+    """Share of light that gets along `ray` (to its `maxt`) through media and null boundaries (with
+    `through_emitters` through emitters' shapes, too, as if they were not there): exact in
+    homogeneous media, in others estimated without bias by ratio tracking (Novak et al. 2014), with
+    roulette once it is faint. Returns it and the advanced `rng`."""
     rng = mi.PCG32(rng)
     ray = mi.Ray3f(ray)
     medium = mi.MediumPtr(medium)
@@ -124,8 +130,11 @@ def transmittance(scene, traits, ray, medium, rng, active):
         value[inside] = value * dr.exp(-sigma_t * (far - near))
 
         met = active & ~collided & surface.is_valid() & (surface.t <= ray.maxt)
-        value[met] = value * surface.bsdf().eval_null_transmission(surface, met)
-        medium[met & surface.is_medium_transition()] = surface.target_medium(ray.d)
+        stands = mi.Bool(met)
+        if dr.hint(through_emitters, mode="scalar"):
+            stands &= ~surface.shape.is_emitter()
+        value[stands] = value * surface.bsdf().eval_null_transmission(surface, stands)
+        medium[stands & surface.is_medium_transition()] = surface.target_medium(ray.d)
         step = dr.select(collided, t, surface.t)
         onward = surface.spawn_ray(ray.d)
         ray.maxt = ray.maxt - step
@@ -140,9 +149,9 @@ def transmittance(scene, traits, ray, medium, rng, active):
 
 
 @dr.syntax
-def fly(scene, traits, ray, medium, draws, active, keep=None):
-    """Moves rays through media and boundaries with the plain BSDF `null` to where they scatter or
-    meet another surface.
+def fly(scene, traits, ray, medium, draws, active, unseen=None, keep=None):
+    """Moves rays through media and boundaries with the plain BSDF `null` (`unseen`: as of
+    `beyond_boundary`) to where they scatter or meet another surface.
 
     `draws`: a `VertexNumbers` of this flight. Returns `(hit, ray, medium, scatters, weight)`: the
     surface (of those that scatter: none, at the distance of the collision), the ray that leads
@@ -200,7 +209,7 @@ def fly(scene, traits, ray, medium, draws, active, keep=None):
 
         # ---- Boundaries
         met = flying & ~collided & hit.is_valid()
-        crosses, share, medium, ray.o = beyond_boundary(traits, hit, ray, medium, met)
+        crosses, share, medium, ray.o = beyond_boundary(traits, hit, ray, medium, met, unseen)
         weight[crosses] = weight * share
         passed[crosses] = 0
         fresh |= crosses
@@ -215,9 +224,10 @@ def fly(scene, traits, ray, medium, draws, active, keep=None):
 
 
 @dr.syntax
-def pass_straight(scene, traits, ray, medium, draws, keep, active):
-    """Moves rays straight through media, and through boundaries with the plain BSDF `null`, to the
-    surface that they meet: nothing scatters them on the way.
+def pass_straight(scene, traits, ray, medium, draws, keep, active, unseen=None):
+    """Moves rays straight through media, and through boundaries with the plain BSDF `null`
+    (`unseen`: as of `beyond_boundary`), to the surface that they meet: nothing scatters them on the
+    way.
 
     `draws`: a `VertexNumbers`. Returns `(hit, ray, medium, kept)`, as `fly` does, but for `kept`:
     the share of light that gets along; exact in homogeneous media, in others estimated by ratio
@@ -280,7 +290,7 @@ def pass_straight(scene, traits, ray, medium, draws, keep, active):
 
         # ---- Boundaries
         met = going & ~cut & hit.is_valid()
-        crosses, share, medium, ray.o = beyond_boundary(traits, hit, ray, medium, met)
+        crosses, share, medium, ray.o = beyond_boundary(traits, hit, ray, medium, met, unseen)
         kept[crosses] = kept * share
         passed[crosses] = 0
         fresh |= crosses
@@ -304,32 +314,36 @@ def begin_flights(traits, medium):
     return [medium, mi.UInt32(0), mi.Bool(False)]
 
 
-def next_hit(scene, traits, ray, flight, numbers, throughput, active):
+def next_hit(scene, traits, ray, flight, numbers, throughput, active, unseen=None):
     """`fly`, for paths that carry `flight`: `(hit, ray, flight, throughput)`."""
     medium, number, _ = flight
     hit, ray, medium, scatters, weight = fly(
-        scene, traits, ray, medium, numbers.at(FLIGHT + number), active
+        scene, traits, ray, medium, numbers.at(FLIGHT + number), active, unseen
     )
     return hit, ray, [medium, number + 1, scatters], throughput * weight
 
 
-def next_hit_straight_on(scene, traits, ray, flight, numbers, keep, active):
+def next_hit_straight_on(scene, traits, ray, flight, numbers, keep, active, unseen=None):
     """As `next_hit`, for paths that nothing in media scatters (`pass_straight`, with `keep`); in
     place of the throughput, the share of light that gets along."""
     medium, number, scatters = flight
     hit, ray, medium, kept = pass_straight(
-        scene, traits, ray, medium, numbers.at(FLIGHT + number), keep, active
+        scene, traits, ray, medium, numbers.at(FLIGHT + number), keep, active, unseen
     )
     return hit, ray, [medium, number + 1, scatters], kept
 
 
-def next_hit_either(scene, traits, ray, flight, numbers, keep_flown, keep_straight, flies, active):
+def next_hit_either(
+    scene, traits, ray, flight, numbers, keep_flown, keep_straight, flies, active, unseen=None
+):
     """As `next_hit` on the lanes `flies`, as `next_hit_straight_on` on the others, each with a
     `keep` of its own; in place of the throughput, its factor."""
     medium, number, _ = flight
     draws = numbers.at(FLIGHT + number)
-    flown = fly(scene, traits, ray, medium, draws, active & flies, keep_flown)
-    straight = pass_straight(scene, traits, ray, medium, draws, keep_straight, active & ~flies)
+    flown = fly(scene, traits, ray, medium, draws, active & flies, unseen, keep_flown)
+    straight = pass_straight(
+        scene, traits, ray, medium, draws, keep_straight, active & ~flies, unseen
+    )
     hit, ray, medium = (dr.select(flies, a, b) for a, b in zip(flown[:3], straight[:3]))
     _, _, _, scatters, weight = flown
     return hit, ray, [medium, number + 1, scatters], dr.select(flies, weight, straight[3])
@@ -417,11 +431,13 @@ def direct_light(scene, traits, lights, ref, sides, draws, active):
     return ds, dr.select(lit, light * kept, 0), pdf
 
 
-def transmitted(scene, traits, p, n, sides, d, distance, wavelengths, rng, active):
+def transmitted(
+    scene, traits, p, n, sides, d, distance, wavelengths, rng, active, through_emitters=False
+):
     """Share of light that gets from vertices `p` (with geometric normals `n`) to the points
-    `distance` away in direction `d`."""
+    `distance` away in direction `d`; `through_emitters`: as of `transmittance`."""
     si = dr.zeros(mi.SurfaceInteraction3f, dr.width(p))
     si.p, si.n, si.wavelengths = p, mi.Normal3f(n), wavelengths
     ray = si.spawn_ray_to(p + d * distance)
-    kept, _ = transmittance(scene, traits, ray, sides.medium(n, d), rng, active)
+    kept, _ = transmittance(scene, traits, ray, sides.medium(n, d), rng, active, through_emitters)
     return kept

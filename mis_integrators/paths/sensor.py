@@ -98,6 +98,14 @@ def unblocked(scene, p, n, d, distance, active):
     return active & ~scene.ray_test(ray, active)
 
 
+def on_emitter(scene, p, d, distance, active):
+    """Whether points `p` lie on emitters' shapes. `d`: any direction that leaves the surface there,
+    and `distance` how far it is to the next that matters."""
+    near = SAME_POINT * distance
+    hit = scene.ray_intersect_preliminary(mi.Ray3f(p + d * near, -d), coherent=False, active=active)
+    return active & hit.is_valid() & (hit.t < 2 * near) & hit.shape.is_emitter()
+
+
 def unblocked_by_visible(scene, integrator, p, d, distance, active):
     """The same towards a sensor that does not see emitters' shapes (`hide_emitters`): whether a
     look from there through all of them ends at the point. It does not where the point lies on such

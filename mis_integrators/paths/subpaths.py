@@ -217,9 +217,10 @@ def smooth_at(at, active):
 class VertexVisitor:
     """Keeps the smooth vertices of light sub-paths (a `LightVisitor`).
 
-    Its state: how many vertices a sub-path has kept, the place of the last one, the density of its
-    direction (per solid angle; zero after a delta function), the last surface's point, the state of
-    `weights`, and if vertices are `marked` their mark.
+    Its state, by name: `number`, how many vertices a sub-path has kept; `parent`, the place of the
+    last one; `density` of its direction (per solid angle; zero after a delta function); `origin`,
+    the last surface's point; `sums`, the state of `weights`; and `mark`, a list: if vertices are
+    `marked`, their mark.
     """
 
     def __init__(self, traits, weights, n_paths, capacity, marked):
@@ -232,52 +233,72 @@ class VertexVisitor:
         )
 
     def blank(self, lanes):
-        number, parent = dr.zeros(mi.UInt32, lanes), dr.full(mi.UInt32, NO_PARENT, lanes)
-        density, origin = dr.zeros(mi.Float, lanes), dr.zeros(mi.Point3f, lanes)
-        return [number, parent, density, origin, self.weights.blank(lanes), self._unmarked()]
+        return {
+            "number": dr.zeros(mi.UInt32, lanes),
+            "parent": dr.full(mi.UInt32, NO_PARENT, lanes),
+            "density": dr.zeros(mi.Float, lanes),
+            "origin": dr.zeros(mi.Point3f, lanes),
+            "sums": self.weights.blank(lanes),
+            "mark": self._unmarked(),
+        }
 
     def _unmarked(self):
         return [mi.Bool(False)] if self.marked else []
 
     def begin(self, state):
-        _, _, density, origin, sums, _ = state
-        return [mi.UInt32(0), mi.UInt32(NO_PARENT), density, origin, sums, self._unmarked()]
+        nothing = {"number": mi.UInt32(0), "parent": mi.UInt32(NO_PARENT), "mark": self._unmarked()}
+        return {**state, **nothing}
 
     def arrive(self, state, at, active):
-        number, parent, density, origin, sums, mark = state
-        si, weights = at.si, self.weights
+        si, weights, number = at.si, self.weights, state["number"]
         first = active & at.first
-        squared = dr.maximum(dr.squared_norm(si.p - origin), 1e-20)
-        arrival = density * facing(self.traits, si.n, at.towards) * dr.rcp(squared)
+        squared = dr.maximum(dr.squared_norm(si.p - state["origin"]), 1e-20)
+        arrival = state["density"] * facing(self.traits, si.n, at.towards) * dr.rcp(squared)
         sums = selected(
             first,
             weights.init_light(si, at.source, ~at.had_delta, first, at.sent),
-            weights.propagate(sums, arrival, si, squared, at.depth),
+            weights.propagate(state["sums"], arrival, si, squared, at.depth),
         )
         smooth = smooth_at(at, active)
         at.vertex_bsdf = VertexBSDF.at(
             self.traits, si, at.bsdf, smooth, at.medium, self.weights.merging is not None
         )
         slot = keep_vertex(
-            self.store, at, at.flux, number, parent, dict(zip(weights.states, sums)), smooth, *mark
+            self.store,
+            at,
+            at.flux,
+            number,
+            state["parent"],
+            dict(zip(weights.states, sums)),
+            smooth,
+            *state["mark"],
         )
         number = dr.select(smooth, number + 1, number)
         dr.scatter(self.store.lengths, number, at.path, smooth)
-        return [number, dr.select(smooth, slot, parent), density, origin, sums, mark]
+        parent = dr.select(smooth, slot, state["parent"])
+        return {**state, "number": number, "parent": parent, "sums": sums}
 
     def leave(self, state, at, wo, delta, active):
-        number, parent, _, _, sums, mark = state
-        si, away = at.si, at.si.to_world(wo)
+        si, away, sums = at.si, at.si.to_world(wo), state["sums"]
         value, p_back, p_forward = at.vertex_bsdf.f_and_pdfs(away, at.towards, active & ~delta)
         mean = at.vertex_bsdf.scattered_mean(value, at.towards, active)
         left = self.weights.scatter(sums, p_forward, p_back, delta, mean, at.vertex_bsdf)
-        sums = self.weights.depart(selected(active, left, sums), si, active)
-        density = dr.select(delta, 0, p_forward * facing(self.traits, si.n, away))
-        mark = [dr.select(at.first, delta, before) for before in mark]
-        return [number, parent, density, mi.Point3f(si.p), sums, mark]
+        return {
+            **state,
+            "density": dr.select(delta, 0, p_forward * facing(self.traits, si.n, away)),
+            "origin": mi.Point3f(si.p),
+            "sums": self.weights.depart(selected(active, left, sums), si, active),
+            "mark": [dr.select(at.first, delta, before) for before in state["mark"]],
+        }
 
     def cross(self, before, after, crosses):
-        return [after[0], *selected(crosses, before[1:], after[1:])]
+        return crossed(before, after, crosses)
+
+
+def crossed(before, after, crosses):
+    """The state of sub-paths that keep vertices, as of `CameraVisitor.cross`: a vertex that one has
+    kept stays kept."""
+    return selected(crosses, {**before, "number": after["number"]}, after)
 
 
 def trace_light_subpaths(
@@ -304,9 +325,8 @@ class CameraVertexVisitor:
     """Keeps the smooth vertices of camera sub-paths, and weights the light that they meet and that
     next-event estimation finds (a `CameraVisitor`).
 
-    Its state: how many vertices a sub-path has kept, the place of the last one, the density of its
-    direction (per solid angle; zero after a delta function), the last vertex of whichever kind,
-    the state of `weights`, and with `classes` what these carry along.
+    Its state, by name: `number`, `parent`, `density` and `sums` as of `VertexVisitor`; `origin`,
+    the last vertex of whichever kind; and `history`, a list: with `classes` what these carry along.
     """
 
     def __init__(self, world, limits, sensor, weights, capacity, ledger, shortest, classes):
@@ -323,42 +343,46 @@ class CameraVertexVisitor:
 
     def begin(self, n_paths, splat, aperture):
         self.inside, self.aperture = within_crop(self.film, splat), aperture
-        origin, sums = dr.zeros(mi.Interaction3f), self.weights.blank(n_paths)
-        history = [] if self.classes is None else start_of_camera_path()
-        return [mi.UInt32(0), mi.UInt32(NO_PARENT), mi.Float(0), origin, sums, history]
+        return {
+            "number": mi.UInt32(0),
+            "parent": mi.UInt32(NO_PARENT),
+            "density": mi.Float(0),
+            "origin": dr.zeros(mi.Interaction3f),
+            "sums": self.weights.blank(n_paths),
+            "history": [] if self.classes is None else start_of_camera_path(),
+        }
 
-    def travel(self, state, ray, flight, numbers, throughput, path, depth, active):
-        hit = next_hit(self.scene, self.traits, ray, flight, numbers, throughput, active)
+    def travel(self, state, ray, flight, numbers, throughput, path, depth, active, unseen):
+        hit = next_hit(self.scene, self.traits, ray, flight, numbers, throughput, active, unseen)
         return state, *hit
 
     def emission(self, state, at, active):
-        _, _, density, origin, sums, history = state
-        lights = self.lights
+        lights, origin = self.lights, state["origin"]
         ds = mi.DirectionSample3f(self.scene, at.si, origin)
         shown = active & (ds.emitter != None)  # noqa: E711 (array comparison)
         if self.hide_emitters:
             shown &= at.visible  # what is behind nothing but null surfaces is hidden, too
         later = shown & (at.depth > 1)
         share = self.weights.hit_emitter(
-            sums,
+            state["sums"],
             lights.pdf_direct(origin, ds, later),
             lights.emission_over_nee_pdf(origin, ds, later),
-            density,
+            state["density"],
         )
         share = dr.select(later, share, 1)
         light = at.throughput * ds.emitter.eval(at.si, shown)
         if self.ledger is not None:
             self.ledger.hit_emitter(at.path, at.depth, light, share, shown)
         if self.classes is not None:
-            self.classes.add("met", at.path, class_of(*history), light * share, shown)
+            self.classes.add("met", at.path, class_of(*state["history"]), light * share, shown)
         return dr.select(shown, light * share, 0)
 
     def unfinished(self, state, at):
         return mi.Bool(True)
 
     def arrive(self, state, at, rng, active):
-        number, parent, density, origin, sums, history = state
-        si, weights = at.si, self.weights
+        si, weights, history = at.si, self.weights, state["history"]
+        number, parent = state["number"], state["parent"]
         smooth = smooth_at(at, active)
         cosine = facing(self.traits, si.n, at.towards)
         first = active & (at.depth == 1)
@@ -366,12 +390,12 @@ class CameraVertexVisitor:
         if self.lens.connects:
             seen = first & self.inside
             of_rays = cosine * self.lens.density(si.p, si.time, self.aperture, seen)
-        squared = dr.maximum(dr.squared_norm(si.p - origin.p), 1e-20)
-        arrival = density * cosine * dr.rcp(squared)
+        squared = dr.maximum(dr.squared_norm(si.p - state["origin"].p), 1e-20)
+        arrival = state["density"] * cosine * dr.rcp(squared)
         sums = selected(
             first,
             weights.init_camera(of_rays, first),
-            weights.propagate(sums, arrival, si, squared, at.depth),
+            weights.propagate(state["sums"], arrival, si, squared, at.depth),
         )
         at.vertex_bsdf = VertexBSDF.at(
             self.traits, si, at.bsdf, smooth, at.medium, self.weights.merging is not None
@@ -386,10 +410,11 @@ class CameraVertexVisitor:
         if self.deepest is not None:
             wanted &= mi.Int32(at.depth) <= self.deepest
         mark = [history[0] == 0] if history else []
-        state = dict(zip(weights.states, sums))
-        slot = keep_vertex(self.store, at, at.throughput, number, parent, state, wanted, *mark)
+        weighed = dict(zip(weights.states, sums))
+        slot = keep_vertex(self.store, at, at.throughput, number, parent, weighed, wanted, *mark)
         number = dr.select(wanted, number + 1, number)
-        return [number, dr.select(wanted, slot, parent), density, origin, sums, history], direct
+        parent = dr.select(wanted, slot, parent)
+        return {**state, "number": number, "parent": parent, "sums": sums}, direct
 
     def _direct(self, sums, at, rng, smooth):
         """Radiance of direct light at smooth vertices, by next-event estimation."""
@@ -420,18 +445,22 @@ class CameraVertexVisitor:
         return dr.select(reached, light * share, 0)
 
     def leave(self, state, at, rng, bs, weight, delta, active):
-        number, parent, _, _, sums, history = state
-        si, wo = at.si, at.si.to_world(bs.wo)
+        si, wo, sums = at.si, at.si.to_world(bs.wo), state["sums"]
         value, p_forward, p_back = at.vertex_bsdf.f_and_pdfs(at.towards, wo, active & ~delta)
         mean = at.vertex_bsdf.scattered_mean(value, wo, active)
         left = self.weights.scatter(sums, p_forward, p_back, delta, mean, at.vertex_bsdf)
-        sums = selected(active, left, sums)
-        density = dr.select(delta, 0, p_forward * facing(self.traits, si.n, wo))
-        history = scattered_history(history, delta, active) if history else []
-        return [number, parent, density, mi.Interaction3f(si), sums, history], weight, active
+        history = state["history"]
+        state = {
+            **state,
+            "density": dr.select(delta, 0, p_forward * facing(self.traits, si.n, wo)),
+            "origin": mi.Interaction3f(si),
+            "sums": selected(active, left, sums),
+            "history": scattered_history(history, delta, active) if history else [],
+        }
+        return state, weight, active
 
     def cross(self, before, after, crosses):
-        return [after[0], *selected(crosses, before[1:], after[1:])]
+        return crossed(before, after, crosses)
 
     def alpha(self, state, visible):
         return whole_or_nothing(visible)

@@ -240,7 +240,7 @@ class QueryVisitor:
             "clear": [mi.Spectrum(1)] if self.traits.has_media else [],
         }
 
-    def travel(self, state, ray, flight, numbers, throughput, path, depth, active):
+    def travel(self, state, ray, flight, numbers, throughput, path, depth, active, unseen):
         brought = throughput
         if self.queries.near_zone is not None:
             kept = numbers.at(BEAM + depth).next_float32() < BEAMS_KEPT
@@ -254,12 +254,13 @@ class QueryVisitor:
             flies = state["vertex"] < self.flights
             if self.queries.near_zone is not None:
                 flies &= state["vertex"] > 0
+            keeps = keep_short, keep
             hit, ray, flight, kept = next_hit_either(
-                self.scene, self.traits, ray, flight, numbers, keep_short, keep, flies, active
+                self.scene, self.traits, ray, flight, numbers, *keeps, flies, active, unseen
             )
         else:
             hit, ray, flight, kept = next_hit_straight_on(
-                self.scene, self.traits, ray, flight, numbers, keep, active
+                self.scene, self.traits, ray, flight, numbers, keep, active, unseen
             )
         state = {**state, "clear": [state["clear"][0] * kept]}
         if self.queries.cones is not None:  # boundaries have been passed on the way

@@ -38,7 +38,7 @@ class SensorLight:
     active: mi.Bool
 
 
-def join_photons(world, lens, zone, photons, seed, wavelengths, marked):
+def join_photons(world, limits, lens, zone, photons, seed, wavelengths, marked):
     """The `SensorLight` of the volume photons outside of the near `zone` (a `NearZone`). Light
     sub-paths leave none from where the sensor would be a segment too far.
 
@@ -70,18 +70,8 @@ def join_photons(world, lens, zone, photons, seed, wavelengths, marked):
     sides = Sides(medium, medium, landing.p, wavelengths)
     phase, _, _ = phase_f_and_pdfs(sides, d, dr.normalize(towards), active)
     active &= dr.max(phase) > 0
-    kept = transmitted(
-        world.scene,
-        world.traits,
-        landing.p,
-        mi.Normal3f(0),
-        sides,
-        d,
-        distance,
-        wavelengths,
-        rng,
-        active,
-    )
+    way = landing.p, mi.Normal3f(0), sides, d, distance, wavelengths
+    kept = transmitted(world.scene, world.traits, *way, rng, active, limits.hide_emitters)
     value = flux * phase * kept * density
     active &= dr.max(value) > 0
     return SensorLight(dr.select(active, value, 0), film, landing.depth, delta_at_light, active)

@@ -3,7 +3,7 @@
 import sys
 
 import mis_integrators
-from mis_integrators.app import cli
+from mis_integrators.app import cli, denoising
 from mis_integrators.app.denoising import DOUBT, shrunk, without_noise
 from mis_integrators.core.film import WINDOW
 from mis_integrators.core.windows import window_mean
@@ -83,6 +83,28 @@ def test_guides_see_through_glass(rgb):
     assert np.all(np.abs(share - 0.923) < 0.08)
     np.testing.assert_allclose(albedo, share[..., None] * WALL, atol=1e-5)
     assert np.all(normal[..., 2] > 0.8) and np.all(np.abs(normal[..., :2]) < 1e-4)
+
+
+def lamp_before_the_wall(distance):
+    """It fills the picture, and faces the camera; its BSDF is black."""
+    return {
+        "type": "rectangle",
+        "to_world": mi.ScalarTransform4f().translate([0, 0, distance]).scale(50),
+        "bsdf": {"type": "diffuse", "reflectance": 0.0},
+        "emitter": {"type": "area", "radiance": 1.0},
+    }
+
+
+@pytest.mark.parametrize("hide_emitters", [False, True])
+def test_guides_do_not_show_what_is_hidden(rgb, hide_emitters):
+    """Two lamps, one behind the other."""
+    scene = painted_wall(*(lamp_before_the_wall(distance) for distance in (2, 3)))
+    albedo, normal = albedo_and_normal(
+        scene, scene.sensors()[0], samples=2, hide_emitters=hide_emitters
+    )
+    expected = WALL if hide_emitters else np.zeros(3)
+    np.testing.assert_allclose(albedo, np.broadcast_to(expected, (4, 6, 3)), atol=1e-5)
+    np.testing.assert_allclose(normal, np.broadcast_to([0, 0, 1], (4, 6, 3)), atol=1e-5)
 
 
 def test_guides_of_mirrors_are_what_is_in_them(rgb):
@@ -354,6 +376,20 @@ def test_integrators_are_told(scene, tmp_path, arguments, told):
     if told is not None:
         assert lamplit.render(scene, *arguments, "--spp", 2, *rest[:2]) == 0
         assert read(tmp_path / "a.exr")[0]["denoised"] == 0
+
+
+@pytest.mark.parametrize("hidden", ["true", "false"])
+def test_guides_are_told_of_hidden_emitters(scene, tmp_path, monkeypatch, hidden):
+    told = []
+
+    def noted(*arguments, hide_emitters, **others):
+        told.append(hide_emitters)
+        return albedo_and_normal(*arguments, hide_emitters=hide_emitters, **others)
+
+    monkeypatch.setattr(denoising, "albedo_and_normal", noted)
+    chosen = "-i", "path", "-P", f"hide_emitters={hidden}"
+    assert lamplit.render(scene, *chosen, "--spp", 2, "-o", tmp_path / "a.exr", "--denoise") == 0
+    assert told == [hidden == "true"]
 
 
 @pytest.mark.parametrize("plugin", ["path", "bdpm"])

@@ -137,7 +137,6 @@ def test_prediction_is_checked(rgb, monkeypatch):
         (lambda: world(batch(orbit(3)), homogeneous()), {}, "several views"),
         (plain, {"max_depth": 1}, "needs no photons"),
         (lambda: fog_scene(grid(pockets, scale=3.0)), {}, "media of grids"),
-        *extended((plain, {"hide_emitters": True}, "hide_emitters")),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )

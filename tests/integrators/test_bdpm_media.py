@@ -21,7 +21,7 @@ from comparing import (
     collect_until,
     pictures,
 )
-from foggy import grid, pockets, view, volpath
+from foggy import grid, oracle_for, pockets, view, volpath
 from selection import extended, one_in_each_row
 from test_bdpm import last_words
 from test_bdpt_media import (
@@ -76,7 +76,8 @@ def agree_with_volpath(scene, max_depth=6, whole=0.02, block=0.06, **parameters)
     """`bdpm`, extrapolated to the radius zero, and `volpath` have the same mean in the image and in
     its quarters."""
     mine = SmallRadiusBatches(scene, 2, max_depth=max_depth, **parameters)
-    oracle = PathBatches(volpath(max_depth=max_depth), scene, 2, 512)
+    oracle = oracle_for(max_depth, parameters.get("hide_emitters", False))
+    oracle = PathBatches(oracle, scene, 2, 512)
     assert_same(*collect_until(mine, oracle, whole, block, most=600), whole, block, slack=SLACK)
 
 
@@ -308,13 +309,6 @@ def test_scenes_without_media_trace_none_of_this(rgb, monkeypatch):
 
 
 # --- What is refused ----------------------------------------------------------
-
-
-def test_hiding_emitters_is_refused(rgb):
-    with pytest.raises(Exception) as error:
-        mi.render(fog_scene(homogeneous()), integrator=bdpm(hide_emitters=True), spp=16)
-    words = 'bdpm: parameter "hide_emitters" is not supported in scenes with'
-    assert last_words(error.value).startswith(words)
 
 
 def test_flakes_are_refused(rgb):

@@ -400,12 +400,6 @@ def test_states_behind_half_transparent_surfaces(rgb, kind):
 # --- What is refused ----------------------------------------------------------
 
 
-def test_hidden_emitters_are_refused(rgb):
-    with pytest.raises(Exception) as error:
-        mi.render(fog_scene(homogeneous()), integrator=bdpt(hide_emitters=True), spp=2)
-    assert 'bdpt: parameter "hide_emitters"' in last_words(error.value)
-
-
 def test_flakes_are_refused(rgb):
     flakes = np.broadcast_to(np.float32([0.9, 0.1, 0.2, 0, 0, 0]), (2, 2, 2, 6))
     phase = {"type": "sggx", "S": {"type": "gridvolume", "grid": mi.VolumeGrid(flakes.copy())}}

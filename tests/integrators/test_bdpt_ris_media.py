@@ -152,7 +152,6 @@ def test_weights_sum_to_one(rgb, name, light, sensor, length, parameters):
     [
         ("bdpt_ris", {"weights": "published"}, '"weights" = published'),
         ("pcbpt", {"weights": "published"}, '"weights" = published'),
-        ("bdpt_ris", {"hide_emitters": True}, '"hide_emitters"'),
     ],
 )
 def test_what_media_do_not_have_is_refused(rgb, name, parameters, words):

@@ -378,7 +378,6 @@ def test_diffuse_scenes_are_those_of_bdpm(rgb):
     [
         ({"weights": "full"}, '"weights" = full'),
         ({"weights": "published"}, '"weights" = published'),
-        ({"hide_emitters": True}, '"hide_emitters"'),
     ],
 )
 def test_what_media_do_not_have_is_refused(rgb, parameters, words):

@@ -13,7 +13,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from comparing import PathBatches, assert_same, collect_until, grey_pictures
-from foggy import view, volpath
+from foggy import oracle_for, view
 from pilots import learned
 from selection import extended, one_in_each_row
 from test_bdpm_media import SLACK, SmallRadiusBatches
@@ -45,7 +45,8 @@ class JoinedBatches(SmallRadiusBatches):
 def agree(scene, max_depth=6, whole=0.02, block=0.06, **parameters):
     parameters = {"camera_paths": 16, **parameters}
     mine = JoinedBatches(scene, 2, max_depth=max_depth, **parameters)
-    oracle = PathBatches(volpath(max_depth=max_depth), scene, 2, 512)
+    oracle = oracle_for(max_depth, parameters.get("hide_emitters", False))
+    oracle = PathBatches(oracle, scene, 2, 512)
     assert_same(*collect_until(mine, oracle, whole, block, most=600), whole, block, slack=SLACK)
 
 
