@@ -107,9 +107,9 @@ def unfinite_data(scene):
     kinds = mi.Emitter, mi.Texture, mi.BSDF, mi.Medium, mi.Volume, mi.PhaseFunction, mi.Shape
     parameters = mi.traverse(scene)
     data = {
-        name: (owner, parameters[name])
+        name: (owner, value)
         for name, (_, _, owner, _) in parameters.properties.items()
-        if isinstance(owner, kinds)
+        if isinstance(owner, kinds) and (value := _value(parameters, name)) is not None
     }
     dr.eval([value for _, value in data.values()])  # at once: each by itself would be a kernel
     found = []
@@ -129,6 +129,15 @@ def unfinite_data(scene):
                 "that are not finite"
             )
     return found
+
+
+def _value(parameters, name):
+    """A scene parameter; ``None`` where it was not given, as `sigma_a` of the BSDF ``hair``. (There
+    Mitsuba's own access raises.)"""
+    try:
+        return parameters[name]
+    except TypeError:
+        return None
 
 
 class SceneTraits:

@@ -21,13 +21,15 @@ SAMPLES = 64
 def narrow_bsdfs(scene):
     """A registry table: of each BSDF of the scene a bit for each of the `COSINES`, whether its
     `concentration` is above `NARROW` there. None where there is no such BSDF."""
-    smooth = [b for b in used_bsdfs(scene) if mi.has_flag(b.flags(), mi.BSDFFlags.Smooth)]
+    bsdfs = used_bsdfs(scene)  # all have a place in the table: any may be asked for
+    smooth = [b for b in bsdfs if mi.has_flag(b.flags(), mi.BSDFFlags.Smooth)]
     rough = [b for b in smooth if int(b.flags()) & ~_EVEN]
     if not rough:
         return None
     narrow = concentration(rough) > NARROW
-    bits = narrow @ (1 << np.arange(len(COSINES)))
-    return registry_table(rough, mi.BSDFPtr, bits, mi.UInt32) if narrow.any() else None
+    bits = dict(zip((b.ptr for b in rough), narrow @ (1 << np.arange(len(COSINES)))))
+    values = [bits.get(b.ptr, 0) for b in bsdfs]
+    return registry_table(bsdfs, mi.BSDFPtr, values, mi.UInt32) if narrow.any() else None
 
 
 def is_narrow(table, bsdf, si, active):

@@ -106,6 +106,11 @@ def test_spectral(rgb, part):
     )
 
 
+def test_parameters_that_are_not_given(rgb):
+    """Of ``hair``, `sigma_a` has no value."""
+    assert unfinite_data(mi.load_dict({"type": "scene", "part": ball(bsdf={"type": "hair"})})) == []
+
+
 def test_without_an_id(rgb):
     """The class stands for it, not an address."""
     scene = mi.load_string(

@@ -77,6 +77,19 @@ def test_which_surfaces_are_narrow(rgb):
     assert lobes.narrow_bsdfs(box(floor={**plastic, "alpha": 0.4})) is None
 
 
+def test_the_table_has_all_surfaces(rgb):
+    """Those without lobes, too, wherever they stand in Mitsuba's registry."""
+    metal, matt = (
+        {"type": "sphere", "bsdf": bsdf} for bsdf in ({**METAL, "alpha": 0.05}, {"type": "diffuse"})
+    )
+    for shapes in ({"a": metal, "b": matt}, {"a": matt, "b": metal}):
+        scene = mi.load_dict({"type": "scene", **shapes})
+        numbers = [
+            dr.reinterpret_array(mi.UInt32, mi.BSDFPtr(shape.bsdf()))[0] for shape in scene.shapes()
+        ]
+        assert max(numbers) < dr.width(lobes.narrow_bsdfs(scene))
+
+
 def narrow_box():
     """Of lobes that are narrow from everywhere, and of a coat that is so at grazing angles."""
     coat = {"type": "roughplastic", "alpha": 0.1}
