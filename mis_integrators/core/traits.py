@@ -40,10 +40,17 @@ def scene_objects(root):
     return list(seen.values())
 
 
+def used_shapes(scene):
+    """Every shape of a scene, those of shape groups and what Mitsuba's loader has merged them into
+    among them, each once."""
+    shapes = [o for o in scene_objects(scene) if isinstance(o, mi.Shape)] + list(scene.shapes())
+    return list({shape.ptr: shape for shape in shapes}.values())
+
+
 def used_bsdfs(scene):
     """Every BSDF that some shape (of a shape group, too) carries, nested ones included, each
     once."""
-    shapes = [o for o in scene_objects(scene) if isinstance(o, mi.Shape)] + list(scene.shapes())
+    shapes = used_shapes(scene)
     below = {o.ptr: o for shape in shapes for o in scene_objects(shape) if isinstance(o, mi.BSDF)}
     own = {shape.bsdf().ptr: shape.bsdf() for shape in shapes if shape.bsdf() is not None}
     return list({**below, **own}.values())
@@ -272,6 +279,15 @@ def check_scene(scene, sensor, plugin):
     check_polarisation(plugin)
     check_emitters(scene, plugin)
     check_bands(sensor.film(), plugin)
+
+
+def check_bsdfs(scene, plugin):
+    """Raises `UnsupportedScene` for BSDFs that scatter unlike in the two directions of a path."""
+    if any(bsdf.class_name() == "Hair" for bsdf in used_bsdfs(scene)):
+        raise UnsupportedScene(
+            f'{plugin}: BSDF "hair" is not supported, for it scatters unlike in the two directions '
+            'of a path; use "path"'
+        )
 
 
 def check_polarisation(plugin):

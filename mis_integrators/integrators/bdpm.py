@@ -6,7 +6,7 @@ from ..core.film import as_camera_weights, expected_weight, with_colour
 from ..core.recording import recorder
 from ..paths.camera import film_sample_count, film_size
 from ..paths.layers import CHANNELS, SPLIT
-from ..paths.lobes import narrow_bsdfs
+from ..paths.lobes import NarrowSurfaces
 from ..paths.ray_cones import cones_of
 from ..paths.sensor import Lens
 from ..photons.hits import meets_one_light
@@ -45,9 +45,9 @@ class BDPM(IterativeIntegrator):
          (Default: 1)
      * - pass_narrow
        - |bool|
-       - Whether paths pass surfaces with narrow lobes, as of smooth metal or frosted glass, without
-         gathering photons there, but for caustic ones; ``bdd`` does not count them then. (Default:
-         yes, i.e. |true|)
+       - Whether paths pass surfaces with narrow lobes, as of smooth metal or frosted glass, and
+         curves, without gathering photons there, but for caustic ones; ``bdd`` does not count them
+         then. (Default: yes, i.e. |true|)
      * - photon_count
        - |int|
        - Light sub-paths an iteration; 0 stands for as many as the cropped film has pixels, or with
@@ -119,8 +119,8 @@ class BDPM(IterativeIntegrator):
     the first smooth surface then.
 
     The estimate is consistent: its bias vanishes with the radius (but for that of photons very
-    close to the sensor). Polarised variants, gradients, the film ``specfilm`` and media of flakes
-    are refused by name.
+    close to the sensor). Polarised variants, gradients, the film ``specfilm``, media of flakes and
+    the BSDF ``hair`` are refused by name.
 
     .. tabs::
         .. code-tab:: xml
@@ -240,7 +240,7 @@ class BDPMSession(PhotonPasses):
             self.cones = cones_of(sensor)
         self.narrow = None
         if integrator.pass_narrow and self.has_indirect:
-            self.narrow = narrow_bsdfs(self.scene)
+            self.narrow = NarrowSurfaces.of(self.scene)
         self.has_caustics_unseen = self.has_caustics and (
             self.cones is None or integrator.bdd > 0 or self.narrow is not None
         )

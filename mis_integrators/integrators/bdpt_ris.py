@@ -136,8 +136,8 @@ class BDPTRIS(ResampledIntegrator):
     ``merging``, which vanishes with the radius.
 
     In participating media vertices are drawn, joined and merged as on surfaces; media of flakes and
-    the value ``published`` of ``weights`` are refused there. Polarised variants, gradients and the
-    film ``specfilm`` are refused by name.
+    the value ``published`` of ``weights`` are refused there. The BSDF ``hair``, polarised variants,
+    gradients and the film ``specfilm`` are refused by name.
 
     .. tabs::
         .. code-tab:: xml

@@ -18,6 +18,7 @@ import numpy as np
 from ..core.recording import lanes
 from ..core.spectra import channel_mean
 from ..core.stratified_variance import contrasts, extrapolated
+from ..core.traits import UnsupportedScene
 from ..paths.layers import written
 from ..paths.path_length_statistics import mean_segments
 from ..pilot.noise import MEASURES, trimmed_mean
@@ -100,7 +101,13 @@ def choose(integrator, scene, sensor, seed, iterations, seconds):
     """The `Decision` for a render of so many iterations, or of so many seconds (either may be
     `None`)."""
     render = integrator, scene, sensor, seed, iterations
-    path, photons = new_session(CAMERA, *render), new_session(PHOTONS, *render)
+    path = new_session(CAMERA, *render)
+    try:
+        photons = new_session(PHOTONS, *render)
+    except UnsupportedScene as refusal:
+        if integrator.splits_light:
+            raise
+        return Decision(CAMERA, path, [f"{CAMERA}: {refusal}"])
     alone = (PHOTONS, photons) if integrator.splits_light else (CAMERA, path)
     if not photons.kinds():
         return Decision(*alone, [f"{alone[0]}: {no_photons(integrator, photons)}"])
@@ -166,9 +173,9 @@ def new_session(plugin, integrator, scene, sensor, seed, iterations):
         "aovs": written(integrator.layers),
     }
     own = own_parameters(CANDIDATES, plugin, integrator)
-    return mi.load_dict({"type": plugin, **shared, **own}).new_session(
-        scene, sensor, seed, iterations
-    )
+    made = mi.load_dict({"type": plugin, **shared, **own})
+    made.check(scene, sensor)
+    return made.new_session(scene, sensor, seed, iterations)
 
 
 def own_parameters(candidates, plugin, integrator):

@@ -18,6 +18,7 @@ from ..core.sequences import SampleSequence
 from ..core.traits import (
     SceneTraits,
     UnsupportedScene,
+    check_bsdfs,
     check_film,
     check_media,
     check_scene,
@@ -103,6 +104,7 @@ class IterativeIntegrator(mi.AdjointIntegrator):
     def check(self, scene, sensor):
         """Raises `UnsupportedScene` for a scene that this integrator cannot render."""
         check_scene(scene, sensor, self.plugin)
+        check_bsdfs(scene, self.plugin)
         if has_media(scene, sensor):
             check_media(scene, sensor, self.plugin)
             for parameter, instead in self.refused_in_media():

@@ -13,7 +13,6 @@ from ..core.packing import with_reserve
 from ..core.traits import lookup
 from ..mis.chance import ChanceWeights, StartDensity
 from ..paths.light_classes import LightClasses, by_class_of_photons
-from ..paths.lobes import is_narrow
 from ..paths.sensor import Lens
 from ..photons.beams import Beams, gather_along, mean_count_along, read_beams
 from ..photons.coverage import covered_share
@@ -130,7 +129,7 @@ class PhotonPasses(PilotedSession):
             *self.lights.tables(),
         ]
         if self.narrow is not None:
-            self._tables.append(self.narrow)
+            self._tables += self.narrow.tables()
         if self.cones is not None:
             self._tables += self.cones.tables()
         if self.near_zone is not None:
@@ -245,7 +244,7 @@ class PhotonPasses(PilotedSession):
         if isinstance(photon_map, TieredMap):
             narrow, first, weigher = mi.Bool(False), radii[0], chance and chance.weigher
             if self.narrow is not None:
-                narrow = is_narrow(self.narrow, vertices.bsdf, vertices.si, vertices.active)
+                narrow = self.narrow.at(vertices.bsdf, vertices.si, vertices.active)
             found = gather_tiers(
                 photon_map, vertices, first, light_paths, max_depth, weigher, marked, narrow
             )

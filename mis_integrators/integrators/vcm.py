@@ -52,8 +52,8 @@ class VCM(BDPT):
     each light sub-path for a sample of its own.
 
     Consistent: the bias of merging vanishes with the radius. In participating media vertices are
-    joined and merged as on surfaces, within balls of four times the radius. Media of flakes,
-    polarised variants, gradients and the film ``specfilm`` are refused by name.
+    joined and merged as on surfaces, within balls of four times the radius. Media of flakes, the
+    BSDF ``hair``, polarised variants, gradients and the film ``specfilm`` are refused by name.
 
     .. tabs::
         .. code-tab:: xml

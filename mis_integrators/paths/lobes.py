@@ -1,6 +1,10 @@
-"""How narrow the lobes of BSDFs are: whether photons that arrive at a surface are of use there."""
+"""Whether photons that arrive at a surface are of use there: how narrow the lobes of its BSDF are,
+and whether it is a curve, narrower itself than the disks in which photons are merged."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -8,7 +12,7 @@ import numpy as np
 
 from ..core.sequences import sobol
 from ..core.spectra import channel_mean
-from ..core.traits import lookup, registry_table, used_bsdfs
+from ..core.traits import lookup, registry_table, used_bsdfs, used_shapes
 
 NARROW = 30.0
 """Tuned: concentration from which on photons are gathered one vertex later."""
@@ -16,6 +20,48 @@ COSINES = 0.25, 0.5, 0.75, 1.0
 """Of the angles under which BSDFs are looked at."""
 SAMPLES = 64
 """Directions sampled of each BSDF under each angle."""
+
+
+CURVES = frozenset({"BSplineCurve", "LinearCurve", "CatmullRomCurve"})
+
+
+@dataclass(frozen=True)
+class NarrowSurfaces:
+    """Surfaces at which photons are of no use: the registry tables `narrow_bsdfs` and, of each
+    shape, whether it is a curve; each may be ``None`` where there is none."""
+
+    bsdfs: Any
+    curves: Any
+
+    @classmethod
+    def of(cls, scene):
+        """Those of a scene; ``None`` where there are none."""
+        found = cls(narrow_bsdfs(scene), curves(scene))
+        return found if found.tables() else None
+
+    def tables(self):
+        """What it reads."""
+        return [table for table in (self.bsdfs, self.curves) if table is not None]
+
+    def at(self, bsdf, si, active):
+        """Whether a surface with this BSDF is one, as seen from where `si` is: by the nearest of
+        the `COSINES`."""
+        narrow = mi.Bool(False)
+        if self.bsdfs is not None:
+            bits = lookup(self.bsdfs, bsdf, mi.UInt32, active)
+            place = dr.abs(si.wi.z) * len(COSINES) - 0.5
+            nearest = mi.UInt32(dr.clip(place, 0, len(COSINES) - 1))
+            narrow |= (bits >> nearest) & 1 != 0
+        if self.curves is not None:
+            narrow |= lookup(self.curves, si.shape, mi.Bool, active & si.is_valid())
+        return narrow
+
+
+def curves(scene):
+    """A registry table: of each shape of the scene, whether it is a curve. None where none is."""
+    shapes = used_shapes(scene)
+    found = [shape.class_name() in CURVES for shape in shapes]
+    return registry_table(shapes, mi.ShapePtr, found, mi.Bool) if any(found) else None
 
 
 def narrow_bsdfs(scene):
@@ -30,14 +76,6 @@ def narrow_bsdfs(scene):
     bits = dict(zip((b.ptr for b in rough), narrow @ (1 << np.arange(len(COSINES)))))
     values = [bits.get(b.ptr, 0) for b in bsdfs]
     return registry_table(bsdfs, mi.BSDFPtr, values, mi.UInt32) if narrow.any() else None
-
-
-def is_narrow(table, bsdf, si, active):
-    """Whether the lobes of a BSDF are narrow, as seen from where `si` is: by the nearest of the
-    `COSINES`. `table`: of `narrow_bsdfs`."""
-    bits = lookup(table, bsdf, mi.UInt32, active)
-    nearest = mi.UInt32(dr.clip(dr.abs(si.wi.z) * len(COSINES) - 0.5, 0, len(COSINES) - 1))
-    return (bits >> nearest) & 1 != 0
 
 
 _EVEN = int(

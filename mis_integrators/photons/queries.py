@@ -17,7 +17,6 @@ from ..core.spectra import channel_mean
 from ..lights.lights import mis_power
 from ..paths.camera import trace_camera, whole_or_nothing
 from ..paths.light_classes import class_of, scattered_history, start_of_camera_path
-from ..paths.lobes import is_narrow
 from ..paths.media import direct_light, next_hit_either, next_hit_straight_on
 from ..paths.setting import CameraPass, Limits, ListedPass, World
 from ..paths.subpaths import selected, smooth_at
@@ -137,9 +136,9 @@ class Queries:
     `bdd`: the last smooth camera vertex, counted from 0; `capacity`: vertices that there is room
     for (under weights, in each section); `has_caustics`, `has_indirect`: kinds of photons that
     there are; `one_vertex`: no path asks twice, and each owns the place of its number; `beams`: how
-    many beams of each kind there is room for (0: none are kept); `narrow`: a registry table of
-    BSDFs at which none but caustic photons are gathered, and which the `bdd` does not count (None:
-    there are none); `points`: in media, too, photons are asked for at vertices (under weights);
+    many beams of each kind there is room for (0: none are kept); `narrow`: the `NarrowSurfaces` at
+    which none but caustic photons are gathered, and which the `bdd` does not count (None: there are
+    none); `points`: in media, too, photons are asked for at vertices (under weights);
     `cones` (`RayCones`, or None): they tell how wide pixels are at vertices that the camera sees;
     `near_zone` (a `NearZone`, or None): volume photons beyond it are joined with the sensor. Then
     photons bring all light of media on the way to the first smooth surface: all segments before it
@@ -376,7 +375,7 @@ class QueryVisitor:
             smooth &= vertex <= self.bdd
         at.ends = vertex >= self.bdd  # the path's last smooth vertex
         if self.queries.narrow is not None:
-            at.narrow = is_narrow(self.queries.narrow, bsdf, at.si, smooth)
+            at.narrow = self.queries.narrow.at(bsdf, at.si, smooth)
             at.ends &= ~at.narrow
         if self.beyond is not None:
             # Other paths go straight through media.

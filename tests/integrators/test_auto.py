@@ -27,7 +27,7 @@ from comparing import (
 )
 from selection import extended
 from test_against_path import MONO, RGB, SPECTRAL, caustic_scene
-from test_bdpm import glossy_box, last_words
+from test_bdpm import box_scene, glossy_box, last_words
 from worlds import diffuse, film, look, path, tray
 
 
@@ -266,6 +266,18 @@ def test_no_light(rgb):
         session.settings["choice"] == "path" and "no light" in session.settings["choice.because.1"]
     )
     assert session.image().max() == 0
+
+
+@pytest.mark.parametrize("parameters", [{}, {"denoised": True}])
+def test_what_photons_cannot_render(rgb, parameters):
+    scene = box_scene(8, extra={"type": "sphere", "bsdf": {"type": "hair"}})
+    session = decided(scene, **parameters)
+    settings = session.settings
+    assert settings["choice"] == "path" and 'BSDF "hair"' in settings["choice.because.1"]
+    assert session.image().max() > 0
+    with pytest.raises(Exception) as error:
+        decided(scene, aovs="caustic:caustic")
+    assert last_words(error.value).startswith('bdpm: BSDF "hair" is not supported')
 
 
 @pytest.mark.parametrize(

@@ -1087,6 +1087,16 @@ def test_polarised_variant():
         )
 
 
+def test_hair(rgb):
+    """Mitsuba's BSDF of fibres scatters unlike in the two directions of a path: only what follows
+    camera paths alone can render it."""
+    scene = box_scene(8, extra={"type": "sphere", "bsdf": {"type": "hair"}})
+    for plugin in set(PLUGINS) - {"bdpm_auto", "volpath_multiview"}:
+        with pytest.raises(Exception) as error:
+            mi.render(scene, integrator=mi.load_dict({"type": plugin}), spp=8)
+        assert last_words(error.value).startswith(f'{plugin}: BSDF "hair" is not supported')
+
+
 @pytest.mark.parametrize("case", ["curve emitter", "sdfgrid emitter", "inside aov"])
 def test_unrenderable_scene(rgb, case, tmp_path):
     curve = tmp_path / "curve.txt"

@@ -63,18 +63,19 @@ def test_which_surfaces_are_narrow(rgb):
         floor=plastic,
         back={**METAL, "alpha": 0.5},
     )
-    table = lobes.narrow_bsdfs(scene)
+    narrow = lobes.NarrowSurfaces.of(scene)
+    assert narrow.curves is None
     from_cosines = dr.zeros(mi.SurfaceInteraction3f, 5)
     from_cosines.wi = mi.Vector3f(0, 0, mi.Float(0.05, 0.37, -0.37, 0.38, 1.0))
     found = {}
     for shape in scene.shapes():
         bsdf = dr.opaque(mi.BSDFPtr, shape.bsdf(), 5)
-        found[shape.id()] = list(lobes.is_narrow(table, bsdf, from_cosines, True))
+        found[shape.id()] = list(narrow.at(bsdf, from_cosines, True))
     assert found.pop("small-box") == found.pop("large-box") == [True] * 5
     assert found.pop("floor") == [True, True, True, False, False]  # the coat, at grazing angles
     assert not np.any(list(found.values()))
-    assert lobes.narrow_bsdfs(box()) is None
-    assert lobes.narrow_bsdfs(box(floor={**plastic, "alpha": 0.4})) is None
+    assert lobes.NarrowSurfaces.of(box()) is None
+    assert lobes.NarrowSurfaces.of(box(floor={**plastic, "alpha": 0.4})) is None
 
 
 def test_the_table_has_all_surfaces(rgb):
@@ -88,6 +89,58 @@ def test_the_table_has_all_surfaces(rgb):
             dr.reinterpret_array(mi.UInt32, mi.BSDFPtr(shape.bsdf()))[0] for shape in scene.shapes()
         ]
         assert max(numbers) < dr.width(lobes.narrow_bsdfs(scene))
+
+
+def bristles(folder, **objects):
+    """A brush of thin diffuse curves on a floor, under a lamp. The last curve is out of sight, for
+    where a ray meets the end of it, Mitsuba (3.9.1) reads beyond a table."""
+    rng = np.random.default_rng(4)
+    with (folder / "bristles.txt").open("w") as file:
+        for number in range(1201):
+            x, y = rng.uniform(-1, 1, 2)
+            dx, dy = rng.uniform(-0.1, 0.1, 2)
+            low = -5 if number == 1200 else 0
+            for k in range(4):
+                file.write(f"{x + dx * k:.4f} {y + dy * k:.4f} {low + 0.2 * k:.4f} 0.008\n")
+            file.write("\n")
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "brush": {
+                "type": "bsplinecurve",
+                "filename": str(folder / "bristles.txt"),
+                "bsdf": {"type": "diffuse", "reflectance": 0.7},
+            },
+            "floor": {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(1.5)},
+            "lamp": {
+                "type": "rectangle",
+                "to_world": mi.ScalarTransform4f().translate([0, 0, 3]).rotate([1, 0, 0], 180),
+                "emitter": {"type": "area", "radiance": 3.0},
+            },
+            "sensor": {
+                "type": "perspective",
+                "fov": 40,
+                "to_world": mi.ScalarTransform4f().look_at([0, -3, 2], [0, 0, 0.2], [0, 0, 1]),
+                "film": {
+                    "type": "hdrfilm",
+                    "width": 32,
+                    "height": 32,
+                    "rfilter": {"type": "box"},
+                    "pixel_format": "rgb",
+                },
+            },
+            **objects,
+        }
+    )
+
+
+@pytest.mark.parametrize("bdd", [0, *extended(1)])
+def test_no_photons_are_gathered_on_curves(rgb, tmp_path, bdd):
+    """They are thinner than disks: with photons the image is 13 % too dark."""
+    scene = bristles(tmp_path)
+    parameters = {"max_depth": 5, "initial_radius": 0.04, "camera_paths": 4}
+    made = mi.load_dict({"type": "bdpm", "bdd": bdd, **parameters})
+    agree(made, path(max_depth=5), scene, blocks=1, whole=0.01, block=0.01)
 
 
 def narrow_box():
