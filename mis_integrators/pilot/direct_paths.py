@@ -25,10 +25,16 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..core.windows import window_mean
 from .noise import relative_weights, trimmed_mean
 
 TRIALS = 4
 """Tuned: independent paths through each pixel that tell how noisy its direct light is."""
+AROUND = 9
+"""Pixels a side of the wider squares that tell of noise, too."""
+SHARE_AROUND = 0.05
+"""Tuned: how much they count, beside the 3 x 3 pixels. Where bright paths are rare, as by flames
+that glass reflects, a pixel's trials and its neighbours' often meet none."""
 MOST_TRIED = 1 << 18
 """Pixels with trials, at most or about: larger films have them in every second, or third, ... row
 and column."""
@@ -76,7 +82,7 @@ class DirectNoise(NamedTuple):
 
 def measure(samples: np.ndarray, width: int) -> DirectNoise:
     """The `DirectNoise` of independent paths through each pixel, from those of the 3 x 3 pixels
-    around.
+    around, and to a small part from those in wider squares.
 
     Parameters
     ----------
@@ -94,9 +100,12 @@ def measure(samples: np.ndarray, width: int) -> DirectNoise:
 
 
 def _noise_around(samples: np.ndarray, width: int) -> np.ndarray:
-    """Variance of all samples of the 3 x 3 pixels around each: (pixels,)."""
+    """Variance of all samples of the 3 x 3 pixels around each, and a share of its mean over wider
+    squares: (pixels,)."""
     mean = smoothed(samples.mean(axis=0), width)
-    return np.maximum(smoothed((samples**2).mean(axis=0), width) - mean**2, 0)
+    near = np.maximum(smoothed((samples**2).mean(axis=0), width) - mean**2, 0)
+    around = np.maximum(window_mean(near.reshape(-1, width), AROUND).ravel(), 0)
+    return (1 - SHARE_AROUND) * near + SHARE_AROUND * around
 
 
 def paths_per_pixel(
