@@ -25,7 +25,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..core.windows import window_mean
 from .noise import relative_weights, trimmed_mean
 
 TRIALS = 4
@@ -57,11 +56,14 @@ def coarser(width: int, height: int) -> tuple[np.ndarray, np.ndarray, np.ndarray
     return rows, columns, nearest.ravel()
 
 
-def smoothed(values: np.ndarray, width: int) -> np.ndarray:
-    """Means over squares of 3 x 3 pixels, smaller at the film's edges: (pixels,), row by row."""
-    image = np.pad(values.reshape(-1, width), 1, mode="edge")
-    rows = image[:-2] + image[1:-1] + image[2:]
-    return ((rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:]) / 9).ravel()
+def smoothed(values: np.ndarray, width: int, side: int = 3) -> np.ndarray:
+    """Means over squares of `side` pixels a side, an odd number, around each: (pixels,), row by
+    row. The film goes on beyond its edges as it is there."""
+    image = np.pad(values.reshape(-1, width), side // 2, mode="edge")
+    height = len(image) - side + 1
+    rows = np.sum([image[shift : shift + height] for shift in range(side)], axis=0)
+    found = np.sum([rows[:, shift : shift + width] for shift in range(side)], axis=0)
+    return (found / side**2).ravel()
 
 
 class DirectNoise(NamedTuple):
@@ -104,8 +106,7 @@ def _noise_around(samples: np.ndarray, width: int) -> np.ndarray:
     squares: (pixels,)."""
     mean = smoothed(samples.mean(axis=0), width)
     near = np.maximum(smoothed((samples**2).mean(axis=0), width) - mean**2, 0)
-    around = np.maximum(window_mean(near.reshape(-1, width), AROUND).ravel(), 0)
-    return (1 - SHARE_AROUND) * near + SHARE_AROUND * around
+    return (1 - SHARE_AROUND) * near + SHARE_AROUND * smoothed(near, width, AROUND)
 
 
 def paths_per_pixel(
