@@ -45,6 +45,11 @@ class OpenScene:
         return name_of(self.path)
 
     @property
+    def hides_emitters(self) -> bool:
+        """Whether integrators are told to hide emitters."""
+        return bool(self.inherited.get("hide_emitters", False))
+
+    @property
     def sensor(self) -> mi.Sensor:
         return self.scene.sensors()[0]
 

@@ -187,12 +187,14 @@ def _denoised(measured: Measured, measurement: Measurement) -> list[np.ndarray]:
     """The denoised images, one a seed; none where they are not denoised."""
     if not measurement.opened.denoise:
         return []
-    opened = measurement.opened
-    scene, hide_emitters = opened.scene, bool(opened.inherited.get("hide_emitters", False))
-    pictures = []
+    opened, pictures = measurement.opened, []
     for run in measured.runs:
         denoised, _ = denoising.denoised_picture(
-            run.last.whole, run.last.channels, scene, scene.sensors()[0], hide_emitters
+            run.last.whole,
+            run.last.channels,
+            opened.scene,
+            opened.scene.sensors()[0],
+            opened.hides_emitters,
         )
         pictures.append(denoised[..., :3])
     return pictures
@@ -205,7 +207,10 @@ def _denoised_errors(
     direct light apart."""
     if not pictures:
         return {}
-    at_once = denoising.denoise(measured.images[0], measurement.opened.scene)
+    opened = measurement.opened
+    at_once = denoising.denoise(
+        measured.images[0], opened.scene, hide_emitters=opened.hides_emitters
+    )
     judged = [errors(picture, measurement.references) for picture in pictures]
     perceived = flip(pictures[0], measurement.references)
     return {

@@ -316,6 +316,5 @@ def check_emitters(scene, plugin):
             )
 
 
-_UNSAMPLED_SHAPES = frozenset(
-    {"BSplineCurve", "LinearCurve", "CatmullRomCurve", "SDFGrid", "Ellipsoids", "EllipsoidsMesh"}
-)
+CURVES = frozenset({"BSplineCurve", "LinearCurve", "CatmullRomCurve"})
+_UNSAMPLED_SHAPES = CURVES | {"SDFGrid", "Ellipsoids", "EllipsoidsMesh"}

@@ -145,8 +145,7 @@ class BDPMOpt(WeightedBDPM):
         }
 
     def refused_in_media(self):
-        other = [] if self.weights == "local" else [(f'"weights" = {self.weights}', '"local"')]
-        return other + super().refused_in_media()
+        return [] if self.weights == "local" else [(f'"weights" = {self.weights}', '"local"')]
 
     def new_session(self, scene, sensor, seed, iterations):
         session = PublishedSession if self.weights == "published" else BDPMOptSession

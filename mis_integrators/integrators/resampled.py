@@ -95,8 +95,7 @@ class ResampledIntegrator(IterativeIntegrator):
         }
 
     def refused_in_media(self):
-        published = [('"weights" = published', '"bounded"')] if self.published else []
-        return published + super().refused_in_media()
+        return [('"weights" = published', '"bounded"')] if self.published else []
 
     def new_session(self, scene, sensor, seed, iterations):
         return ResampledSession(self, scene, sensor, seed, iterations)

@@ -224,10 +224,17 @@ def trace_camera(
         active &= False
 
     flight = begin_flights(traits, camera_pass.sensor.get_medium())
-    unseen = ~visible if hide_emitters else None
     if dr.hint(traits.has_media, mode="scalar"):
         state, hit, ray, flight, throughput = visitor.travel(
-            state, ray, flight, numbers, throughput, path, depth, active, unseen
+            state,
+            ray,
+            flight,
+            numbers,
+            throughput,
+            path,
+            depth,
+            active,
+            ~visible if hide_emitters else None,
         )
     else:
         hit = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
@@ -286,9 +293,16 @@ def trace_camera(
             rng, throughput, dr.max(throughput), eta, begun, active
         )
         if dr.hint(traits.has_media, mode="scalar"):
-            unseen = ~visible if hide_emitters else None
             state, hit, ray, flight, throughput = visitor.travel(
-                state, ray, flight, numbers, throughput, path, depth, active, unseen
+                state,
+                ray,
+                flight,
+                numbers,
+                throughput,
+                path,
+                depth,
+                active,
+                ~visible if hide_emitters else None,
             )
         else:
             hit = scene.ray_intersect_preliminary(ray, coherent=False, active=active)

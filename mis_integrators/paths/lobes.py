@@ -12,7 +12,7 @@ import numpy as np
 
 from ..core.sequences import sobol
 from ..core.spectra import channel_mean
-from ..core.traits import lookup, registry_table, used_bsdfs, used_shapes
+from ..core.traits import CURVES, lookup, registry_table, used_bsdfs, used_shapes
 
 NARROW = 30.0
 """Tuned: concentration from which on photons are gathered one vertex later."""
@@ -20,9 +20,6 @@ COSINES = 0.25, 0.5, 0.75, 1.0
 """Of the angles under which BSDFs are looked at."""
 SAMPLES = 64
 """Directions sampled of each BSDF under each angle."""
-
-
-CURVES = frozenset({"BSplineCurve", "LinearCurve", "CatmullRomCurve"})
 
 
 @dataclass(frozen=True)

@@ -55,7 +55,7 @@ def test_no_other_numbers_do_better(iterations, exponent):
 def test_paths_go_where_the_noise_is():
     paths = direct_paths.paths_per_pixel(found_in(samples_of()), 0.1, 0.05, 32, 1.5)
     paths = paths.reshape(16, WIDTH)
-    assert paths[4, 6:18].min() > 4 * np.median(paths[10:, : WIDTH // 2])
+    assert paths[4, 6:18].min() > 4 * np.median(paths[8:, : WIDTH // 2])
     far = 5 + direct_paths.AROUND // 2  # rows without noise near
     assert np.all(paths[far + 1 :, WIDTH // 2 + 6 :] == 1)
     assert np.all(paths[:2, 6:18] < paths[4, 6:18].min() / 2)
@@ -63,12 +63,15 @@ def test_paths_go_where_the_noise_is():
 
 def test_an_edge_between_pixels_counts():
     """No sample of these pixels differs from the others, but the neighbours do."""
-    image = np.zeros((direct_paths.TRIALS, 8, WIDTH))
-    image[:, :4] = 30.0
+    image = np.zeros((direct_paths.TRIALS, 24, WIDTH))
+    image[:, :12] = 30.0
     paths = direct_paths.paths_per_pixel(
         found_in(image.reshape(direct_paths.TRIALS, -1)), 0.1, 0.05, 32, 1.5
-    ).reshape(8, WIDTH)
-    assert np.all(paths[3:5] > 2) and np.all(paths[[0, 1, 6, 7]] < paths[3:5].min() / 2)
+    ).reshape(24, WIDTH)
+    assert np.all(paths[11:13] > 2)
+    reach = direct_paths.AROUND // 2  # of rows that are counted a little
+    assert np.all(paths[: 11 - reach] == 1) and np.all(paths[13 + reach :] == 1)
+    assert np.all(paths[[9, 10, 13, 14]] < paths[11:13].min() / 2)
 
 
 def test_rare_bright_paths_that_trials_miss_have_more():
