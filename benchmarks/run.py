@@ -16,7 +16,7 @@ mi.set_variant("llvm_ad_rgb")
 
 from common import references  # noqa: E402
 from common.methods import CHOSEN_FROM, COMPARED, VARIED, Method, parse_method, registered  # noqa: E402
-from common.scene_files import BUNDLED, bundled  # noqa: E402
+from common.scene_files import BUNDLED, bundled, open_scene  # noqa: E402
 from experiments import (  # noqa: E402
     choice,
     combine,
@@ -133,7 +133,7 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument(
         "--resampled",
         nargs="*",
-        type=_file,
+        type=_scene,
         default=[path for path in bundled() if path.stem == "door"],
         metavar="FILE.xml",
         help="scenes of the sweeps of resampling (default: door)",
@@ -145,7 +145,7 @@ def _parser() -> argparse.ArgumentParser:
     _compares_with_references(command)
     command.add_argument(
         "--baseline",
-        type=_file,
+        type=_scene,
         metavar="FILE",
         help="figures of an earlier run (compare.json or benchmarks/history/*.json): print what "
         "became slower or noisier",
@@ -508,10 +508,16 @@ def _labels(methods: Sequence[Method]) -> str:
     return " ".join(method.label for method in methods)
 
 
-def _file(text: str) -> Path:
-    if not Path(text).is_file():
+def _scene(text: str) -> Path:
+    """A scene file that can be loaded: else hours of measuring would end at it."""
+    path = Path(text)
+    if not path.is_file():
         raise argparse.ArgumentTypeError(f"there is no file {text}")
-    return Path(text)
+    try:
+        open_scene(path)
+    except loading.SCENE_ERRORS as error:
+        raise argparse.ArgumentTypeError(f"{text}: {loading.one_line(error)}") from None
+    return path
 
 
 def _positive(text: str) -> float:
@@ -538,7 +544,7 @@ def _measuring(commands, name: str, module, scenes: bool = True) -> argparse.Arg
         command.add_argument(
             "--scenes",
             nargs="+",
-            type=_file,
+            type=_scene,
             default=bundled(),
             metavar="FILE.xml",
             help="scene files (default: the bundled ones)",
@@ -628,7 +634,7 @@ def _views(
     command.add_argument(
         "--view-scenes",
         nargs="*",
-        type=_file,
+        type=_scene,
         default=view_counts.SCENES,
         metavar="FILE.xml",
         help="scenes with several views (default: the bundled ones whose views overlap)",

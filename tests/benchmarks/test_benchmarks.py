@@ -528,6 +528,18 @@ def test_what_is_asked_for_is_checked_before_it_is_measured(module, capsys, argu
     assert exit.value.code == 2 and message in capsys.readouterr().err.splitlines()[-1]
 
 
+def test_a_scene_that_cannot_be_loaded_is_told_before_others_are_measured(module, tmp_path, capsys):
+    (tmp_path / "dark.xml").write_text(
+        '<scene version="3.0.0"><emitter type="point"><rgb name="intensty" value="1"/>'
+        "</emitter></scene>"
+    )
+    good, bad = str(SCENES / "cornell_point.xml"), str(tmp_path / "dark.xml")
+    with pytest.raises(SystemExit) as exit:
+        module("run").main(["choice", "--scenes", good, bad])
+    message = capsys.readouterr().err.splitlines()[-1]
+    assert exit.value.code == 2 and bad in message and "intensty" in message
+
+
 def test_comparisons_without_path_are_shown(module, capsys):
     """Artefacts are counted beside `path`: without it the table has no such column."""
     compare = module("experiments.compare")
