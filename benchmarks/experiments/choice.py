@@ -37,7 +37,7 @@ def run(options: argparse.Namespace) -> None:
 def judged(compared: list[Row], seconds: float, kind: str) -> list[Row]:
     """One row for `bdpm_auto` among the rows of `compare`, if it could render the scene: its errors
     (of the images' `kind`) over those of the better `path` and of the best method, each measure by
-    itself."""
+    itself. A ratio is not a number where the other error is below the noise of the references."""
     mine = next((row for row in compared if row["method"] == AUTO), None)
     if mine is None:
         return []
@@ -45,7 +45,8 @@ def judged(compared: list[Row], seconds: float, kind: str) -> list[Row]:
     for measure in ("relMSE", "MSE"):
         name = f"{kind}{measure}"
         row[f"{name} / best path"] = mine[f"{name} / best path"]
-        row[f"{name} / best"] = mine[name] / min(other[name] for other in compared)
+        best = min(other[name] for other in compared)
+        row[f"{name} / best"] = mine[name] / best if best else float("nan")
     beside = [r for r in compared if str(r["method"]).startswith("path")]
     own = f"{kind}artefacts"
     row |= {own: mine[own], f"{own} of path": min(other[own] for other in beside)}
@@ -55,11 +56,15 @@ def judged(compared: list[Row], seconds: float, kind: str) -> list[Row]:
 
 
 def shares(rows: list[Row]) -> list[Row]:
-    """Of each ratio: the shares of rows within the `BOUNDS`, the geometric mean, the largest."""
+    """Of each ratio that is known anywhere: the shares of rows within the `BOUNDS`, the geometric
+    mean, the largest."""
     ratios = [name for name in rows[0] if " / best" in name] if rows else []
     found = []
     for name in ratios:
         values = np.array([row[name] for row in rows], float)
+        values = values[np.isfinite(values)]
+        if not values.size:
+            continue
         found.append(
             {
                 "ratio": name,

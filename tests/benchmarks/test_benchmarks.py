@@ -644,6 +644,23 @@ def test_whether_bdpm_auto_is_behind(tmp_path, module):
     assert found["MSE / best path"]["<= 1.3"] == np.mean(np.array(of_path) <= 1.3)
 
 
+def test_errors_below_the_noise_of_references_have_no_ratios(module):
+    """Where a few bright pixels are noisy in the references, all errors may come out as zero."""
+    choice = module("experiments.choice")
+    ratio = {"relMSE / best path": 0.5, "MSE / best path": math.nan}
+    row = {"scene": "s", "relMSE": 2.0, "MSE": 0.0, "artefacts": 0, **ratio}
+    compared = [
+        {**row, "method": "path", "relMSE": 4.0, "settings": ""},
+        {**row, "method": "bdpm_auto", "settings": "choice=bdpm because"},
+    ]
+    rows = choice.judged(compared, 5.0, "")
+    assert rows[0]["relMSE / best"] == 1 and math.isnan(rows[0]["MSE / best"])
+    assert [found["ratio"] for found in choice.shares(rows)] == [
+        "relMSE / best path",
+        "relMSE / best",
+    ]
+
+
 def test_random_rooms_are_the_same_each_time(module):
     rooms = module("common.rooms")
     assert rooms.room(3) == rooms.room(3) != rooms.room(4)
