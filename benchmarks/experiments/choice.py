@@ -7,6 +7,7 @@ import argparse
 
 import numpy as np
 
+from common.methods import PATH_TRACERS
 from common.rooms import write_rooms
 from common.rows import Row, save, show
 from common.scene_files import bundled
@@ -47,9 +48,10 @@ def judged(compared: list[Row], seconds: float, kind: str) -> list[Row]:
         row[f"{name} / best path"] = mine[f"{name} / best path"]
         best = min(other[name] for other in compared)
         row[f"{name} / best"] = mine[name] / best if best else float("nan")
-    beside = [r for r in compared if str(r["method"]).startswith("path")]
+    beside = [r for r in compared if str(r["method"]).partition(":")[0] in PATH_TRACERS]
     own = f"{kind}artefacts"
-    row |= {own: mine[own], f"{own} of path": min(other[own] for other in beside)}
+    of_path = min((other[own] for other in beside), default=float("nan"))
+    row |= {own: mine.get(own, float("nan")), f"{own} of path": of_path}
     best = min(compared, key=lambda other: other[f"{kind}relMSE"])
     chosen = str(mine["settings"]).partition("choice=")[2].partition(" ")[0]
     return [{**row, "chosen": chosen, "best": best["method"]}]

@@ -661,6 +661,17 @@ def test_errors_below_the_noise_of_references_have_no_ratios(module):
     ]
 
 
+def test_choice_counts_artefacts_beside_volpath_too(module):
+    choice = module("experiments.choice")
+    row = {"scene": "s", "relMSE": 2.0, "MSE": 1.0, "relMSE / best path": 0.5, "MSE / best path": 1}
+    volpath = {**row, "method": "volpath:sampler=multijitter", "settings": "", "artefacts": 0.1}
+    mine = {**row, "method": "bdpm_auto", "settings": "choice=bdpm because", "artefacts": 0.2}
+    assert choice.judged([volpath, mine], 5.0, "")[0]["artefacts of path"] == 0.1
+    # Without any of them they are counted nowhere.
+    alone = {name: value for name, value in mine.items() if name != "artefacts"}
+    assert math.isnan(choice.judged([alone], 5.0, "")[0]["artefacts of path"])
+
+
 def test_random_rooms_are_the_same_each_time(module):
     rooms = module("common.rooms")
     assert rooms.room(3) == rooms.room(3) != rooms.room(4)
