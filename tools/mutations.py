@@ -773,4 +773,11 @@ MUTATIONS = [
         "denoisers are told of the second of two hidden lamps",
         f"{DENOISING}::test_guides_do_not_show_what_is_hidden",
     ),
+    Mutation(
+        "paths/media.py",
+        "counts = shares_of_channels(mi.Spectrum(1) if throughput is None else throughput)",
+        "counts = shares_of_channels(mi.Spectrum(1))",
+        "all channels count alike in free flight, whatever a path has of them",
+        "tests/paths/test_media.py::test_many_flights_make_no_channel_bright",
+    ),
 ]

@@ -3,8 +3,11 @@ is left on the way between two points.
 
 Free flight is delta tracking (Woodcock et al. 1965) against a medium's majorant, the largest one of
 its channels: a tentative collision is null or real, with the mean probability over the channels, so
-that one density serves all of them and throughput carries the ratios (spectral tracking, Kutz et
-al. 2017; Mitsuba's `prbvolpath` does the same).
+that one density serves all of them and throughput carries the ratios. In the mean each channel
+counts by the throughput that it has (history-aware spectral tracking; Kutz et al. 2017, Spectral
+and decomposition tracking for rendering heterogeneous volumes). So no collision makes the sum over
+the channels larger, however many there are. With all channels alike, as in Mitsuba's `prbvolpath`,
+the ratios of hundreds of collisions in wax or milk multiply to bright dots of one colour.
 
 Index-matched boundaries (the BSDF `null`, and the share that others let pass straight on) end no
 segment: paths and connections go through them.
@@ -52,17 +55,26 @@ def section(medium, ray, active):
     return dr.select(inside, near, 0), dr.select(inside, far, 0), dr.select(inside, majorant, 0)
 
 
-def collision(medium, p, majorant, time, wavelengths, active, wi=None):
+def shares_of_channels(throughput):
+    """Throughput over its sum, a spectrum; all alike where there is none."""
+    throughput = dr.abs(throughput)
+    total = dr.sum(throughput)
+    alike = 1 / dr.size_v(type(throughput))
+    return dr.select(total > 1e-30, throughput * dr.rcp(dr.maximum(total, 1e-30)), alike)
+
+
+def collision(medium, p, majorant, time, wavelengths, active, wi=None, throughput=None):
     """At a tentative collision: `(null, real, probability)`, the spectra that a null collision and
-    a scattering multiply throughput with, and the probability of the former. With the probability's
-    mean over the spectrum, one density serves all channels (prbvolpath does the same)."""
+    a scattering multiply throughput with, and the probability of the former: a mean over the
+    channels, in which each counts by its `throughput` (``None``: all alike)."""
     sigma_s, _, sigma_t = medium.get_scattering_coefficients(
         point_in(medium, p, time, wavelengths, wi), active
     )
+    counts = shares_of_channels(mi.Spectrum(1) if throughput is None else throughput)
     share = sigma_t * dr.rcp(dr.maximum(majorant, 1e-30))
-    probability = dr.clip(1 - channel_mean(share), 0, 1)
+    total = dr.sum(counts * sigma_t)
+    probability = dr.clip(1 - dr.sum(counts * share), 0, 1)
     null = dr.select(probability > 0, (1 - share) * dr.rcp(dr.maximum(probability, 1e-30)), 0)
-    total = channel_mean(sigma_t)
     return null, dr.select(total > 0, sigma_s * dr.rcp(dr.maximum(total, 1e-30)), 0), probability
 
 
@@ -149,14 +161,14 @@ def transmittance(scene, traits, ray, medium, rng, active, through_emitters=Fals
 
 
 @dr.syntax
-def fly(scene, traits, ray, medium, draws, active, unseen=None, keep=None):
+def fly(scene, traits, ray, medium, draws, throughput, active, unseen=None, keep=None):
     """Moves rays through media and boundaries with the plain BSDF `null` (`unseen`: as of
     `beyond_boundary`) to where they scatter or meet another surface.
 
     `draws`: a `VertexNumbers` of this flight. Returns `(hit, ray, medium, scatters, weight)`: the
     surface (of those that scatter: none, at the distance of the collision), the ray that leads
-    there, the medium at its end, whether it scatters there, and what throughput is multiplied with:
-    albedo and null collisions.
+    there, the medium at its end, whether it scatters there, and what the `throughput` is multiplied
+    with: albedo and null collisions.
 
     `keep`, if given, is called as that of `pass_straight` for each piece of the way from one
     tentative collision to the next, with the weight so far in place of the share of light, which is
@@ -197,7 +209,14 @@ def fly(scene, traits, ray, medium, draws, active, unseen=None, keep=None):
             piece = inside & (majorant > 0) & (length > 0)
             keep(begin, medium, length, weight, normal, hit.t - start, piece)
         null, real, probability = collision(
-            medium, ray(t), majorant, ray.time, ray.wavelengths, collided, -ray.d
+            medium,
+            ray(t),
+            majorant,
+            ray.time,
+            ray.wavelengths,
+            collided,
+            -ray.d,
+            throughput * weight,
         )
         passes = mi.Bool(False)
         if dr.hint(traits.has_null_media, mode="scalar"):
@@ -318,7 +337,7 @@ def next_hit(scene, traits, ray, flight, numbers, throughput, active, unseen=Non
     """`fly`, for paths that carry `flight`: `(hit, ray, flight, throughput)`."""
     medium, number, _ = flight
     hit, ray, medium, scatters, weight = fly(
-        scene, traits, ray, medium, numbers.at(FLIGHT + number), active, unseen
+        scene, traits, ray, medium, numbers.at(FLIGHT + number), throughput, active, unseen
     )
     return hit, ray, [medium, number + 1, scatters], throughput * weight
 
@@ -334,13 +353,23 @@ def next_hit_straight_on(scene, traits, ray, flight, numbers, keep, active, unse
 
 
 def next_hit_either(
-    scene, traits, ray, flight, numbers, keep_flown, keep_straight, flies, active, unseen=None
+    scene,
+    traits,
+    ray,
+    flight,
+    numbers,
+    throughput,
+    keep_flown,
+    keep_straight,
+    flies,
+    active,
+    unseen=None,
 ):
     """As `next_hit` on the lanes `flies`, as `next_hit_straight_on` on the others, each with a
     `keep` of its own; in place of the throughput, its factor."""
     medium, number, _ = flight
     draws = numbers.at(FLIGHT + number)
-    flown = fly(scene, traits, ray, medium, draws, active & flies, unseen, keep_flown)
+    flown = fly(scene, traits, ray, medium, draws, throughput, active & flies, unseen, keep_flown)
     straight = pass_straight(
         scene, traits, ray, medium, draws, keep_straight, active & ~flies, unseen
     )
@@ -401,9 +430,10 @@ def phase_f_and_pdfs(sides, to_camera, to_light, active):
 
 
 def scattered_share(medium, p, wavelengths, active):
-    """`(sigma_s, albedo, extinction)` at points: scattering coefficient [1/m] (a spectrum), what
-    `collision` multiplies throughput with where a path scatters (a spectrum), and the extinction by
-    which paths fly, the channels' mean [1/m]."""
+    """`(sigma_s, albedo, extinction)` at points: scattering coefficient [1/m] (a spectrum), the
+    channels' mean of the extinction [1/m], and the former over the latter: what a scattering
+    multiplies throughput with where all channels have the same (`collision`). Weights need a
+    function of the path alone, so that it is these that they know of."""
     sigma_s, _, sigma_t = medium.get_scattering_coefficients(
         point_in(medium, p, mi.Float(0), wavelengths), active
     )
@@ -413,8 +443,7 @@ def scattered_share(medium, p, wavelengths, active):
 
 
 def albedo_mean(sides, active):
-    """Albedo at vertices in media (`vertex.Sides`): mean scattering over mean extinction, which is
-    the channels' mean of what `collision` multiplies throughput with where it scatters."""
+    """Albedo at vertices in media (`vertex.Sides`): mean scattering over mean extinction."""
     medium = dr.select(active, sides.above, dr.zeros(mi.MediumPtr))
     _, albedo, _ = scattered_share(medium, sides.p, sides.wavelengths, active)
     return channel_mean(albedo)

@@ -253,9 +253,18 @@ class QueryVisitor:
             flies = state["vertex"] < self.flights
             if self.queries.near_zone is not None:
                 flies &= state["vertex"] > 0
-            keeps = keep_short, keep
             hit, ray, flight, kept = next_hit_either(
-                self.scene, self.traits, ray, flight, numbers, *keeps, flies, active, unseen
+                self.scene,
+                self.traits,
+                ray,
+                flight,
+                numbers,
+                throughput,
+                keep_short,
+                keep,
+                flies,
+                active,
+                unseen,
             )
         else:
             hit, ray, flight, kept = next_hit_straight_on(

@@ -93,7 +93,7 @@ def incident_radiance(
         collided = inside & (majorant > 0) & (t < far)
         p = ray(t)
         null, real, probability = collision(
-            medium, p, majorant, ray.time, ray.wavelengths, collided
+            medium, p, majorant, ray.time, ray.wavelengths, collided, throughput=throughput
         )
         chance = dr.select(look, draws.next_float32(), rng.next_float32(collided & ~look))
         passes = collided & (chance < probability)

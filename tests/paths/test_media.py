@@ -33,7 +33,9 @@ def flown(scene, o, d, medium=None, seed=0):
     traits = SceneTraits(scene, scene.sensors()[0] if scene.sensors() else None)
     ray = mi.Ray3f(dr.zeros(mi.Point3f, COUNT) + mi.Point3f(*o), mi.Vector3f(*d))
     medium = dr.zeros(mi.MediumPtr, COUNT) if medium is None else medium
-    hit, ray, medium, scatters, weight = fly(scene, traits, ray, medium, draws(seed), True)
+    hit, ray, medium, scatters, weight = fly(
+        scene, traits, ray, medium, draws(seed), mi.Spectrum(1), True
+    )
     return np.array(ray(hit.t)), np.array(scatters), np.array(weight), medium
 
 
@@ -85,6 +87,33 @@ def test_free_flight_is_the_transmittance_of_each_channel(rgb, kind):
         # Crossing a boundary skips a few ten-thousandths.
         assert not differences(tracked, law, slack=1e-3)
         assert not differences(passed, law, slack=1e-3)
+
+
+def test_many_flights_make_no_channel_bright(rgb):
+    """Ten flights through a medium that absorbs nothing, whose channels scatter differently: the
+    sum of the channels' throughput stays what it was, and each channel's flights have its law."""
+    medium = coloured() | {"albedo": {"type": "rgb", "value": [1.0, 1.0, 1.0]}}
+    scene = mi.load_dict({"type": "scene", "cube": container(medium, 1000.0)})
+    traits = SceneTraits(scene)
+    sequence = SampleSequence(mi.UInt32(5), mi.UInt32(0), 1, False)
+    numbers = sequence.of_paths(dr.arange(mi.UInt32, COUNT))
+    ray = mi.Ray3f(dr.zeros(mi.Point3f, COUNT) + mi.Point3f(0, 0, 900), mi.Vector3f(0, 0, -1))
+    throughput = mi.Spectrum(dr.full(mi.Float, 1, COUNT))
+    inside = mi.MediumPtr(traits.media[0])
+    sigma = 2.5 * np.array([0.2, 0.4, 1.0])
+    for flight in range(10):
+        hit, ray, inside, scatters, weight = fly(
+            scene, traits, ray, inside, numbers.at(flight), throughput, True
+        )
+        assert np.array(scatters).all()
+        throughput *= weight
+        length = np.array(hit.t)
+        ray.o = ray(hit.t)
+        dr.eval(ray, inside, throughput)
+    np.testing.assert_allclose(np.array(throughput).sum(axis=0), 3, rtol=1e-3)
+    assert not differences(estimate(np.array(throughput)), Estimate.exact(np.ones((1, 3))))
+    law = Estimate.exact(1 / sigma[None])
+    assert not differences(estimate(np.array(throughput) * length), law)
 
 
 def test_flights_cross_boundaries(rgb):

@@ -296,7 +296,7 @@ def pieces_along(scene, o, d, scattered=False):
 
     none = dr.zeros(mi.MediumPtr, COUNT)
     if scattered:
-        hit, ray, _, _, kept = fly(scene, traits, ray, none, draws, True, keep=keep)
+        hit, ray, _, _, kept = fly(scene, traits, ray, none, draws, mi.Spectrum(1), True, keep=keep)
     else:
         hit, ray, _, kept = pass_straight(scene, traits, ray, none, draws, keep, True)
     dr.eval(hit, ray, kept, store.values, store.count)
