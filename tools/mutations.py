@@ -780,4 +780,18 @@ MUTATIONS = [
         "all channels count alike in free flight, whatever a path has of them",
         "tests/paths/test_media.py::test_many_flights_make_no_channel_bright",
     ),
+    Mutation(
+        "photons/beams.py",
+        "begins + ends - 1)",
+        "begins)",
+        "of two opposite walls one cuts a beam's disk",
+        f"{BEAMS}::test_coverage_is_the_share_of_a_disk_between_walls",
+    ),
+    Mutation(
+        "photons/queries.py",
+        'state["wall"] = dr.select(active, at.si.n, state["wall"])',
+        'state["wall"] = mi.Normal3f(0)',
+        "beams do not know of the wall that a path has left",
+        f"{MEDIA}::test_walls_do_not_darken_what_is_dense",
+    ),
 ]

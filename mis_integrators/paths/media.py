@@ -15,6 +15,8 @@ segment: paths and connections go through them.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import drjit as dr
 import mitsuba as mi
 
@@ -30,6 +32,26 @@ LONGEST = 1e18
 FLIGHT = 1 << 16
 """Where paths draw their numbers for free flights (`PathNumbers.at`): beyond those of vertices."""
 FLIGHT_SALT, SHADOW_SALT = 0x666C7900, 0x73686164
+
+
+@dataclass
+class Walls:
+    """The surfaces between which a piece of a ray lies: the one at which the ray has come into the
+    medium, and the one that it meets. Geometric normals, and distances along the ray from the
+    piece's beginning to what is `behind` and `ahead` (infinite: there is none)."""
+
+    normal_behind: mi.Normal3f
+    behind: mi.Float
+    normal_ahead: mi.Normal3f
+    ahead: mi.Float
+
+
+def walls_of(normal_behind, start, normal_ahead, distance):
+    """The `Walls` of a piece that begins at distance `start` on its ray, which leaves a surface
+    (a zero normal: none) and meets another one."""
+    leaves = dr.squared_norm(normal_behind) > 0
+    behind = dr.select(leaves, start, dr.inf)
+    return Walls(normal_behind, behind, normal_ahead, distance - start)
 
 
 def point_in(medium, p, time, wavelengths, wi=None):
@@ -161,7 +183,7 @@ def transmittance(scene, traits, ray, medium, rng, active, through_emitters=Fals
 
 
 @dr.syntax
-def fly(scene, traits, ray, medium, draws, throughput, active, unseen=None, keep=None):
+def fly(scene, traits, ray, medium, draws, throughput, active, unseen=None, keep=None, left=None):
     """Moves rays through media and boundaries with the plain BSDF `null` (`unseen`: as of
     `beyond_boundary`) to where they scatter or meet another surface.
 
@@ -173,7 +195,7 @@ def fly(scene, traits, ray, medium, draws, throughput, active, unseen=None, keep
     `keep`, if given, is called as that of `pass_straight` for each piece of the way from one
     tentative collision to the next, with the weight so far in place of the share of light, which is
     constant along the piece: flights that get as far as a point have that share as their mean
-    weight there.
+    weight there. `left`: as there.
     """
     ray = mi.Ray3f(ray)
     medium = mi.MediumPtr(medium)
@@ -185,6 +207,7 @@ def fly(scene, traits, ray, medium, draws, throughput, active, unseen=None, keep
     scatters = mi.Bool(False)
     passed = mi.Float(0)
     normal = None if keep is None else mi.Normal3f(0, 0, 1)
+    entered = None if keep is None else mi.Normal3f(0) if left is None else mi.Normal3f(left)
     fresh = mi.Bool(True)  # the next surface is not known yet
     while dr.hint(flying, label="free flight"):
         look = flying & fresh
@@ -207,7 +230,7 @@ def fly(scene, traits, ray, medium, draws, throughput, active, unseen=None, keep
             begin = mi.Ray3f(ray)
             begin.o = ray(start)
             piece = inside & (majorant > 0) & (length > 0)
-            keep(begin, medium, length, weight, normal, hit.t - start, piece)
+            keep(begin, medium, length, weight, walls_of(entered, start, normal, hit.t), piece)
         null, real, probability = collision(
             medium,
             ray(t),
@@ -231,6 +254,8 @@ def fly(scene, traits, ray, medium, draws, throughput, active, unseen=None, keep
         crosses, share, medium, ray.o = beyond_boundary(traits, hit, ray, medium, met, unseen)
         weight[crosses] = weight * share
         passed[crosses] = 0
+        if dr.hint(keep is not None, mode="scalar"):
+            entered[crosses] = normal
         fresh |= crosses
         flying &= passes | crosses
         flight, chance = rng.next_float32(flying), rng.next_float32(flying)
@@ -243,20 +268,21 @@ def fly(scene, traits, ray, medium, draws, throughput, active, unseen=None, keep
 
 
 @dr.syntax
-def pass_straight(scene, traits, ray, medium, draws, keep, active, unseen=None):
+def pass_straight(scene, traits, ray, medium, draws, keep, active, unseen=None, left=None):
     """Moves rays straight through media, and through boundaries with the plain BSDF `null`
     (`unseen`: as of `beyond_boundary`), to the surface that they meet: nothing scatters them on the
     way.
 
-    `draws`: a `VertexNumbers`. Returns `(hit, ray, medium, kept)`, as `fly` does, but for `kept`:
+    `draws`: a `VertexNumbers`; `left`: geometric normals of the surfaces that the rays leave, zero
+    for those that leave none (None: none does). Returns `(hit, ray, medium, kept)`, as `fly` does,
+    but for `kept`:
     the share of light that gets along; exact in homogeneous media, in others estimated by ratio
     tracking (Novak et al. 2014), whose tentative collisions cut the way into pieces. Where the
     share is faint, the way is cut, too, and goes on by roulette.
 
-    `keep(start, medium, length, kept, normal, surface, mask)` is called for each piece in a medium:
-    `start` is a ray from its beginning, `kept` the share there; `normal` is that of the surface
-    which the ray meets, `surface` the distance to it (infinite: none). Along a piece, the share
-    falls with the extinction of homogeneous media, and is constant in others.
+    `keep(start, medium, length, kept, walls, mask)` is called for each piece in a medium: `start`
+    is a ray from its beginning, `kept` the share there; `walls`: its `Walls`. Along a piece, the
+    share falls with the extinction of homogeneous media, and is constant in others.
     """
     ray = mi.Ray3f(ray)
     medium = mi.MediumPtr(medium)
@@ -266,6 +292,7 @@ def pass_straight(scene, traits, ray, medium, draws, keep, active, unseen=None):
     kept = mi.Spectrum(1)
     passed = mi.Float(0)
     normal = mi.Normal3f(0, 0, 1)
+    entered = mi.Normal3f(0) if left is None else mi.Normal3f(left)
     fresh = mi.Bool(True)  # the next surface is not known yet
     while dr.hint(going, label="straight on"):
         look = going & fresh
@@ -297,7 +324,7 @@ def pass_straight(scene, traits, ray, medium, draws, keep, active, unseen=None):
         t = dr.minimum(t, far)
         begin = mi.Ray3f(ray)
         begin.o = ray(start)
-        keep(begin, medium, t - start, kept, normal, hit.t - start, inside)
+        keep(begin, medium, t - start, kept, walls_of(entered, start, normal, hit.t), inside)
         kept[inside & ~grid] = kept * dr.exp(-sigma_t * (t - start))
         if dr.hint(traits.has_grids, mode="scalar"):
             collided = grid & cut
@@ -312,6 +339,7 @@ def pass_straight(scene, traits, ray, medium, draws, keep, active, unseen=None):
         crosses, share, medium, ray.o = beyond_boundary(traits, hit, ray, medium, met, unseen)
         kept[crosses] = kept * share
         passed[crosses] = 0
+        entered[crosses] = normal
         fresh |= crosses
 
         # ---- Roulette
@@ -342,12 +370,12 @@ def next_hit(scene, traits, ray, flight, numbers, throughput, active, unseen=Non
     return hit, ray, [medium, number + 1, scatters], throughput * weight
 
 
-def next_hit_straight_on(scene, traits, ray, flight, numbers, keep, active, unseen=None):
+def next_hit_straight_on(scene, traits, ray, flight, numbers, keep, active, unseen, left):
     """As `next_hit`, for paths that nothing in media scatters (`pass_straight`, with `keep`); in
     place of the throughput, the share of light that gets along."""
     medium, number, scatters = flight
     hit, ray, medium, kept = pass_straight(
-        scene, traits, ray, medium, numbers.at(FLIGHT + number), keep, active, unseen
+        scene, traits, ray, medium, numbers.at(FLIGHT + number), keep, active, unseen, left
     )
     return hit, ray, [medium, number + 1, scatters], kept
 
@@ -363,15 +391,18 @@ def next_hit_either(
     keep_straight,
     flies,
     active,
-    unseen=None,
+    unseen,
+    left,
 ):
     """As `next_hit` on the lanes `flies`, as `next_hit_straight_on` on the others, each with a
     `keep` of its own; in place of the throughput, its factor."""
     medium, number, _ = flight
     draws = numbers.at(FLIGHT + number)
-    flown = fly(scene, traits, ray, medium, draws, throughput, active & flies, unseen, keep_flown)
+    flown = fly(
+        scene, traits, ray, medium, draws, throughput, active & flies, unseen, keep_flown, left
+    )
     straight = pass_straight(
-        scene, traits, ray, medium, draws, keep_straight, active & ~flies, unseen
+        scene, traits, ray, medium, draws, keep_straight, active & ~flies, unseen, left
     )
     hit, ray, medium = (dr.select(flies, a, b) for a, b in zip(flown[:3], straight[:3]))
     _, _, _, scatters, weight = flown

@@ -35,14 +35,16 @@ FIRST = 1 << 30
 """Bit that says that the path has scattered smoothly nowhere before."""
 LEVEL_SHIFT = 27
 """Where under weights the three bits of the number of smooth vertices before begin."""
+LEAST_COVERAGE = 0.25
+"""Share of a disk that photons may lie in, at least: planes stand for walls, which may be bent."""
 SLACK = 2e-3
 """Cells that queries reach beyond the radius, for rounding."""
 
 
 def beam_layout():
     """Fields of a beam: its ray, `length`, the path's throughput at its beginning, the number of
-    the path, its depth in segments with this one (with `LONG` and `FIRST`), the medium, and the
-    surface that its ray meets: packed geometric `normal`, and distance (infinite: none)."""
+    the path, its depth in segments with this one (with `LONG` and `FIRST`), the medium, and its
+    `paths.media.Walls`, normals packed."""
     return Layout(
         {
             "o": mi.Point3f,
@@ -52,8 +54,10 @@ def beam_layout():
             "throughput": mi.Spectrum,
             "length": mi.Float,
             "medium": mi.MediumPtr,
-            "normal": mi.UInt32,
-            "surface": mi.Float,
+            "normal_behind": mi.UInt32,
+            "behind": mi.Float,
+            "normal_ahead": mi.UInt32,
+            "ahead": mi.Float,
         }
     )
 
@@ -70,9 +74,10 @@ def read_beams(words):
 
 @dataclass
 class Beams:
-    """Beams of a buffer (`new_beams`), one a lane: the fields of `beam_layout`, which are `active`,
-    `long` and `first`, under weights their `level`, and the `extinction` by which light falls along
-    them (zero for short ones and in heterogeneous media)."""
+    """Beams of a buffer (`new_beams`), one a lane: the fields of `beam_layout` (normals unpacked,
+    towards the beam), which are `active`, `long` and `first`, under weights their `level`, and the
+    `extinction` by which light falls along them (zero for short ones and in heterogeneous
+    media)."""
 
     o: mi.Point3f
     d: mi.Vector3f
@@ -81,8 +86,10 @@ class Beams:
     path: mi.UInt32
     depth: mi.UInt32
     medium: mi.MediumPtr
-    normal: mi.Vector3f
-    surface: mi.Float
+    normal_behind: mi.Vector3f
+    behind: mi.Float
+    normal_ahead: mi.Vector3f
+    ahead: mi.Float
     active: mi.Bool
     long: mi.Bool
     first: mi.Bool
@@ -101,11 +108,13 @@ class Beams:
         even = active & long & medium.is_homogeneous()
         _, _, sigma_t = medium.get_scattering_coefficients(at_start, even)
         extinction = dr.select(even, sigma_t, 0)
-        normal = dr.normalize(unpack_direction(record["normal"]))
-        normal = dr.mulsign(normal, -dr.dot(normal, record["d"]))
+        normals = {}
+        for name, towards in (("normal_behind", record["d"]), ("normal_ahead", -record["d"])):
+            normal = dr.normalize(unpack_direction(record[name]))
+            normals[name] = dr.mulsign(normal, dr.dot(normal, towards))
         level = (record["depth"] >> LEVEL_SHIFT) & 7
         record["depth"] &= (1 << LEVEL_SHIFT) - 1
-        record |= {"medium": medium, "normal": normal, "long": long, "first": first}
+        record |= {"medium": medium, **normals, "long": long, "first": first}
         record |= {"level": level, "extinction": extinction}
         return cls(**record, active=active, wavelengths=wavelengths)
 
@@ -114,11 +123,24 @@ class Beams:
         own = landing.medium == number_of_medium(self.medium)
         return own if all_kinds else own & (self.long | landing.caustic)
 
-    def before_surface(self, p):
-        """Whether points lie on the camera's side of the surface that ends the way: on that of its
-        tangent plane. Behind a thin wall there may be light that does not get through."""
-        height = dr.dot(p - self.o - self.d * self.surface, self.normal)
-        return ~dr.isfinite(self.surface) | (height > 0)
+    def between_walls(self, p):
+        """Whether points lie on the beam's side of the tangent planes of its walls. Behind a thin
+        wall there may be light that does not get through."""
+        begins = dr.dot(p - self.o + self.d * self.behind, self.normal_behind) > 0
+        ends = dr.dot(p - self.o - self.d * self.ahead, self.normal_ahead) > 0
+        return (~dr.isfinite(self.behind) | begins) & (~dr.isfinite(self.ahead) | ends)
+
+    def coverage(self, along, radius):
+        """Share of the disk of that radius across the beam, at a distance `along` it, that lies
+        `between_walls`: only there are photons. `LEAST_COVERAGE` at least."""
+        begins = _side(self.normal_behind, self.d, self.behind + along, radius)
+        ends = _side(self.normal_ahead, self.d, self.ahead - along, radius)
+        # Walls cut the same part of the disk, or opposite ones.
+        across = dr.dot(self.normal_behind, self.normal_ahead) - dr.dot(
+            self.normal_behind, self.d
+        ) * dr.dot(self.normal_ahead, self.d)
+        both = dr.select(across > 0, dr.minimum(begins, ends), begins + ends - 1)
+        return dr.maximum(both, LEAST_COVERAGE)
 
     def phase(self, p, towards, active):
         """The phase function [1/sr] at points `p`, for light from `towards` that goes on to the
@@ -126,6 +148,17 @@ class Beams:
         medium = dr.select(active, self.medium, dr.zeros(mi.MediumPtr))
         mei = point_in(medium, p, mi.Float(0), self.wavelengths, -self.d)
         return medium.phase_function().eval_pdf(mi.PhaseFunctionContext(None), mei, towards, active)
+
+
+def _side(normal, d, distance, radius):
+    """Share of a disk, across the direction `d` and so far from a plane along it, on the near side
+    of the plane: the disk's centre is `distance` |n.d| / |n x d| from the line that cuts it, and a
+    line at x radii from the centre cuts off (arccos x - x sqrt(1 - x^2)) / pi."""
+    cosine = dr.abs(dr.dot(normal, d))
+    sine = dr.safe_sqrt(1 - dr.square(cosine))
+    x = distance * cosine * dr.rcp(dr.maximum(sine, 1e-6) * radius)
+    x = dr.clip(dr.select(dr.isfinite(distance), x, 1), 0, 1)
+    return 1 - (dr.acos(x) - x * dr.safe_sqrt(1 - x * x)) * dr.inv_pi
 
 
 class BeamQuery(Query):
@@ -258,7 +291,8 @@ def gather_along(
     """Radiance that volume photons bring to camera paths along beams, for each radius of a list:
     the sum over photons of phase function x flux x transmittance to the beam's beginning, over
     (pi radius^2 x light sub-paths) (Jarosz et al. 2008, with a constant kernel). The radius is the
-    photon's own share of that of the list.
+    photon's own share of that of the list. Of a disk that walls cut, only what lies between them
+    counts (`Beams.coverage`).
 
     Parameters and result are those of `gather.gather_photons`, but for ``weigh(index, pdf,
     active)``: the weight (a number) of a photon to which camera paths would go on with density
@@ -275,7 +309,7 @@ def gather_along(
     sums = KernelSums(radii, beams.throughput, grey, marked)
 
     def visit(index, landing, offset, distance_squared, hit, totals):
-        hit &= beams.takes(landing, weigh is not None) & beams.before_surface(landing.p)
+        hit &= beams.takes(landing, weigh is not None) & beams.between_walls(landing.p)
         if near_zone is not None:
             hit &= ~seen | near_zone.holds(landing.p)
         if max_depth > 0:
@@ -289,7 +323,8 @@ def gather_along(
         value *= dr.exp(-beams.extinction * along)
         share = dr.square(landing.share)
         inside = [hit & (distance_squared < dr.square(radius) * share) for radius in radii]
-        return sums.add(totals, value / share, inside, beams, landing, delta_at_light)
+        own = [dr.rcp(beams.coverage(along, radius * landing.share)) for radius in radii]
+        return sums.add(totals, value / share, inside, beams, landing, delta_at_light, own)
 
     totals = visit_hits(query, visit, sums.zeros())
     return sums.estimates(totals, disk_area, light_path_count, beams.active)

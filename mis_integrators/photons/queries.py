@@ -172,8 +172,10 @@ class QueryVisitor:
     `times`, how many times light counts that is found there; `sums`, the state of `weights`;
     `history`, what `classes` carry along; `cone`, with the queries' `cones` the path's; `left`,
     where paths meet lights by chance, the place of the last smooth vertex, the cosine at which they
-    left it, and the mean throughput with which they did; and `clear`, in scenes with media, the
-    share of light that has got through these without being scattered. The last five are lists.
+    left it, and the mean throughput with which they did; and in scenes with media `clear`, the
+    share of light that has got through these without being scattered, and `wall`, the normal of the
+    surface that the path has left last, zero after a vertex in a medium. The last six are lists
+    where nothing is kept.
 
     In media, paths scatter until they have left `bdd` smooth vertices behind, and go straight on
     from there; where photons are asked for at points, until they have left one more behind. Where
@@ -237,6 +239,7 @@ class QueryVisitor:
             "cone": [] if self.queries.cones is None else self.queries.cones.begin(),
             "left": [mi.UInt32(0), one, one] if self.queries.meets_lights else [],
             "clear": [mi.Spectrum(1)] if self.traits.has_media else [],
+            "wall": mi.Normal3f(0) if self.traits.has_media else [],
         }
 
     def travel(self, state, ray, flight, numbers, throughput, path, depth, active, unseen):
@@ -265,10 +268,11 @@ class QueryVisitor:
                 flies,
                 active,
                 unseen,
+                state["wall"],
             )
         else:
             hit, ray, flight, kept = next_hit_straight_on(
-                self.scene, self.traits, ray, flight, numbers, keep, active, unseen
+                self.scene, self.traits, ray, flight, numbers, keep, active, unseen, state["wall"]
             )
         state = {**state, "clear": [state["clear"][0] * kept]}
         if self.queries.cones is not None:  # boundaries have been passed on the way
@@ -300,7 +304,7 @@ class QueryVisitor:
         if self.classes is not None:
             depth |= dr.select(state["history"][0] == 0, mi.UInt32(FIRST), 0)
 
-        def keep(start, medium, length, kept, normal, surface, mask):
+        def keep(start, medium, length, kept, walls, mask):
             if zone is not None:
                 length = dr.select(first, dr.minimum(length, zone.reach(start)), length)
                 mask = mask & (length > 0)
@@ -317,8 +321,10 @@ class QueryVisitor:
                 "path": path,
                 "depth": depth,
                 "medium": medium,
-                "normal": pack_direction(normal),
-                "surface": surface,
+                "normal_behind": pack_direction(walls.normal_behind),
+                "behind": walls.behind,
+                "normal_ahead": pack_direction(walls.normal_ahead),
+                "ahead": walls.ahead,
             }
             beam_layout().write(store.beams, beam, slot, mask)
             if stored:
@@ -508,6 +514,8 @@ class QueryVisitor:
             state["sums"] = self.weights.scatter(
                 state["sums"], at.si, self._scattering(at), bs, vertex, scattered
             )
+        if self.traits.has_media:
+            state["wall"] = dr.select(active, at.si.n, state["wall"])  # zero in media
         if state["history"]:
             state["history"] = scattered_history(state["history"], delta, active)
         beyond = dr.select(at.ends, mi.UInt32(self.bdd), vertex) + 1
@@ -523,7 +531,8 @@ class QueryVisitor:
         return state, weight, active
 
     def cross(self, before, after, crosses):
-        return selected(crosses, {**before, "cone": after["cone"]}, after)
+        passed = {"cone": after["cone"], "wall": after["wall"]}
+        return selected(crosses, {**before, **passed}, after)
 
     def alpha(self, state, visible):
         if not self.traits.has_media:

@@ -184,8 +184,10 @@ class JointPaths:
             "throughput": dr.select(self.valid, mi.Spectrum(1), 0),
             "length": 1.1 * hit.t,
             "medium": self.medium,
-            "normal": pack_direction(mi.Vector3f(0, 0, 1)),
-            "surface": mi.Float(dr.inf),
+            "normal_behind": pack_direction(mi.Vector3f(0, 0, 1)),
+            "behind": mi.Float(dr.inf),
+            "normal_ahead": pack_direction(mi.Vector3f(0, 0, 1)),
+            "ahead": mi.Float(dr.inf),
         }
         buffer = beam_layout().room(COUNT)
         beam_layout().write(buffer, beam, index)

@@ -71,8 +71,19 @@ def photon_map(points, flux, medium, radius, depth=1, caustic=False):
     return build_volume_map(place, power, count, mi.Float([radius]), len(points) + 3)
 
 
-def beams(o, d, length, medium, depth=1, normal=(0, 0, 1), surface=dr.inf, bits=LONG | FIRST):
-    """Beams (NumPy (m, 3), (m, 3), (m,)) in a medium, on rays that meet a surface."""
+def beams(
+    o,
+    d,
+    length,
+    medium,
+    depth=1,
+    normal=(0, 0, 1),
+    surface=dr.inf,
+    bits=LONG | FIRST,
+    behind=((0, 0, 1), dr.inf),
+):
+    """Beams (NumPy (m, 3), (m, 3), (m,)) in a medium, on rays that meet a surface, `behind` them
+    the normal of another one and the distance to it."""
     words = beam_layout().room(len(o))
     values = {
         "o": mi.Point3f(np.float32(o).T.copy()),
@@ -82,8 +93,10 @@ def beams(o, d, length, medium, depth=1, normal=(0, 0, 1), surface=dr.inf, bits=
         "throughput": mi.Spectrum(1),
         "length": mi.Float(np.float32(length)),
         "medium": mi.MediumPtr(medium),
-        "normal": pack_direction(mi.Vector3f(*map(float, normal))),
-        "surface": mi.Float(surface),
+        "normal_behind": pack_direction(mi.Vector3f(*map(float, behind[0]))),
+        "behind": mi.Float(behind[1]),
+        "normal_ahead": pack_direction(mi.Vector3f(*map(float, normal))),
+        "ahead": mi.Float(surface),
     }
     beam_layout().write(words, values, dr.arange(mi.UInt32, len(o)))
     return Beams.read(words, [])
@@ -175,6 +188,42 @@ def test_photons_of_another_medium_do_not_count(rgb):
         for medium in (first, second)
     )
     assert np.array(inside).max() > 0 and np.array(outside).max() == 0
+
+
+WALLS = {
+    "behind": ([0.9, 0.1, 0.3], 0.4, [0, 0, 1.0], np.inf),
+    "ahead": ([0, 0, 1.0], np.inf, [0.7, 0.0, -0.2], 0.3),
+    "on one side": ([0.9, 0.1, 0.3], 0.2, [0.9, 0.0, -0.2], 0.6),
+    "on both sides": ([0.9, 0.1, 0.2], 0.5, [-0.9, 0.0, -0.2], 1.2),
+    "straight": ([0, 0, 1.0], 0.05, [0, 0, -1.0], 0.5),
+}
+
+
+@pytest.mark.parametrize("walls", WALLS)
+def test_coverage_is_the_share_of_a_disk_between_walls(rgb, walls):
+    """Against a million points of the disk; walls that cut the same side count once, though their
+    lines differ a little."""
+    _scene, medium, _ = media()
+    behind, distance, ahead, surface = WALLS[walls]
+    behind, ahead = (np.array(n) / np.linalg.norm(n) for n in (behind, ahead))
+    o, d, length, radius = np.zeros((1, 3)), np.array([[0, 0, 1.0]]), np.array([3.0]), 0.8
+    those = beams(o, d, length, medium, 1, -ahead, surface, behind=(-behind, distance))
+    rng = np.random.default_rng(3)
+    disk = radius * np.sqrt(rng.random(10**6)), rng.uniform(0, 2 * np.pi, 10**6)
+    for along in (0.0, 0.1, 0.25):
+        points = np.stack(
+            [disk[0] * np.cos(disk[1]), disk[0] * np.sin(disk[1]), np.full(10**6, along)], axis=1
+        )
+        between = np.ones(10**6, bool)
+        if np.isfinite(distance):
+            between &= (points + [0, 0, distance]) @ behind > 0
+        if np.isfinite(surface):
+            between &= (points - [0, 0, surface]) @ ahead > 0
+        found = float(those.coverage(mi.Float(along), mi.Float(radius))[0])
+        slack = 0.03 if walls == "on one side" else 0.003
+        assert found == pytest.approx(max(between.mean(), 0.25), abs=slack)
+        counted = those.between_walls(mi.Point3f(*points.T.astype(np.float32)))
+        assert np.mean(np.array(counted) == between) > 0.9999
 
 
 @pytest.mark.parametrize("sign", [1, -1])
@@ -287,7 +336,7 @@ def pieces_along(scene, o, d, scattered=False):
     store.count = dr.zeros(mi.UInt32, 1)
     store.values = dr.zeros(mi.Float, 4 * room)
 
-    def keep(start, medium, length, kept, normal, surface, mask):
+    def keep(start, medium, length, kept, walls, mask):
         slot = dr.scatter_inc(store.count, mi.UInt32(0), mask)
         first = dr.dot(start.o - mi.Point3f(*o), mi.Vector3f(*d))
         path = mi.Float(dr.arange(mi.UInt32, COUNT))
