@@ -36,7 +36,7 @@ from .choice import (
 CAMERA, PHOTONS = "volpath_multiview", "bdpm"
 CANDIDATES = {CAMERA: {}, PHOTONS: {"bdd": 0}}
 """Plugins that may be chosen, and their parameters (see `choice.FOR_DENOISERS`)."""
-ENOUGH = 0.3
+ENOUGH = 0.05
 """Tuned: photons that a light sub-path leaves, on average, from which on a pilot is worth its time
 and knows their blur."""
 PATHS_AN_ITERATION = 4.0
