@@ -145,7 +145,7 @@ def _parser() -> argparse.ArgumentParser:
     _compares_with_references(command)
     command.add_argument(
         "--baseline",
-        type=_scene,
+        type=_file,
         metavar="FILE",
         help="figures of an earlier run (compare.json or benchmarks/history/*.json): print what "
         "became slower or noisier",
@@ -508,11 +508,15 @@ def _labels(methods: Sequence[Method]) -> str:
     return " ".join(method.label for method in methods)
 
 
+def _file(text: str) -> Path:
+    if not Path(text).is_file():
+        raise argparse.ArgumentTypeError(f"there is no file {text}")
+    return Path(text)
+
+
 def _scene(text: str) -> Path:
     """A scene file that can be loaded: else hours of measuring would end at it."""
-    path = Path(text)
-    if not path.is_file():
-        raise argparse.ArgumentTypeError(f"there is no file {text}")
+    path = _file(text)
     try:
         open_scene(path)
     except loading.SCENE_ERRORS as error:

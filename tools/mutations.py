@@ -789,8 +789,8 @@ MUTATIONS = [
     ),
     Mutation(
         "photons/queries.py",
-        'state["wall"] = dr.select(active, at.si.n, state["wall"])',
-        'state["wall"] = mi.Normal3f(0)',
+        'selected(active, [at.si.n], state["wall"])',
+        'selected(active, [mi.Normal3f(0)], state["wall"])',
         "beams do not know of the wall that a path has left",
         f"{MEDIA}::test_walls_do_not_darken_what_is_dense",
     ),

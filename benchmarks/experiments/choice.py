@@ -11,7 +11,7 @@ from common.methods import PATH_TRACERS
 from common.rooms import write_rooms
 from common.rows import Row, save, show
 from common.scene_files import bundled
-from experiments.compare import compare, measure_scene
+from experiments.compare import compare, measure_scene, over
 from report.results import BEHIND
 
 AUTO = "bdpm_auto"
@@ -38,7 +38,7 @@ def run(options: argparse.Namespace) -> None:
 def judged(compared: list[Row], seconds: float, kind: str) -> list[Row]:
     """One row for `bdpm_auto` among the rows of `compare`, if it could render the scene: its errors
     (of the images' `kind`) over those of the better `path` and of the best method, each measure by
-    itself. A ratio is not a number where the other error is below the noise of the references."""
+    itself."""
     mine = next((row for row in compared if row["method"] == AUTO), None)
     if mine is None:
         return []
@@ -46,8 +46,7 @@ def judged(compared: list[Row], seconds: float, kind: str) -> list[Row]:
     for measure in ("relMSE", "MSE"):
         name = f"{kind}{measure}"
         row[f"{name} / best path"] = mine[f"{name} / best path"]
-        best = min(other[name] for other in compared)
-        row[f"{name} / best"] = mine[name] / best if best else float("nan")
+        row[f"{name} / best"] = over(mine[name], min(other[name] for other in compared))
     beside = [r for r in compared if str(r["method"]).partition(":")[0] in PATH_TRACERS]
     own = f"{kind}artefacts"
     of_path = min((other[own] for other in beside), default=float("nan"))

@@ -167,8 +167,14 @@ def compare(measurement: Measurement) -> list[Row]:
         better = min((row[name] for row in paths if name in row), default=float("nan"))
         for row in rows:
             if name in row:
-                row[column] = row[name] / better if better else float("nan")
+                row[column] = over(row[name], better)
     return rows
+
+
+def over(error: float, other: float) -> float:
+    """The ratio of two errors: not a number where the other is below the noise of the
+    references."""
+    return error / other if other else float("nan")
 
 
 def _figures(measured: Measured, measurement: Measurement) -> dict[str, list[float]]:

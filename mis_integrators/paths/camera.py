@@ -197,6 +197,17 @@ class CameraVisitor(Protocol):
         """Coverage of the paths in the end; `visible`: as of `CameraArrival`."""
 
 
+def traveller(visitor, numbers, path, hide_emitters):
+    """`CameraVisitor.travel` of the sub-paths `path` with these `numbers`: a function of those that
+    are `visible` in place of `unseen`. (A mask kept for two calls would go through the loop.)"""
+
+    def travel(state, ray, flight, throughput, depth, active, visible):
+        unseen = ~visible if hide_emitters else None
+        return visitor.travel(state, ray, flight, numbers, throughput, path, depth, active, unseen)
+
+    return travel
+
+
 @dr.syntax
 def trace_camera(
     world: World,
@@ -224,17 +235,10 @@ def trace_camera(
         active &= False
 
     flight = begin_flights(traits, camera_pass.sensor.get_medium())
+    travel = traveller(visitor, numbers, path, hide_emitters)
     if dr.hint(traits.has_media, mode="scalar"):
-        state, hit, ray, flight, throughput = visitor.travel(
-            state,
-            ray,
-            flight,
-            numbers,
-            throughput,
-            path,
-            depth,
-            active,
-            ~visible if hide_emitters else None,
+        state, hit, ray, flight, throughput = travel(
+            state, ray, flight, throughput, depth, active, visible
         )
     else:
         hit = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
@@ -293,16 +297,8 @@ def trace_camera(
             rng, throughput, dr.max(throughput), eta, begun, active
         )
         if dr.hint(traits.has_media, mode="scalar"):
-            state, hit, ray, flight, throughput = visitor.travel(
-                state,
-                ray,
-                flight,
-                numbers,
-                throughput,
-                path,
-                depth,
-                active,
-                ~visible if hide_emitters else None,
+            state, hit, ray, flight, throughput = travel(
+                state, ray, flight, throughput, depth, active, visible
             )
         else:
             hit = scene.ray_intersect_preliminary(ray, coherent=False, active=active)

@@ -2,7 +2,7 @@
 is left on the way between two points.
 
 Free flight is delta tracking (Woodcock et al. 1965) against a medium's majorant, the largest one of
-its channels: a tentative collision is null or real, with the mean probability over the channels, so
+its channels: a tentative collision is null or real, with a mean probability over the channels, so
 that one density serves all of them and throughput carries the ratios. In the mean each channel
 counts by the throughput that it has (history-aware spectral tracking; Kutz et al. 2017, Spectral
 and decomposition tracking for rendering heterogeneous volumes). So no collision makes the sum over
@@ -207,7 +207,7 @@ def fly(scene, traits, ray, medium, draws, throughput, active, unseen=None, keep
     scatters = mi.Bool(False)
     passed = mi.Float(0)
     normal = None if keep is None else mi.Normal3f(0, 0, 1)
-    entered = None if keep is None else mi.Normal3f(0) if left is None else mi.Normal3f(left)
+    entered = None if keep is None else mi.Normal3f(0 if left is None else left)
     fresh = mi.Bool(True)  # the next surface is not known yet
     while dr.hint(flying, label="free flight"):
         look = flying & fresh
@@ -274,11 +274,10 @@ def pass_straight(scene, traits, ray, medium, draws, keep, active, unseen=None, 
     way.
 
     `draws`: a `VertexNumbers`; `left`: geometric normals of the surfaces that the rays leave, zero
-    for those that leave none (None: none does). Returns `(hit, ray, medium, kept)`, as `fly` does,
-    but for `kept`:
-    the share of light that gets along; exact in homogeneous media, in others estimated by ratio
-    tracking (Novak et al. 2014), whose tentative collisions cut the way into pieces. Where the
-    share is faint, the way is cut, too, and goes on by roulette.
+    for those that leave none (``None``: none does). Returns `(hit, ray, medium, kept)`, as `fly`
+    does, but for `kept`: the share of light that gets along; exact in homogeneous media, in others
+    estimated by ratio tracking (Novak et al. 2014), whose tentative collisions cut the way into
+    pieces. Where the share is faint, the way is cut, too, and goes on by roulette.
 
     `keep(start, medium, length, kept, walls, mask)` is called for each piece in a medium: `start`
     is a ray from its beginning, `kept` the share there; `walls`: its `Walls`. Along a piece, the
@@ -292,7 +291,7 @@ def pass_straight(scene, traits, ray, medium, draws, keep, active, unseen=None, 
     kept = mi.Spectrum(1)
     passed = mi.Float(0)
     normal = mi.Normal3f(0, 0, 1)
-    entered = mi.Normal3f(0) if left is None else mi.Normal3f(left)
+    entered = mi.Normal3f(0 if left is None else left)
     fresh = mi.Bool(True)  # the next surface is not known yet
     while dr.hint(going, label="straight on"):
         look = going & fresh
@@ -461,10 +460,10 @@ def phase_f_and_pdfs(sides, to_camera, to_light, active):
 
 
 def scattered_share(medium, p, wavelengths, active):
-    """`(sigma_s, albedo, extinction)` at points: scattering coefficient [1/m] (a spectrum), the
-    channels' mean of the extinction [1/m], and the former over the latter: what a scattering
-    multiplies throughput with where all channels have the same (`collision`). Weights need a
-    function of the path alone, so that it is these that they know of."""
+    """`(sigma_s, albedo, extinction)` at points: scattering coefficient [1/m] (a spectrum), that
+    over the extinction (a spectrum: what a scattering multiplies throughput with where all channels
+    have the same, see `collision`), and the extinction, the channels' mean [1/m]. Weights know of
+    these: they need a function of the path's vertices alone."""
     sigma_s, _, sigma_t = medium.get_scattering_coefficients(
         point_in(medium, p, mi.Float(0), wavelengths), active
     )

@@ -136,10 +136,8 @@ class Beams:
         begins = _side(self.normal_behind, self.d, self.behind + along, radius)
         ends = _side(self.normal_ahead, self.d, self.ahead - along, radius)
         # Walls cut the same part of the disk, or opposite ones.
-        across = dr.dot(self.normal_behind, self.normal_ahead) - dr.dot(
-            self.normal_behind, self.d
-        ) * dr.dot(self.normal_ahead, self.d)
-        both = dr.select(across > 0, dr.minimum(begins, ends), begins + ends - 1)
+        alike = dr.dot(dr.cross(self.normal_behind, self.d), dr.cross(self.normal_ahead, self.d))
+        both = dr.select(alike > 0, dr.minimum(begins, ends), begins + ends - 1)
         return dr.maximum(both, LEAST_COVERAGE)
 
     def phase(self, p, towards, active):

@@ -172,10 +172,10 @@ class QueryVisitor:
     `times`, how many times light counts that is found there; `sums`, the state of `weights`;
     `history`, what `classes` carry along; `cone`, with the queries' `cones` the path's; `left`,
     where paths meet lights by chance, the place of the last smooth vertex, the cosine at which they
-    left it, and the mean throughput with which they did; and in scenes with media `clear`, the
-    share of light that has got through these without being scattered, and `wall`, the normal of the
-    surface that the path has left last, zero after a vertex in a medium. The last six are lists
-    where nothing is kept.
+    left it, and the mean throughput with which they did; `clear`, in scenes with media, the share
+    of light that has got through these without being scattered; and `wall`, where beams are kept,
+    the normal of the surface that the path has left last, zero after a vertex in a medium. The last
+    six are lists.
 
     In media, paths scatter until they have left `bdd` smooth vertices behind, and go straight on
     from there; where photons are asked for at points, until they have left one more behind. Where
@@ -239,7 +239,7 @@ class QueryVisitor:
             "cone": [] if self.queries.cones is None else self.queries.cones.begin(),
             "left": [mi.UInt32(0), one, one] if self.queries.meets_lights else [],
             "clear": [mi.Spectrum(1)] if self.traits.has_media else [],
-            "wall": mi.Normal3f(0) if self.traits.has_media else [],
+            "wall": [mi.Normal3f(0)] if self.queries.beams else [],
         }
 
     def travel(self, state, ray, flight, numbers, throughput, path, depth, active, unseen):
@@ -248,6 +248,7 @@ class QueryVisitor:
             kept = numbers.at(BEAM + depth).next_float32() < BEAMS_KEPT
             brought = dr.select(depth == 0, throughput, dr.select(kept, throughput / BEAMS_KEPT, 0))
         begun = mi.Point3f(ray.o)
+        wall = state["wall"][0] if state["wall"] else None
         keep = self._keep_beams(state, brought, path, depth + 1, LONG)
         if self.flies:
             keep_short = None
@@ -268,11 +269,11 @@ class QueryVisitor:
                 flies,
                 active,
                 unseen,
-                state["wall"],
+                wall,
             )
         else:
             hit, ray, flight, kept = next_hit_straight_on(
-                self.scene, self.traits, ray, flight, numbers, keep, active, unseen, state["wall"]
+                self.scene, self.traits, ray, flight, numbers, keep, active, unseen, wall
             )
         state = {**state, "clear": [state["clear"][0] * kept]}
         if self.queries.cones is not None:  # boundaries have been passed on the way
@@ -514,8 +515,8 @@ class QueryVisitor:
             state["sums"] = self.weights.scatter(
                 state["sums"], at.si, self._scattering(at), bs, vertex, scattered
             )
-        if self.traits.has_media:
-            state["wall"] = dr.select(active, at.si.n, state["wall"])  # zero in media
+        if state["wall"]:
+            state["wall"] = selected(active, [at.si.n], state["wall"])  # zero in media
         if state["history"]:
             state["history"] = scattered_history(state["history"], delta, active)
         beyond = dr.select(at.ends, mi.UInt32(self.bdd), vertex) + 1

@@ -540,6 +540,13 @@ def test_a_scene_that_cannot_be_loaded_is_told_before_others_are_measured(module
     assert exit.value.code == 2 and bad in message and "intensty" in message
 
 
+def test_a_baseline_is_a_file_of_figures_and_no_scene(module, tmp_path):
+    figures = tmp_path / "compare.json"
+    figures.write_text("[]")
+    options = module("run")._parser().parse_args(["compare", "--baseline", str(figures)])
+    assert options.baseline == figures
+
+
 def test_comparisons_without_path_are_shown(module, capsys):
     """Artefacts are counted beside `path`: without it the table has no such column."""
     compare = module("experiments.compare")
