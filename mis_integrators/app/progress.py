@@ -2,6 +2,7 @@
 
 import contextlib
 import math
+import os
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -101,9 +102,16 @@ def tell(*parts: object) -> None:
 @contextlib.contextmanager
 def _nobody_may_listen() -> Iterator[None]:
     """Standard error may be closed, or a pipe whose reader has gone (which ends the process, if
-    rich has its way): a render goes on."""
-    with contextlib.suppress(OSError, ValueError, SystemExit):
+    rich has its way): a render goes on, without it."""
+    try:
         yield
+    except BlockingIOError:  # a slow reader
+        pass
+    except (OSError, ValueError, SystemExit):
+        # What is still in Python's buffer would fail again at the end, with exit code 120.
+        silent = contextlib.suppress(OSError, ValueError, AttributeError)  # none, or no file
+        with silent, open(os.devnull, "w") as nowhere:
+            os.dup2(nowhere.fileno(), sys.stderr.fileno())
 
 
 def _duration(seconds: float) -> str:

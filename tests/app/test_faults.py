@@ -562,8 +562,13 @@ def test_nobody_reads_standard_error(scene, tmp_path, plugin):
     reader, writer = os.pipe()
     os.close(reader)
     arguments = ["-D", "size=16", "-i", plugin, "--spp", 8, "--checkpoint", 100]
+    buffered = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
     process = subprocess.run(
-        command(scene, *arguments, "-o", tmp_path / "a.exr"), cwd=ROOT, stderr=writer, timeout=100
+        command(scene, *arguments, "-o", tmp_path / "a.exr"),
+        cwd=ROOT,
+        env=buffered,
+        stderr=writer,
+        timeout=100,
     )
     os.close(writer)
     assert process.returncode == 0 and read(tmp_path / "a.exr")[0]["spp"] == 8
