@@ -233,7 +233,7 @@ MUTATIONS = [
     ),
     # ------------------------------------------------------------------ lights
     Mutation(
-        "lights/lights.py",
+        "lights/kinds.py",
         "return dr.rcp(4 * dr.pi * dr.square(ds.dist))",
         "return dr.rcp(2 * dr.pi * dr.square(ds.dist))",
         "a point light is taken to shine into half of all directions",

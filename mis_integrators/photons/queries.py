@@ -11,10 +11,10 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.packing import Store, pack_direction
+from ..core.power_heuristic import mis_power
 from ..core.recording import lanes
 from ..core.records import Layout
 from ..core.spectra import channel_mean
-from ..lights.lights import mis_power
 from ..paths.camera import trace_camera, whole_or_nothing
 from ..paths.light_classes import class_of, scattered_history, start_of_camera_path
 from ..paths.media import direct_light, next_hit_either, next_hit_straight_on

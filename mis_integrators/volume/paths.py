@@ -5,8 +5,8 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from ..core.power_heuristic import mis_power
 from ..core.random import next_1d_and_2d
-from ..lights.lights import mis_power
 from ..paths.media import collision, point_in, section, transmittance
 from ..paths.roulette import russian_roulette
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from ..core.power_heuristic import mis_power
 from ..core.random import next_1d_and_2d, streams
-from ..lights.lights import mis_power
 from ..paths.media import point_in
 from .paths import direct_light, incident_radiance
 from .pivots import IN_MEDIUM, LATER, NOWHERE, ON_SURFACE, OWN, PIVOT, pivot_surface

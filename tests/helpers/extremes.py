@@ -117,7 +117,8 @@ class Room:
 
 
 def integrator(method, **parameters):
-    """A single strategy, or full weights."""
+    """A single strategy as it is mixed (its photons are gathered on narrow lobes, too), or full
+    weights."""
     plugin, _, bdd = method.partition(":")
     if bdd:
         parameters = {
@@ -125,7 +126,8 @@ def integrator(method, **parameters):
             for name, value in parameters.items()
             if name not in ("frozen_photons", "mix_diffuse")
         }
-        return mi.load_dict({"type": plugin, "max_depth": DEPTH, "bdd": int(bdd), **parameters})
+        single = {"type": plugin, "bdd": int(bdd), "pass_narrow": False}
+        return mi.load_dict({**single, "max_depth": DEPTH, **parameters})
     return mi.load_dict(
         {
             "type": plugin,

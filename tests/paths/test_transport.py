@@ -2,13 +2,15 @@
 sampling claims to have."""
 
 from mis_integrators.core import packing
+from mis_integrators.core.power_heuristic import mis_power
 from mis_integrators.core.random import mix, next_2d, streams
+from mis_integrators.lights.emitter_choice import mean_power
 from mis_integrators.lights.environment_guide import (
     EnvironmentGuide,
     cell_direction,
     direction_cell,
 )
-from mis_integrators.lights.lights import Lights, _mean_power, mis_power
+from mis_integrators.lights.lights import Lights
 from mis_integrators.photons import grid as photon_map
 from mis_integrators.photons.photon import read_power
 
@@ -460,7 +462,7 @@ def test_small_spots_of_light_are_not_taken_for_darkness():
     }
     scene = mi.load_dict({"type": "scene", "lamp": lamp})
     emitter = scene.emitters()[0]
-    assert _mean_power(emitter) == 0, "test too weak"
+    assert mean_power(emitter) == 0, "test too weak"
     lights, _, flux = emission(scene, 1 << 21)
     assert not lights.dark
     mean, error = mean_and_error(flux)
