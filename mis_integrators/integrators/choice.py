@@ -2,16 +2,18 @@
 
 Both are judged on the same few thousand pixels. Their errors after n iterations are the squared
 bias (the blur of the photons' disks) plus the variance over n (`pilot.radius`); n follows from what
-an iteration costs (`costs`). There are two measures of error, relative and absolute
-(`pilot.noise`), and what has the least product of both renders: the other would lose more in one
-of them than it wins in the other.
+an iteration costs: its seconds in a render of a given time, else counted events (`costs`). There
+are two measures of error, relative and absolute (`pilot.noise`), and what has the least product of
+both renders: the other would lose more in one of them than it wins in the other.
 """
 
 from __future__ import annotations
 
 import math
+import time
 from dataclasses import dataclass, field
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -19,6 +21,7 @@ from ..core.recording import lanes
 from ..core.spectra import channel_mean
 from ..core.stratified_variance import contrasts, extrapolated
 from ..core.traits import UnsupportedScene
+from ..paths.camera import film_sample_count
 from ..paths.layers import written
 from ..paths.path_length_statistics import mean_segments
 from ..pilot.noise import MEASURES, trimmed_mean
@@ -39,9 +42,6 @@ TRIAL_INDEX = 1 << 28
 UNSEEN = 1e-3
 """Tuned: share of the light, brought by caustics, from which on camera paths that cannot see them
 are out of the question."""
-RARE = 0.02
-"""Tuned: the same for camera paths that meet them by chance only: so seldom that a pilot does not
-see how noisy they are."""
 
 
 @dataclass
@@ -68,10 +68,10 @@ class Trial:
     parts: dict[str, tuple[float, float]]
     """By measure: squared bias, and variance of one iteration."""
     cost: float
-    """Of one iteration, a pixel; 1 where nothing else is tried."""
+    """Of one iteration: its seconds, or a pixel's segments; 1 where nothing else is tried."""
 
     def errors(self, budget):
-        """Mean squared errors, by measure, when the cost a pixel is `budget`."""
+        """Mean squared errors, by measure, when the cost is `budget`."""
         return {
             measure: squared_bias + variance * self.cost / budget
             for measure, (squared_bias, variance) in self.parts.items()
@@ -112,6 +112,8 @@ def choose(integrator, scene, sensor, seed, iterations, seconds):
     if not photons.kinds():
         return Decision(*alone, [f"{alone[0]}: {no_photons(integrator, photons)}"])
     photons.plan_time(seconds)
+    if photons.has_caustics and not integrator.kept_classes and not camera_paths_are_blind(photons):
+        photons.judge_chance()
     photons.predict()
     prediction = photons.prediction
     if prediction is None:
@@ -122,24 +124,22 @@ def choose(integrator, scene, sensor, seed, iterations, seconds):
     if integrator.kept_classes:
         excluded = f"not {CAMERA}: it does not split the light"
     else:
-        excluded = why_not_camera_paths(CAMERA, photons, prediction)
+        excluded = why_blind(CAMERA, photons, prediction)
     if excluded:
         return decide([trial_of_photons(PHOTONS, photons, 1.0)], [excluded], planned, 1.0)
 
-    pixels = prediction.pixels
-    segments = mean_segments(
-        scene,
-        sensor,
-        seed,
-        pixels.stride,
-        pixels.count,
-        integrator.max_depth,
-        integrator.rr_depth,
-    )
-    mapper = _try_photons(photons, segments)
-    budget = planned * mapper.cost
-    trials = [_try_path(path, segments, pixels, prediction.mean, budget), mapper]
-    return decide(trials, [], budget, mapper.cost)
+    if seconds:
+        usual = photons.expected_seconds
+        values, cost = _clocked_samples(path, prediction.pixels)
+    else:
+        usual, cost = _counted_costs(path, photons)
+        values = _samples(path, prediction.pixels, 0)
+    budget = planned * usual
+    trials = [
+        _trial_of_path(path, values, prediction, budget, cost),
+        trial_of_photons(PHOTONS, photons, usual),
+    ]
+    return decide(trials, [], budget, usual)
 
 
 def decide(trials, reasons, budget, usual):
@@ -196,24 +196,13 @@ def camera_paths_are_blind(session):
     return session.has_caustics and session.traits.has_unmet_lights
 
 
-def why_not_camera_paths(plugin, session, prediction):
-    """Why a `plugin` of camera paths alone is not tried, in one line; `None` if it is."""
-    if not session.has_caustics:
-        return None
-    share = f"{prediction.caustic_share:.1%} of the light"
-    if camera_paths_are_blind(session):
-        if prediction.caustic_share > UNSEEN:
-            return f"not {plugin}: it cannot see the caustics, {share}"
-    elif prediction.caustic_share > RARE:
-        return f"not {plugin}: it would meet the caustics, {share}, by chance only"
+def why_blind(plugin, session, prediction):
+    """Why a `plugin` of camera paths alone is not tried that cannot see all of the light, in one
+    line; `None` if it sees nearly all."""
+    if camera_paths_are_blind(session) and prediction.caustic_share > UNSEEN:
+        share = f"{prediction.caustic_share:.1%} of the light"
+        return f"not {plugin}: it cannot see the caustics, {share}"
     return None
-
-
-def _try_photons(session, segments):
-    gathered, paths = session.prediction.gathered, session.camera_paths
-    counted = costs.events(session, segments, session.last_vertex, gathered, paths)
-    cost = costs.cost(PHOTONS, counted) + costs.of_direct_paths(session, segments)
-    return trial_of_photons(PHOTONS, session, cost)
 
 
 def trial_of_photons(plugin, session, cost):
@@ -223,28 +212,73 @@ def trial_of_photons(plugin, session, cost):
     return Trial(plugin, session, parts, cost)
 
 
-def _try_path(path, segments, pixels, mean, budget):
-    """`path` on the pilot's pixels, for a render of this `budget`."""
+def _counted_costs(path, photons):
+    """Costs of an iteration of photons and of a sample of `path`, in segments of the latter."""
+    pixels, integrator = photons.prediction.pixels, path.integrator
+    segments = mean_segments(
+        path.scene,
+        path.sensor,
+        path.seed,
+        pixels.stride,
+        pixels.count,
+        integrator.max_depth,
+        integrator.rr_depth,
+    )
+    gathered, paths = photons.prediction.gathered, photons.camera_paths
+    counted = costs.events(photons, segments, photons.last_vertex, gathered, paths)
+    usual = costs.cost(PHOTONS, counted) + costs.of_direct_paths(photons, segments)
+    return usual, costs.cost(CAMERA, costs.events(path, segments, None, 0.0))
+
+
+def _clocked_samples(path, pixels):
+    """Samples of the pilot's pixels, as of `_samples`, and the seconds that one sample of each of
+    the film's takes: those of the second half, whose kernels are compiled."""
+    first = _samples(path, pixels, 0)
+    clock = []
+    second = _samples(path, pixels, PATH_TRIALS, clock)
+    seconds = sum(clock) / second.size * film_sample_count(path.sensor)
+    return np.concatenate([first, second]), seconds
+
+
+def _samples(path, pixels, first, clock=None):
+    """`PATH_TRIALS` samples of each of the pilot's pixels, from number `first` on: radiance, mean
+    over the channels, (samples, pixels). `clock`: a list, for the seconds that they take."""
     passes = (
         PATH_TRIALS if mi.is_spectral else 1
     )  # wavelengths are shared by all that is traced at once
     at_once = PATH_TRIALS // passes
     count, stride = pixels.count, pixels.stride * path.camera_paths
     trial = lanes(at_once * count) // count
+    back = trial * (-count * stride % 2**32)  # to the first pixel
     values = []
-    first = trial * (-count * stride % 2**32)  # back to the first pixel
-    for number in range(passes):
+    for number in range(first, first + passes):
         spectral = path._spectral(TRIAL_INDEX + number)
         radiance, *_ = path.trace(
-            TRIAL_INDEX, first, stride, at_once * count, spectral, trial + number
+            TRIAL_INDEX,
+            back,
+            stride,
+            at_once * count,
+            spectral,
+            trial + dr.opaque(mi.UInt32, number),  # one kernel for all
         )
-        values += list(
-            np.broadcast_to(np.array(channel_mean(radiance)), at_once * count).reshape(
-                at_once, count
-            )
-        )
-    cost = costs.cost(CAMERA, costs.events(path, segments, None, 0.0))
-    parts = parts_of_samples(path, np.array(values), mean, budget / cost, 1 / path.camera_paths)
+        value = channel_mean(radiance) + dr.zeros(mi.Float, at_once * count)
+        start = time.perf_counter()
+        dr.eval(value)
+        dr.sync_thread()
+        if clock is not None:
+            clock.append(time.perf_counter() - start)
+        values.append(np.array(value).reshape(at_once, count))
+    return np.concatenate(values)
+
+
+def _trial_of_path(path, values, prediction, budget, cost):
+    """`path`, by the `values` of samples that `cost` so much, for a render of this `budget`. How
+    noisy caustics are that it meets by chance, photons tell: its few samples may have met none."""
+    share = 1 / path.camera_paths
+    parts = parts_of_samples(path, values, prediction.mean, budget / cost, share)
+    for measure, chance in prediction.chance.items():
+        squared_bias, variance = parts[measure]
+        parts[measure] = squared_bias, max(variance, share * chance)
     return Trial(CAMERA, path, parts, cost * path.camera_paths)
 
 

@@ -30,7 +30,7 @@ from .choice import (
     own_parameters,
     parts_of_samples,
     trial_of_photons,
-    why_not_camera_paths,
+    why_blind,
 )
 
 CAMERA, PHOTONS = "volpath_multiview", "bdpm"
@@ -39,6 +39,9 @@ CANDIDATES = {CAMERA: {}, PHOTONS: {"bdd": 0}}
 ENOUGH = 0.05
 """Tuned: photons that a light sub-path leaves, on average, from which on a pilot is worth its time
 and knows their blur."""
+RARE = 0.02
+"""Tuned: share of the light, brought by caustics that camera paths meet by chance, from which on
+they are out of the question: so seldom that a pilot does not see how noisy they are."""
 PATHS_AN_ITERATION = 4.0
 """Tuned: camera paths that cost as much as an iteration of photons, for each that it has itself.
 1.5 to 4.5 were measured, and 1.8 to 4.5 for a denoiser. The most counts: where both are close,
@@ -104,9 +107,12 @@ def _judged(camera, photons, iterations, seconds):
     prediction, cost = photons.prediction, PATHS_AN_ITERATION * photons.camera_paths
     budget = cost * (prediction.iterations if seconds else iterations or UNPLANNED_ITERATIONS)
     trials, reasons = [trial_of_photons(PHOTONS, photons, cost)], []
-    blind = why_not_camera_paths(CAMERA, photons, prediction)
-    if blind:
-        reasons.append(blind)
+    reason = why_blind(CAMERA, photons, prediction)
+    if reason is None and photons.has_caustics and prediction.caustic_share > RARE:
+        share = f"{prediction.caustic_share:.1%} of the light"
+        reason = f"not {CAMERA}: it would meet the caustics, {share}, by chance only"
+    if reason:
+        reasons.append(reason)
     else:
         left = LEFT if photons.integrator.denoised else 1
         trials.insert(0, _trial_of_camera_paths(camera, prediction, budget, left))

@@ -11,13 +11,14 @@ import mitsuba as mi
 from ..core.film import splat_light, splat_samples
 from ..core.packing import with_reserve
 from ..core.traits import lookup
-from ..mis.chance import ChanceWeights, StartDensity
+from ..mis.chance import ChanceWeights, StartDensity, second_moment
 from ..paths.light_classes import LightClasses, by_class_of_photons
 from ..paths.sensor import Lens
 from ..photons.beams import Beams, gather_along, mean_count_along, read_beams
 from ..photons.coverage import covered_share
 from ..photons.gather import QueryVertices, gather_photons, mean_photon_count
 from ..photons.grid import PhotonMap, build_photon_map
+from ..photons.hits import meets_one_light
 from ..photons.queries import (
     Queries,
     pixel_disk,
@@ -29,6 +30,7 @@ from ..photons.sensor_light import join_photons
 from ..photons.tiers import LEFT_TO_DENOISER, TieredMap, build_tiered_map, gather_tiers
 from ..photons.trace import trace_light_paths
 from ..photons.volume import VolumeMap, build_volume_map
+from ..pilot.radius import middle_index
 from .piloted import PilotedSession
 from .purposes import LIGHT, SENSOR
 
@@ -41,8 +43,16 @@ class PhotonPasses(PilotedSession):
     for photons, vertices and beams. Passes are recorded with the room that they have, and anew
     where that grows."""
 
+    judges_chance = False
+    """Whether photons carry what tells how noisy camera paths are that meet their light by chance
+    (`gather_and_judge`)."""
     points = False
     """Whether volume photons are gathered at vertices in media, and not along beams."""
+
+    def judge_chance(self):
+        """Before a pilot: asks it for the noise of camera paths that meet caustics by chance."""
+        self.judges_chance = self.traits.has_light_surfaces and meets_one_light(self.scene)
+        self._freeze()
 
     # ------------------------------------------------------------------ room
 
@@ -148,7 +158,7 @@ class PhotonPasses(PilotedSession):
 
     def _light_state(self, spectral):
         """What photons carry for the weights; None where there are none."""
-        return StartDensity(self.lights) if self.by_chance else None
+        return StartDensity(self.lights) if self.by_chance or self.judges_chance else None
 
     def _merge_state(self, spectral):
         """The weights of camera paths (a `mis.state.MergeState`); None where there are none."""
@@ -260,6 +270,32 @@ class PhotonPasses(PilotedSession):
             )
         return found if chance is None else chance.with_hits(found, radii, grey)
 
+    def gather_and_judge(self, photons, vertices, radii, spectral):
+        """The second moment of one camera path that goes on from a vertex and meets the light of
+        caustic photons by chance, by those within the middle radius; then what these bring for each
+        radius, mean over the channels."""
+        photon_map = build_photon_map(
+            *photons[:3],
+            self.traits.bounds,
+            radii[-1],
+            self.photon_capacity,
+            "caustic",
+            photons[3],
+        )
+        record = read_queries(vertices)
+        takes = takes_photons(record, "caustic")
+        asking = QueryVertices(self.traits, record, spectral["wavelengths"], takes)
+        moment = second_moment(self.lights, photon_map, asking)
+        return gather_photons(
+            photon_map,
+            asking,
+            [radii[middle_index(radii)], *radii],
+            self._light_paths,
+            self.integrator.max_depth,
+            lambda *photon: [moment(*photon)] + [1] * len(radii),
+            grey=True,
+        )
+
     @property
     def _tiers_left(self):
         """The last tier whose photons have the radius of the first, see `build_tiered_map`."""
@@ -315,7 +351,9 @@ class PhotonPasses(PilotedSession):
                 return build_volume_map(
                     *in_media[:3], radius, self.volume_capacity, *in_media[3:], density=density
                 )
-        weighted = kind != "indirect" if self.by_chance else kind == "indirect"
+        weighted = kind == "indirect" and not self.judges_chance
+        if self.by_chance:
+            weighted = kind != "indirect"
         mis_words = photons[3] if weighted and len(photons) > 3 else None
         return build_photon_map(
             *photons[:3],

@@ -60,19 +60,19 @@ class SubsetPasses:
     def _record_gather(self):
         session = self.session
         self.photon_capacity = session.photon_capacity, session.volume_capacity
-        self._gather = session.recorded(
-            lambda scene, tables, photons, density, vertices, radii, spectral: {
-                kind: session._gather(
-                    session._map(photons, kind, radii[kind][-1], density),
-                    vertices,
-                    kind,
-                    radii[kind],
-                    spectral,
-                    grey=True,
-                )
-                for kind in radii
-            }
-        )
+
+        def gather(scene, tables, photons, density, vertices, radii, spectral):
+            gathered = {}
+            for kind, ladder in radii.items():
+                if kind == "caustic" and session.judges_chance:
+                    found = session.gather_and_judge(photons, vertices, ladder, spectral)
+                else:
+                    photon_map = session._map(photons, kind, ladder[-1], density)
+                    found = session._gather(photon_map, vertices, kind, ladder, spectral, grey=True)
+                gathered[kind] = found
+            return gathered
+
+        self._gather = session.recorded(gather)
 
     def _joined_light(self, scene, sensor, tables, in_media, seed, spectral):
         """Light of volume photons joined with the sensor, mean over the channels, one a pixel."""
@@ -125,6 +125,12 @@ class SubsetPasses:
         gathered = self._gather(
             session.scene, session._tables, photons, self.density, vertices, radii, spectral
         )
+        self.moment = None
+        if "caustic" in gathered and session.judges_chance:
+            moment, *gathered["caustic"] = gathered["caustic"]
+            self.moment = self.by_pixel(
+                session._per_path(moment, vertices, "caustic", self.pixels.paths)
+            )
         for kind, values in gathered.items():
             for corrected in self.setting.corrections(kind):
                 if corrected:
@@ -197,6 +203,9 @@ class SubsetIteration(NamedTuple):
 
     def gather(self, radii):
         return self.passes.gather(self.photons, self.vertices, radii, self.seed, self.spectral)
+
+    def chance(self):
+        return self.passes.moment
 
     def joined(self):
         return self.passes.joined(self.number, self.photons, self.spectral)

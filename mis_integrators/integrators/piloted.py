@@ -39,6 +39,7 @@ class PilotedSession(IterativeSession):
         self.light_share = 1.0  # of the light sub-paths, those that an iteration has
         self.prediction = None  # a `Prediction`, where a pilot has chosen
         self.iteration_seconds = math.inf  # what one takes, where that is measured
+        self.expected_seconds = math.inf  # what one will take, by the pilot
         self._untimed = None  # arguments of `_choose_by_clock`, until it is called
         self.kept = {}  # iterations that were rendered to measure their time, by number
 
@@ -132,6 +133,7 @@ class PilotedSession(IterativeSession):
         else:
             guess = LIKE_A_PILOT * pilot.seconds * pilot.setting.light_paths
             first = pilot.choose(self._left(begun, guess) / guess)
+            self.expected_seconds = guess * pilot.cost(first)
             self._take(first)
             self._untimed = pilot, first, guess, begun
 

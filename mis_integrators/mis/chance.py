@@ -9,6 +9,9 @@ photons per solid angle in the vertex' merge disk. One camera path goes there wi
 the BSDF. With x = N pi r^2 D cos / p, photons have the weight x / (1 + x), and lights that are met
 1 / (1 + x).
 
+Photons that carry D also tell how noisy camera paths alone would be there, which a few of them
+cannot: see `second_moment`.
+
 Left out are roulette, transmittance of media, the choices at delta surfaces (taken as alike from
 both sides), and that etendue changes with the squared index of refraction. Weights are functions of
 the path all the same.
@@ -24,8 +27,9 @@ from ..core.spectra import channel_mean
 from ..lights.lights import NEVER_MET
 from ..paths.light_classes import CAUSTIC, CLASSES
 from ..paths.light_starts import light_seen_from
-from ..photons.hits import density_ratio
+from ..photons.hits import SMALLEST_PDF, density_ratio
 from ..photons.kernel_sums import disk_area
+from ..photons.photon import read_power
 from ..weights.heuristics import bounded_power, weight
 
 
@@ -67,6 +71,27 @@ class StartDensity:
         """D of photons of a map."""
         place = photon_map.place_of_mis_words(index, active)
         return self.layout.read(photon_map.mis_words, place, active)["density"]
+
+
+def second_moment(lights, photon_map, vertices):
+    """What multiplies what caustic photons of a map bring to `vertices`, so that the sum is the
+    second moment of one camera path that goes on there and meets their light (`weigh` of
+    `gather_photons`).
+
+    Such a path brings f L cos / p, with density p. So the moment is the integral of f L cos times
+    f L cos / p: photons sample the first factor, and their radiance is flux times D.
+    """
+    carried = StartDensity(lights)
+
+    def weigh(index, landing, scattering, active):
+        flux, _ = read_power(photon_map.power, index, active)
+        density = carried.read(photon_map, index, active)
+        active = active & (density < NEVER_MET)
+        pdf = dr.maximum(scattering.p * scattering.shading, SMALLEST_PDF)
+        light = channel_mean(vertices.factor * scattering.value) * channel_mean(flux) * density
+        return dr.select(active, light * dr.rcp(pdf), 0)
+
+    return weigh
 
 
 class ChanceWeights:

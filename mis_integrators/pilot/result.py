@@ -38,6 +38,9 @@ class PilotSamples(NamedTuple):
     joined: np.ndarray | None = None
     """Light of photons that are joined with the sensor, (iterations, groups, pixels); None where
     none are."""
+    chance: np.ndarray | None = None
+    """Second moment of one camera path that meets the light of caustic photons by chance,
+    (iterations, groups, pixels); None where nobody asks."""
 
 
 class PredictedError(NamedTuple):
@@ -70,6 +73,9 @@ class Prediction(NamedTuple):
     """Those of the pilot."""
     caustic_share: float
     """Share of the light that caustic photons bring."""
+    chance: dict[str, float]
+    """By measure: the error of one camera path by the light of caustic photons, which it meets by
+    chance; empty where nobody asks."""
 
 
 @dataclass(frozen=True)
@@ -107,6 +113,8 @@ class PilotResult:
     photon_light: float
     """What photons bring to a pixel, on average."""
     caustic_share: float
+    chance: dict[str, float]
+    """As of `Prediction`."""
 
     def choose(self, count: float, kept: Choice | None = None, reluctance: float = 0.0) -> Choice:
         """The choice with the least product of the predicted errors, see `_measures`.
@@ -213,6 +221,7 @@ class PilotResult:
             self.mean,
             self.pixels,
             self.caustic_share,
+            self.chance,
         )
 
     def gathered(self, kind: str, radius: Radii, share: float) -> Radii:
@@ -248,7 +257,7 @@ def measure(
     that gathers."""
     if samples is None:
         nothing = np.zeros(pixels.count)
-        return PilotResult(setting, pixels, seconds, {}, {}, {}, {}, nothing, 0.0, 0.0)
+        return PilotResult(setting, pixels, seconds, {}, {}, {}, {}, nothing, 0.0, 0.0, {})
     middle = {
         kind: samples.gathered[kind, False][:, middle_index(ladder)].mean(axis=1)
         for kind, ladder in samples.ladder.items()
@@ -291,4 +300,10 @@ def measure(
         mean,
         float(np.mean(of_photons)),
         float(caustics / max(np.mean(mean), 1e-30)),
+        {
+            measure: float(np.mean(weights[measure] * samples.chance.mean(axis=(0, 1))))
+            for measure in MEASURES
+        }
+        if samples.chance is not None
+        else {},
     )

@@ -56,6 +56,10 @@ class PilotIteration(Protocol):
         """Light that neither photons bring nor other paths see: mean over the channels, (groups,
         pixels)."""
 
+    def chance(self) -> np.ndarray | None:
+        """After `gather`: the second moment of one camera path that meets the light of caustic
+        photons by chance, (groups, pixels); None where nobody asks."""
+
     def joined(self) -> np.ndarray:
         """Light of photons that are joined with the sensor: mean over the channels, (groups,
         pixels). Not called where none are."""
@@ -89,6 +93,7 @@ def run_pilot(setting: PilotSetting, pixels: PilotPixels, passes: PilotPasses) -
     photons: dict[str, float] = {}
     gathered: list[dict[tuple[str, bool], np.ndarray]] = []
     direct: list[np.ndarray] = []
+    chance: list[np.ndarray] = []
     joined: list[np.ndarray] = []
     spent = 0.0
     for done in range(1, MOST_ITERATIONS + 1):
@@ -99,6 +104,9 @@ def run_pilot(setting: PilotSetting, pixels: PilotPixels, passes: PilotPasses) -
         if radii or setting.joins_sensor:
             gathered.append(iteration.gather(radii))
             direct.append(iteration.direct())
+            moment = iteration.chance()
+            if moment is not None:
+                chance.append(moment)
         if setting.joins_sensor:
             joined.append(iteration.joined())
         del iteration  # its photons' memory is free for those of the next
@@ -111,7 +119,13 @@ def run_pilot(setting: PilotSetting, pixels: PilotPixels, passes: PilotPasses) -
         estimates = {key: np.array([step[key] for step in gathered]) for key in gathered[0]}
         of_photons = np.array(joined) if joined else None
         samples = PilotSamples(
-            radii, photons, estimates, np.array(direct), passes.seen(), of_photons
+            radii,
+            photons,
+            estimates,
+            np.array(direct),
+            passes.seen(),
+            of_photons,
+            np.array(chance) if chance else None,
         )
     return measure(setting, pixels, samples, seconds)
 
