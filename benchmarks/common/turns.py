@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from mis_integrators.core.clock import compile_seconds, watched_kernels
 from mis_integrators.core.session import Session
 
 import drjit as dr
@@ -125,21 +126,11 @@ class Contender:
 def timed(work: Callable[[], Any]) -> tuple[Any, float, float, list[dict]]:
     """What `work` returns, its seconds, those of them that went into compiling, and its kernels (as
     in Dr.Jit's kernel history)."""
-    dr.kernel_history_clear()
-    start = time.perf_counter()
-    result = work()
-    seconds = time.perf_counter() - start
-    kernels = dr.kernel_history()
+    with watched_kernels() as kernels:
+        start = time.perf_counter()
+        result = work()
+        seconds = time.perf_counter() - start
     return result, seconds, min(seconds, compile_seconds(kernels)), kernels
-
-
-def compile_seconds(kernels: Sequence[dict]) -> float:
-    """Seconds that kernels of Dr.Jit's history took to compile; next to none for those found in a
-    cache."""
-    return (
-        sum(kernel.get("codegen_time", 0) + kernel.get("backend_time", 0) for kernel in kernels)
-        / 1000
-    )
 
 
 def take_turns(
@@ -160,7 +151,6 @@ def take_turns(
                 while contender.rendering < end and contender.wants(seconds, spp):
                     contender.iterate()
             tell(f"{min(c.rendering for c in contenders):.1f} of {seconds:g} s each")
-        dr.kernel_history_clear()
 
 
 def processor_seconds(

@@ -9,8 +9,7 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-import drjit as dr
-
+from ..core.clock import compiled_seconds
 from ..core.session import Session
 from .progress import Progress
 from .target_error import TargetError
@@ -67,18 +66,12 @@ class Clock:
         self.compiling = compiling
 
     def __enter__(self) -> None:
-        dr.kernel_history_clear()
+        self._compiled = compiled_seconds()
         self._start = time.perf_counter()
 
     def __exit__(self, *_: object) -> None:
         seconds = time.perf_counter() - self._start
-        compiling = (
-            sum(
-                kernel.get("codegen_time", 0) + kernel.get("backend_time", 0)
-                for kernel in dr.kernel_history([dr.KernelType.JIT])
-            )
-            / 1000
-        )
+        compiling = compiled_seconds() - self._compiled
         self.compiling += min(compiling, seconds)
         self.rendering += max(0.0, seconds - compiling)
 

@@ -10,13 +10,13 @@ both renders: the other would lose more in one of them than it wins in the other
 from __future__ import annotations
 
 import math
-import time
 from dataclasses import dataclass, field
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..core.clock import now
 from ..core.recording import lanes
 from ..core.spectra import channel_mean
 from ..core.stratified_variance import contrasts, extrapolated
@@ -262,11 +262,11 @@ def _samples(path, pixels, first, clock=None):
             trial + dr.opaque(mi.UInt32, number),  # one kernel for all
         )
         value = channel_mean(radiance) + dr.zeros(mi.Float, at_once * count)
-        start = time.perf_counter()
+        start = now()
         dr.eval(value)
         dr.sync_thread()
         if clock is not None:
-            clock.append(time.perf_counter() - start)
+            clock.append(now() - start)
         values.append(np.array(value).reshape(at_once, count))
     return np.concatenate(values)
 

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-import time
 
 import drjit as dr
 import mitsuba as mi
 
+from ..core.clock import now
 from ..core.untrusted import Fields
 from ..pilot.result import Choice
 from ..pilot.run import run_pilot
@@ -124,7 +124,7 @@ class PilotedSession(IterativeSession):
     def predict(self):
         """Runs the pilot, if one is needed, and makes the first choice: enough for a `prediction`.
         `start` does this, too, and times an iteration where there is a time limit."""
-        begun = time.perf_counter()
+        begun = now()
         pilot = self._run_pilot()
         if pilot is None:
             self.radii = self.radii or {}
@@ -148,11 +148,11 @@ class PilotedSession(IterativeSession):
             return None
         setting = self.pilot_setting()
         pixels = pilot_pixels(setting)
-        return run_pilot(setting, pixels, self.pilot_passes(setting, pixels))
+        return run_pilot(setting, pixels, self.pilot_passes(setting, pixels), now)
 
     def _left(self, begun, least):
         """Seconds that are left of a render begun then, `least` at least."""
-        return max(begun + self.seconds - time.perf_counter(), least)
+        return max(begun + self.seconds - now(), least)
 
     def _choose_by_clock(self, pilot, first, guess, begun):
         """Measures what an iteration takes with the `first` choice, which was made for a `guess` of
@@ -187,11 +187,11 @@ class PilotedSession(IterativeSession):
         them. Returns the seconds of an iteration, and those of all."""
         spent = 0.0
         for number in range(2):
-            start = time.perf_counter()
+            start = now()
             block = self._render(number)
             dr.eval(block)
             dr.sync_thread()
-            seconds = time.perf_counter() - start
+            seconds = now() - start
             self.kept[number] = block
             spent += seconds
             if seconds < TOO_SLOW * guess or spent > left / 2:

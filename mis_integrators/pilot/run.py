@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
@@ -77,7 +78,12 @@ class PilotPasses(Protocol):
         (pixels,)."""
 
 
-def run_pilot(setting: PilotSetting, pixels: PilotPixels, passes: PilotPasses) -> PilotResult:
+def run_pilot(
+    setting: PilotSetting,
+    pixels: PilotPixels,
+    passes: PilotPasses,
+    now: Callable[[], float] = time.perf_counter,
+) -> PilotResult:
     """Runs as many iterations as the render's plan allows, and returns what they have measured.
 
     Parameters
@@ -88,6 +94,8 @@ def run_pilot(setting: PilotSetting, pixels: PilotPixels, passes: PilotPasses) -
         Those that it takes: `setting.pilot_pixels`.
     passes
         They trace those pixels, and gather all kinds and corrections of the setting.
+    now
+        The clock [s] of the render, by which the pilot's time is limited.
     """
     radii: dict[str, np.ndarray] = {}
     photons: dict[str, float] = {}
@@ -97,7 +105,7 @@ def run_pilot(setting: PilotSetting, pixels: PilotPixels, passes: PilotPasses) -
     joined: list[np.ndarray] = []
     spent = 0.0
     for done in range(1, MOST_ITERATIONS + 1):
-        start = time.perf_counter()
+        start = now()
         iteration = passes.trace(PILOT_INDEX + done - 1)
         if done == 1:
             radii, photons = choose_ladder(setting, iteration)
@@ -110,7 +118,7 @@ def run_pilot(setting: PilotSetting, pixels: PilotPixels, passes: PilotPasses) -
         if setting.joins_sensor:
             joined.append(iteration.joined())
         del iteration  # its photons' memory is free for those of the next
-        seconds = time.perf_counter() - start
+        seconds = now() - start
         spent += seconds if done > 1 else 0.0
         if not direct or has_enough(setting, done, spent):
             break

@@ -27,6 +27,7 @@ from dataclasses import dataclass
 from statistics import NormalDist
 
 from mis_integrators.analysis.confidence import t_quantile
+from mis_integrators.core.clock import watched_kernels
 
 import drjit as dr
 import mitsuba as mi
@@ -269,12 +270,11 @@ def grey_pictures(session, count):
 
 def kernels_of(run, operations=0):
     """Hashes of the kernels, of more than so many operations, that `run()` launches."""
-    dr.kernel_history_clear()
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True), watched_kernels() as kernels:
         run()
     return {
         kernel["hash"]
-        for kernel in dr.kernel_history()
+        for kernel in kernels
         if kernel["type"] == dr.KernelType.JIT and kernel["operation_count"] > operations
     }
 
