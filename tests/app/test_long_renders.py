@@ -302,7 +302,6 @@ def test_samples_asked_for_are_made_whatever_was_learned(
     )
     if price:
         set_price_of_path(monkeypatch, price)
-        monkeypatch.setattr("mis_integrators.integrators.choice.RARE", 1.0)  # caustics or not
     out = ["-i", plugin, *given, "-o", tmp_path / "a.exr"]
     assert render(scene, *out, "--time", 0.01, "--checkpoint", 100) == 0
     header, _ = read(tmp_path / "a.exr")

@@ -264,3 +264,33 @@ def test_light_is_of_the_class_of_caustics():
     layer = {n: image[..., names.index(f"{n}.R")] for n in "dic"}
     np.testing.assert_allclose(sum(layer.values()), image[..., 0], rtol=1e-4, atol=1e-5)
     assert layer["c"].mean() > 0.5 * image[..., 0].mean()
+
+
+@pytest.mark.parametrize("floor", FLOORS)
+@pytest.mark.parametrize("name", ["lamp", "sky and lamp"])
+def test_photons_tell_how_noisy_paths_are(name, floor):
+    """The second moment of what a camera path brings that meets lights by chance, of which photons
+    know, is that of `path`, to which all light comes through the pane. Three iterations of a pilot
+    with 576 pixels know it within a tenth (seen over seeds); what they leave out, that a path
+    chooses at the glass, is 0.05 to 0.1. An error of a cosine or of a factor of two is seen."""
+    sensor = {"type": "perspective", "fov": 30, "film": film(SIZE)}
+    sensor["to_world"] = look((0, -3, 1.6), (0, 0, 0), (0, 0, 1))  # sees the floor and the ball
+    scene = world(floor, sensor=sensor, **LIGHTS[name]())
+    plugin = {"type": "bdpm", "bdd": 0, "max_depth": 6, "photon_count": 40000}
+    session = mi.load_dict(plugin).session(scene, seed=3, spp=64)
+    session.judge_chance()
+    session.predict()
+    path = mi.load_dict({"type": "path", "max_depth": 6, "rr_depth": 100})
+    image = np.array(mi.render(scene, integrator=path, spp=4096)).mean(axis=-1)
+    squares = [
+        np.square(np.array(mi.render(scene, integrator=path, spp=1, seed=seed)).mean(axis=-1))
+        for seed in range(1, 400)
+    ]
+    usual = np.mean(np.minimum(image, np.quantile(image, 0.9)))
+    assert session.prediction.chance["mse"] == pytest.approx(np.mean(squares) / usual**2, rel=0.3)
+
+
+def test_who_does_not_ask_is_told_nothing():
+    session = mi.load_dict({"type": "bdpm", "bdd": 0, "max_depth": 6}).session(world(), spp=8)
+    session.predict()
+    assert session.prediction.chance == {}
