@@ -38,6 +38,7 @@ DENOISING = "tests/app/test_denoising.py"
 SHIFTS = "tests/volume/test_shifts.py"
 VIEWS = "tests/volume/test_multiview.py"
 BDPM = "tests/integrators/test_bdpm.py"
+AUTO = "tests/integrators/test_auto.py"
 BDPT = "tests/integrators/test_bdpt.py"
 FOG = "tests/integrators/test_bdpt_media.py"
 RIS_FOG = "tests/integrators/test_bdpt_ris_media.py"
@@ -793,5 +794,33 @@ MUTATIONS = [
         'selected(active, [mi.Normal3f(0)], state["wall"])',
         "beams do not know of the wall that a path has left",
         f"{MEDIA}::test_walls_do_not_darken_what_is_dense",
+    ),
+    Mutation(
+        "mis/chance.py",
+        "channel_mean(flux) * density\n        return dr.select(active, light * dr.rcp(pdf), 0)",
+        "channel_mean(flux) * density\n        return dr.select(active, light, 0)",
+        "photons tell of paths whose directions all have density one",
+        f"{CHANCE}::test_photons_tell_how_noisy_paths_are",
+    ),
+    Mutation(
+        "integrators/piloted.py",
+        "from ..core.clock import now",
+        "from time import perf_counter as now",
+        "compiling counts as rendering where a render is planned",
+        "tests/core/test_clock.py",
+    ),
+    Mutation(
+        "integrators/choice.py",
+        "max(variance, share * chance)",
+        "variance",
+        "path is judged by samples that have met no caustics",
+        f"{AUTO}::test_paths_find_the_caustics_of_a_sky",
+    ),
+    Mutation(
+        "integrators/choice.py",
+        "usual = photons.expected_seconds",
+        "usual = 0.05 * photons.expected_seconds",
+        "an iteration of photons is taken to cost a twentieth of what it does",
+        f"{AUTO}::test_paths_find_the_caustics_of_a_sky",
     ),
 ]
