@@ -821,6 +821,6 @@ MUTATIONS = [
         "usual = photons.expected_seconds",
         "usual = 0.05 * photons.expected_seconds",
         "an iteration of photons is taken to cost a twentieth of what it does",
-        f"{AUTO}::test_paths_find_the_caustics_of_a_sky",
+        f"{AUTO}::test_prices_are_what_candidates_take",
     ),
 ]
