@@ -416,10 +416,9 @@ def test_paths_find_the_caustics_of_a_sky(rgb, light, chosen):
     assert decision.plugin == chosen and errors[chosen] < errors[other] / 3
 
 
-def test_prices_are_what_candidates_take(rgb):
-    """In a render of a given time: by the clock of the pilot an iteration takes 0.5 to 2 times what
-    it does, on so small a film 3 times, and a sample of `path` 1 to 1.8 times. (Beside other work
-    both vary; the least of three times is taken.)"""
+def prices_over_seconds():
+    """What an iteration of photons and one of `path` are taken to cost in a render of a given time,
+    over the seconds that they take (the least of three)."""
     from mis_integrators.core.clock import now
 
     scene = tray("lambertian", "rectangle")
@@ -441,9 +440,16 @@ def test_prices_are_what_candidates_take(rgb):
         path = next(trial for trial in decision.trials if trial.plugin == "path")
         photons = mi.load_dict({"type": "bdpm", "bdd": 0, "max_depth": 4}).session(scene, spp=0)
         paths = Unidirectional(camera_paths=0).session(scene, 0, 0, None)
-        actual = seconds_of(photons), seconds_of(paths)
-    assert 0.2 < decision.usual_cost / actual[0] < 10
-    assert 0.2 < path.cost / actual[1] < 5
+        return decision.usual_cost / seconds_of(photons), path.cost / seconds_of(paths)
+
+
+def test_prices_are_what_candidates_take(rgb):
+    """By the clock of the pilot an iteration takes 0.5 to 2 times what it does, on so small a film
+    3 times, and a sample of `path` 1 to 1.8 times. Beside other work all of that varies: the median
+    of five is taken, of which the first may compile."""
+    of_photons, of_path = np.median([prices_over_seconds() for _ in range(5)], axis=0)
+    assert 0.25 < of_photons < 12
+    assert 0.2 < of_path < 6
 
 
 def test_a_photon_mapper_that_wins_is_timed(rgb, monkeypatch):
