@@ -797,8 +797,8 @@ MUTATIONS = [
     ),
     Mutation(
         "mis/chance.py",
-        "channel_mean(flux) * density\n        return dr.select(active, light * dr.rcp(pdf), 0)",
-        "channel_mean(flux) * density\n        return dr.select(active, light, 0)",
+        "density_ratio(density, 1, scattering.p * scattering.shading)",
+        "density_ratio(density, 1, mi.Float(1))",
         "photons tell of paths whose directions all have density one",
         f"{CHANCE}::test_photons_tell_how_noisy_paths_are",
     ),

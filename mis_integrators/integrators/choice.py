@@ -133,7 +133,7 @@ def choose(integrator, scene, sensor, seed, iterations, seconds):
         values, cost = _clocked_samples(path, prediction.pixels)
     else:
         usual, cost = _counted_costs(path, photons)
-        values = _samples(path, prediction.pixels, 0)
+        values, _ = _samples(path, prediction.pixels, 0)
     budget = planned * usual
     trials = [
         _trial_of_path(path, values, prediction, budget, cost),
@@ -233,16 +233,15 @@ def _counted_costs(path, photons):
 def _clocked_samples(path, pixels):
     """Samples of the pilot's pixels, as of `_samples`, and the seconds that one sample of each of
     the film's takes: those of the second half, whose kernels are compiled."""
-    first = _samples(path, pixels, 0)
-    clock = []
-    second = _samples(path, pixels, PATH_TRIALS, clock)
-    seconds = sum(clock) / second.size * film_sample_count(path.sensor)
-    return np.concatenate([first, second]), seconds
+    first, _ = _samples(path, pixels, 0)
+    second, seconds = _samples(path, pixels, PATH_TRIALS)
+    each = seconds / second.size
+    return np.concatenate([first, second]), each * film_sample_count(path.sensor)
 
 
-def _samples(path, pixels, first, clock=None):
+def _samples(path, pixels, first):
     """`PATH_TRIALS` samples of each of the pilot's pixels, from number `first` on: radiance, mean
-    over the channels, (samples, pixels). `clock`: a list, for the seconds that they take."""
+    over the channels, (samples, pixels); and the seconds that they take."""
     passes = (
         PATH_TRIALS if mi.is_spectral else 1
     )  # wavelengths are shared by all that is traced at once
@@ -250,7 +249,7 @@ def _samples(path, pixels, first, clock=None):
     count, stride = pixels.count, pixels.stride * path.camera_paths
     trial = lanes(at_once * count) // count
     back = trial * (-count * stride % 2**32)  # to the first pixel
-    values = []
+    values, seconds = [], 0.0
     for number in range(first, first + passes):
         spectral = path._spectral(TRIAL_INDEX + number)
         radiance, *_ = path.trace(
@@ -265,10 +264,9 @@ def _samples(path, pixels, first, clock=None):
         start = now()
         dr.eval(value)
         dr.sync_thread()
-        if clock is not None:
-            clock.append(now() - start)
+        seconds += now() - start
         values.append(np.array(value).reshape(at_once, count))
-    return np.concatenate(values)
+    return np.concatenate(values), seconds
 
 
 def _trial_of_path(path, values, prediction, budget, cost):

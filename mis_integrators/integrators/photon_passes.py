@@ -270,18 +270,10 @@ class PhotonPasses(PilotedSession):
             )
         return found if chance is None else chance.with_hits(found, radii, grey)
 
-    def gather_and_judge(self, photons, vertices, radii, spectral):
+    def gather_and_judge(self, photon_map, vertices, radii, spectral):
         """The second moment of one camera path that goes on from a vertex and meets the light of
         caustic photons by chance, by those within the middle radius; then what these bring for each
         radius, mean over the channels."""
-        photon_map = build_photon_map(
-            *photons[:3],
-            self.traits.bounds,
-            radii[-1],
-            self.photon_capacity,
-            "caustic",
-            photons[3],
-        )
         record = read_queries(vertices)
         takes = takes_photons(record, "caustic")
         asking = QueryVertices(self.traits, record, spectral["wavelengths"], takes)
@@ -351,9 +343,7 @@ class PhotonPasses(PilotedSession):
                 return build_volume_map(
                     *in_media[:3], radius, self.volume_capacity, *in_media[3:], density=density
                 )
-        weighted = kind == "indirect" and not self.judges_chance
-        if self.by_chance:
-            weighted = kind != "indirect"
+        weighted = (kind == "indirect") != (self.by_chance or self.judges_chance)
         mis_words = photons[3] if weighted and len(photons) > 3 else None
         return build_photon_map(
             *photons[:3],

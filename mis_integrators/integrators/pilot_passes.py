@@ -64,10 +64,10 @@ class SubsetPasses:
         def gather(scene, tables, photons, density, vertices, radii, spectral):
             gathered = {}
             for kind, ladder in radii.items():
+                photon_map = session._map(photons, kind, ladder[-1], density)
                 if kind == "caustic" and session.judges_chance:
-                    found = session.gather_and_judge(photons, vertices, ladder, spectral)
+                    found = session.gather_and_judge(photon_map, vertices, ladder, spectral)
                 else:
-                    photon_map = session._map(photons, kind, ladder[-1], density)
                     found = session._gather(photon_map, vertices, kind, ladder, spectral, grey=True)
                 gathered[kind] = found
             return gathered

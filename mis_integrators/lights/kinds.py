@@ -69,7 +69,7 @@ class Kind:
 
     def emit(self, emitter, index, samples, time, wavelengths, active):
         """A `Start`, by `Samples`."""
-        raise NotImplementedError
+        raise TypeError(f"{type(self).__name__} does not define emit")
 
     def direct(self, own, ref, ds, index, active):
         """Density of next-event estimation per solid angle at `ref`."""
@@ -78,7 +78,7 @@ class Kind:
     def across(self, ref, ds, index, active):
         """Density of light sub-paths per unit area across the ray at `ref` [1/m^2], once the
         light's point or direction is given."""
-        raise NotImplementedError
+        raise TypeError(f"{type(self).__name__} does not define across")
 
     def origin(self, own, ds, index, active):
         """Density with which `emit` chooses the light's point or direction, per solid angle at

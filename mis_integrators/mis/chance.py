@@ -27,7 +27,7 @@ from ..core.spectra import channel_mean
 from ..lights.lights import NEVER_MET
 from ..paths.light_classes import CAUSTIC, CLASSES
 from ..paths.light_starts import light_seen_from
-from ..photons.hits import SMALLEST_PDF, density_ratio
+from ..photons.hits import density_ratio
 from ..photons.kernel_sums import disk_area
 from ..photons.photon import read_power
 from ..weights.heuristics import bounded_power, weight
@@ -87,9 +87,9 @@ def second_moment(lights, photon_map, vertices):
         flux, _ = read_power(photon_map.power, index, active)
         density = carried.read(photon_map, index, active)
         active = active & (density < NEVER_MET)
-        pdf = dr.maximum(scattering.p * scattering.shading, SMALLEST_PDF)
-        light = channel_mean(vertices.factor * scattering.value) * channel_mean(flux) * density
-        return dr.select(active, light * dr.rcp(pdf), 0)
+        light = channel_mean(vertices.factor * scattering.value) * channel_mean(flux)
+        ratio = density_ratio(density, 1, scattering.p * scattering.shading)  # the cosine is in f
+        return dr.select(active, light * ratio, 0)
 
     return weigh
 
