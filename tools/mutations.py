@@ -823,4 +823,25 @@ MUTATIONS = [
         "an iteration of photons is taken to cost a twentieth of what it does",
         f"{AUTO}::test_prices_are_what_candidates_take",
     ),
+    Mutation(
+        "integrators/choice.py",
+        "(LEFT if path.integrator.denoised else 1)",
+        "1",
+        "all noise of path counts where a denoiser leaves little of it",
+        "tests/integrators/test_denoised.py::test_of_the_noise_of_path_a_denoiser_leaves_its_share",
+    ),
+    Mutation(
+        "integrators/unidirectional.py",
+        "DIRECT_SEGMENTS = 2",
+        "DIRECT_SEGMENTS = 3",
+        "under path light of three segments is denoised as direct light",
+        f"{DENOISING}::test_path_under_bdpm_auto_keeps_its_direct_light_apart",
+    ),
+    Mutation(
+        "integrators/photon_passes.py",
+        'takes |= takes_photons(record, "seen_caustic")',
+        "pass",
+        "for denoisers nothing tells of the caustics that path meets where the camera sees them",
+        f"{CHANCE}::test_photons_tell_how_noisy_paths_are",
+    ),
 ]

@@ -24,6 +24,7 @@ from ..core.traits import UnsupportedScene
 from ..paths.camera import film_sample_count
 from ..paths.layers import written
 from ..paths.path_length_statistics import mean_segments
+from ..pilot.denoiser import LEFT
 from ..pilot.noise import MEASURES, trimmed_mean
 from ..pilot.setting import UNPLANNED_ITERATIONS
 from . import costs
@@ -112,7 +113,7 @@ def choose(integrator, scene, sensor, seed, iterations, seconds):
     if not photons.kinds():
         return Decision(*alone, [f"{alone[0]}: {no_photons(integrator, photons)}"])
     photons.plan_time(seconds)
-    if photons.has_caustics and not integrator.kept_classes and not camera_paths_are_blind(photons):
+    if photons.has_caustics and not integrator.splits_light and not camera_paths_are_blind(photons):
         photons.judge_chance()
     photons.predict()
     prediction = photons.prediction
@@ -121,7 +122,7 @@ def choose(integrator, scene, sensor, seed, iterations, seconds):
         return Decision(*alone, [f"{alone[0]}: {reason}"])
 
     planned = prediction.iterations if seconds else iterations or UNPLANNED_ITERATIONS
-    if integrator.kept_classes:
+    if integrator.splits_light:
         excluded = f"not {CAMERA}: it does not split the light"
     else:
         excluded = why_blind(CAMERA, photons, prediction)
@@ -227,7 +228,8 @@ def _counted_costs(path, photons):
     gathered, paths = photons.prediction.gathered, photons.camera_paths
     counted = costs.events(photons, segments, photons.last_vertex, gathered, paths)
     usual = costs.cost(PHOTONS, counted) + costs.of_direct_paths(photons, segments)
-    return usual, costs.cost(CAMERA, costs.events(path, segments, None, 0.0))
+    alone = costs.cost(CAMERA, costs.events(path, segments, None, 0.0))
+    return usual, alone + costs.of_light_apart(path, segments)
 
 
 def _clocked_samples(path, pixels):
@@ -252,7 +254,7 @@ def _samples(path, pixels, first):
     values, seconds = [], 0.0
     for number in range(first, first + passes):
         spectral = path._spectral(TRIAL_INDEX + number)
-        radiance, *_ = path.trace(
+        radiance, *_, parts = path.trace(
             TRIAL_INDEX,
             back,
             stride,
@@ -261,8 +263,9 @@ def _samples(path, pixels, first):
             trial + dr.opaque(mi.UInt32, number),  # one kernel for all
         )
         value = channel_mean(radiance) + dr.zeros(mi.Float, at_once * count)
+        parts = [channel_mean(part) + dr.zeros(mi.Float, at_once * count) for part in parts]
         start = now()
-        dr.eval(value)
+        dr.eval(value, parts)
         dr.sync_thread()
         seconds += now() - start
         values.append(np.array(value).reshape(at_once, count))
@@ -272,7 +275,7 @@ def _samples(path, pixels, first):
 def _trial_of_path(path, values, prediction, budget, cost):
     """`path`, by the `values` of samples that `cost` so much, for a render of this `budget`. How
     noisy caustics are that it meets by chance, photons tell: its few samples may have met none."""
-    share = 1 / path.camera_paths
+    share = (LEFT if path.integrator.denoised else 1) / path.camera_paths
     parts = parts_of_samples(path, values, prediction.mean, budget / cost, share)
     for measure, chance in prediction.chance.items():
         squared_bias, variance = parts[measure]

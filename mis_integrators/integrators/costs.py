@@ -34,6 +34,12 @@ def of_direct_paths(session, segments):
     return session.direct_light.mean_paths * float(segments[0])
 
 
+def of_light_apart(path, segments):
+    """Cost of tracing a camera path again, up to so many segments, for the light of `path` that is
+    kept apart."""
+    return min(float(sum(segments)), path.segments_apart)
+
+
 def cost(plugin, counted, prices=PRICES):
     """Cost of an iteration of `plugin` with these events a pixel, in segments of `path`."""
     return sum(prices[plugin][name] * count for name, count in zip(EVENTS, counted))

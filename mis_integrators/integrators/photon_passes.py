@@ -30,7 +30,6 @@ from ..photons.sensor_light import join_photons
 from ..photons.tiers import LEFT_TO_DENOISER, TieredMap, build_tiered_map, gather_tiers
 from ..photons.trace import trace_light_paths
 from ..photons.volume import VolumeMap, build_volume_map
-from ..pilot.radius import middle_index
 from .piloted import PilotedSession
 from .purposes import LIGHT, SENSOR
 
@@ -45,7 +44,7 @@ class PhotonPasses(PilotedSession):
 
     judges_chance = False
     """Whether photons carry what tells how noisy camera paths are that meet their light by chance
-    (`gather_and_judge`)."""
+    (`moment_of_chance`)."""
     points = False
     """Whether volume photons are gathered at vertices in media, and not along beams."""
 
@@ -270,23 +269,23 @@ class PhotonPasses(PilotedSession):
             )
         return found if chance is None else chance.with_hits(found, radii, grey)
 
-    def gather_and_judge(self, photon_map, vertices, radii, spectral):
+    def moment_of_chance(self, photon_map, vertices, radius, spectral):
         """The second moment of one camera path that goes on from a vertex and meets the light of
-        caustic photons by chance, by those within the middle radius; then what these bring for each
-        radius, mean over the channels."""
+        caustic photons by chance, by those within `radius`."""
         record = read_queries(vertices)
         takes = takes_photons(record, "caustic")
+        if self.cones is not None:  # wide disks tell it better than those of a pixel's size
+            takes |= takes_photons(record, "seen_caustic")
         asking = QueryVertices(self.traits, record, spectral["wavelengths"], takes)
-        moment = second_moment(self.lights, photon_map, asking)
         return gather_photons(
             photon_map,
             asking,
-            [radii[middle_index(radii)], *radii],
+            [radius],
             self._light_paths,
             self.integrator.max_depth,
-            lambda *photon: [moment(*photon)] + [1] * len(radii),
+            second_moment(self.lights, photon_map, asking),
             grey=True,
-        )
+        )[0]
 
     @property
     def _tiers_left(self):

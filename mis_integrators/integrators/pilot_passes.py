@@ -15,6 +15,7 @@ from ..core.recording import lanes
 from ..core.spectra import channel_mean
 from ..paths.camera import film_sample_count, pixel_at
 from ..photons.queries import read_queries
+from ..pilot.radius import middle_index
 
 
 class SubsetPasses:
@@ -62,15 +63,16 @@ class SubsetPasses:
         self.photon_capacity = session.photon_capacity, session.volume_capacity
 
         def gather(scene, tables, photons, density, vertices, radii, spectral):
-            gathered = {}
+            gathered, moment = {}, None
             for kind, ladder in radii.items():
                 photon_map = session._map(photons, kind, ladder[-1], density)
+                gathered[kind] = session._gather(
+                    photon_map, vertices, kind, ladder, spectral, grey=True
+                )
                 if kind == "caustic" and session.judges_chance:
-                    found = session.gather_and_judge(photon_map, vertices, ladder, spectral)
-                else:
-                    found = session._gather(photon_map, vertices, kind, ladder, spectral, grey=True)
-                gathered[kind] = found
-            return gathered
+                    radius = ladder[middle_index(ladder)]
+                    moment = session.moment_of_chance(photon_map, vertices, radius, spectral)
+            return gathered, moment
 
         self._gather = session.recorded(gather)
 
@@ -122,12 +124,11 @@ class SubsetPasses:
             kind: [dr.opaque(mi.Float, float(radius)) for radius in ladder]
             for kind, ladder in radii.items()
         }
-        gathered = self._gather(
+        gathered, moment = self._gather(
             session.scene, session._tables, photons, self.density, vertices, radii, spectral
         )
-        self.moment = None
-        if "caustic" in gathered and session.judges_chance:
-            moment, *gathered["caustic"] = gathered["caustic"]
+        self.moment = moment
+        if moment is not None:
             self.moment = self.by_pixel(
                 session._per_path(moment, vertices, "caustic", self.pixels.paths)
             )

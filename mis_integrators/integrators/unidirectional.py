@@ -17,6 +17,9 @@ BUSY = 1 << 19
 slower."""
 CHUNK = 1 << 21
 """Camera paths traced at once at most (bounds memory)."""
+DIRECT_SEGMENTS = 2
+"""Segments of the paths whose light is denoised apart: lamps that are seen and direct light, with
+the edges that a denoiser blurs."""
 PATHS = 0
 """Purpose of an iteration's random seeds, besides `PathSession.wavelength`."""
 
@@ -50,17 +53,26 @@ class PathSession(IterativeSession):
 
     def __init__(self, integrator, scene, sensor, seed, iterations):
         super().__init__(integrator, scene, sensor, seed, iterations)
-        self.path_integrator = mi.load_dict(
-            {
-                "type": "path",
-                "max_depth": integrator.max_depth,
-                "rr_depth": integrator.rr_depth,
-                "hide_emitters": integrator.hide_emitters,
-            }
-        )
+        self.path_integrator = self._path(integrator.max_depth)
+        self.segments_apart = 0  # of the longest paths whose light is kept apart
+        if integrator.denoised:
+            longest = DIRECT_SEGMENTS if integrator.max_depth < 0 else integrator.max_depth
+            self.segments_apart = min(longest, DIRECT_SEGMENTS)
+            self.direct_integrator = self._path(self.segments_apart)
         if not integrator.camera_paths and iterations is None:
             self.camera_paths = max(1, BUSY // film_sample_count(sensor))
         self.split_paths(CHUNK)
+
+    def _path(self, max_depth):
+        """Mitsuba's `path` for paths up to `max_depth` segments."""
+        return mi.load_dict(
+            {
+                "type": "path",
+                "max_depth": max_depth,
+                "rr_depth": self.integrator.rr_depth,
+                "hide_emitters": self.integrator.hide_emitters,
+            }
+        )
 
     @property
     def left_out(self):
@@ -81,9 +93,10 @@ class PathSession(IterativeSession):
         self.split_paths(CHUNK)
 
     def trace(self, iteration, first, stride, paths, spectral, variation=0):
-        """Radiance and alpha of camera paths `first`, `first + stride`, ..., and their positions on
-        the film. Where `first` and `variation` are arrays, each lane has its own; the variations of
-        a pixel's first path are parts of one sequence."""
+        """Radiance and alpha of camera paths `first`, `first + stride`, ..., their positions on the
+        film, which of them there are, and the part of the radiance that is `direct` (a list: none
+        where none is kept). Where `first` and `variation` are arrays, each lane has its own; the
+        variations of a pixel's first path are parts of one sequence."""
         sequence = self._sequence(iteration, PATHS, self.camera_paths)
         sequence.first += variation
         camera_pass = CameraPass(
@@ -94,22 +107,28 @@ class PathSession(IterativeSession):
         radiance, valid, _ = self.path_integrator.sample(
             self.scene, PathSampler(numbers), differential, None, active
         )
+        direct = []
+        if self.integrator.denoised:
+            # The same numbers make the same vertices and shadow rays: nothing is counted twice.
+            part, *_ = self.direct_integrator.sample(
+                self.scene, PathSampler(numbers), differential, None, active
+            )
+            direct.append(dr.select(active, weight * part, 0))
         return (
             dr.select(active, weight * radiance, 0),
             dr.select(valid, mi.Float(1), 0),
             position,
             active,
+            direct,
         )
 
     def _iteration(self, iteration):
         spectral = self._spectral(iteration)
 
         def render(chunk, first):
-            radiance, alpha, position, active = self.trace(
+            radiance, alpha, position, active, classes = self.trace(
                 iteration, first, 1, self.chunk, spectral
             )
-            # `path` does not split its light: none of it counts as direct light.
-            classes = [mi.Spectrum(0)] * self.integrator.kept_classes
             return (
                 splat_samples(
                     self.sensor.film(),

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import mis_integrators  # noqa: F401 (registers the plugins)
-from mis_integrators.pilot.denoiser import GROUPS
+from mis_integrators.pilot.denoiser import GROUPS, LEFT
 
 import mitsuba as mi
 import numpy as np
@@ -82,14 +82,24 @@ def test_what_is_chosen_knows_of_the_denoiser(scene):
     assert denoised.settings["denoised"] is True
 
 
-def test_images_that_will_be_denoised_are_split(scene):
-    """Direct light is denoised apart, so that `path` is no candidate: it would have none."""
+def test_of_the_noise_of_path_a_denoiser_leaves_its_share(scene):
+    """As of the noise of camera paths under photons. Both are judged by the same samples, and by
+    means of pixels that differ a little."""
+    variances = []
     for flag in (False, True):
         session = mi.load_dict({"type": "bdpm_auto", "denoised": flag}).session(scene, spp=16)
         session.iterate()
-        decision = session.decision
-        tried = {name.partition(".")[2] for name in decision.errors}
-        assert tried == ({"bdpm"} if flag else {"path", "bdpm"})
-        assert ("not path: it does not split the light" in decision.reasons) is flag
-    assert decision.plugin == "bdpm" and decision.session.integrator.denoised
+        trials = {trial.plugin: trial for trial in session.decision.trials}
+        assert set(trials) == {"path", "bdpm"}
+        variances.append([trials["path"].parts[measure][1] for measure in ("relmse", "mse")])
+    np.testing.assert_allclose(np.divide(*variances[::-1]), LEFT, rtol=0.3)
+    assert session.decision.session.integrator.denoised
     assert session.image()[..., session.channels.index("direct_light.R")].any()
+
+
+def test_path_is_no_candidate_where_layers_split_the_light(scene):
+    auto = mi.load_dict({"type": "bdpm_auto", "denoised": True, "aovs": "c:caustic"})
+    session = auto.session(scene, spp=16)
+    session.start()
+    assert session.decision.plugin == "bdpm"
+    assert "not path: it does not split the light" in session.decision.reasons
