@@ -117,8 +117,7 @@ class SubsetPasses:
             self._record_camera(max(self.capacity, found), max(self.beam_capacity, beams))
 
     def gather(self, photons, vertices, radii, seed, spectral):
-        """What photons bring to the camera paths, for the radii of each kind, by kind and whether
-        it is corrected at edges: (radii, groups, pixels)."""
+        """As of `pilot.run.PilotIteration`."""
         session, estimates = self.session, {}
         radii = {
             kind: [dr.opaque(mi.Float, float(radius)) for radius in ladder]
@@ -127,9 +126,8 @@ class SubsetPasses:
         gathered, moment = self._gather(
             session.scene, session._tables, photons, self.density, vertices, radii, spectral
         )
-        self.moment = moment
         if moment is not None:
-            self.moment = self.by_pixel(
+            moment = self.by_pixel(
                 session._per_path(moment, vertices, "caustic", self.pixels.paths)
             )
         for kind, values in gathered.items():
@@ -148,7 +146,7 @@ class SubsetPasses:
                         for value in values
                     ]
                 )
-        return estimates
+        return estimates, moment
 
     def mean_photon_count(self, photons, vertices, kind, radius, spectral):
         """As of `BDPMSession.mean_count`; `spectral`: that of the vertices' paths."""
@@ -204,9 +202,6 @@ class SubsetIteration(NamedTuple):
 
     def gather(self, radii):
         return self.passes.gather(self.photons, self.vertices, radii, self.seed, self.spectral)
-
-    def chance(self):
-        return self.passes.moment
 
     def joined(self):
         return self.passes.joined(self.number, self.photons, self.spectral)

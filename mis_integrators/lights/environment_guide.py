@@ -150,7 +150,15 @@ def _worth_aiming(portals, p, d, light, density, own):
     return np.sum(light * density / aimed) < WORTH_AIMING * np.sum(light * density / own)
 
 
-class Place(NamedTuple):
+def _joined(arrays):
+    """Arrays of `PILOT_PATHS` lanes, or one, one after the other."""
+    kind = type(arrays[0])
+    if dr.depth_v(kind) > 1:
+        return kind(*(_joined(parts) for parts in zip(*arrays)))
+    return dr.concat([dr.repeat(array, PILOT_PATHS // dr.width(array)) for array in arrays])
+
+
+class Places(NamedTuple):
     """Surfaces that camera paths have met: their BSDFs, the paths' throughput, and where they
     scatter smoothly."""
 
@@ -219,12 +227,11 @@ class EnvironmentGuide:
     # ------------------------------------------------------------------ pilot
 
     def _learn(self, sensor):
-        places = self._places(sensor)
-        self._learn_directions(places)
+        places, rng = self._places(sensor)
+        self._learn_directions(places, rng)
         records = [
-            self._numpy(self._look(index, emitter, place, rng), rng)
+            self._numpy(self._look(index, emitter, places, rng), rng)
             for index, emitter in self.infinite
-            for place, rng in places
             for _ in range(TESTS if emitter.is_environment() else 1)
         ]
         p, d, row, weight, density, own = (np.concatenate(x, axis=-1) for x in zip(*records))
@@ -302,21 +309,19 @@ class EnvironmentGuide:
                 rows[first : first + direction_cells()] = True
         return rows
 
-    def _learn_directions(self, places):
+    def _learn_directions(self, places, rng):
         """Direction cells by (radiance without its sharp peaks) x (share of the places that see the
         sky there)."""
         environment = next(((i, e) for i, e in self.infinite if e.is_environment()), None)
         if environment is None:
             return
         _, emitter = environment
-        tests, seen = np.zeros(direction_cells()), np.zeros(direction_cells())
-        for place, rng in places:
-            towards = mi.warp.square_to_uniform_sphere(next_2d(rng))
-            tested = self._scatters(place, towards)
-            reached = _sees_sky(self.scene, place.si.spawn_ray(towards), tested)
-            cell, tested, reached = self._numpy((direction_cell(towards), tested, reached), rng)
-            tests += np.bincount(cell[tested], minlength=direction_cells())
-            seen += np.bincount(cell[reached], minlength=direction_cells())
+        towards = mi.warp.square_to_uniform_sphere(next_2d(rng))
+        tested = self._scatters(places, towards)
+        reached = _sees_sky(self.scene, places.si.spawn_ray(towards), tested)
+        cell, tested, reached = self._numpy((direction_cell(towards), tested, reached), rng)
+        tests = np.bincount(cell[tested], minlength=direction_cells())
+        seen = np.bincount(cell[reached], minlength=direction_cells())
         reach = seen / np.maximum(tests, 1)
         draws = 64
         cell = dr.arange(mi.UInt32, direction_cells() * draws) // draws
@@ -346,7 +351,7 @@ class EnvironmentGuide:
     @staticmethod
     def _numpy(record, rng):
         """The record's arrays, and the random numbers after it, made by one kernel: the same for
-        all places."""
+        all looks."""
         dr.eval(record, rng)
         return [np.array(x) for x in record]
 
@@ -367,8 +372,7 @@ class EnvironmentGuide:
         return channel_mean(emitter.eval(si, active)) + dr.zeros(mi.Float, dr.width(towards))
 
     def _places(self, sensor):
-        """Places that matter: the first surfaces of camera paths, a list of `(Place, random
-        numbers)`."""
+        """Places that matter: the first surfaces of camera paths, and random numbers for each."""
         rng = streams(dr.arange(mi.UInt32, PILOT_PATHS), mi.UInt32(0x67756964))
         wavelength_sample = 0.5
         ray, throughput = sample_camera_ray(
@@ -376,70 +380,81 @@ class EnvironmentGuide:
         )
         throughput = mi.Spectrum(throughput) + dr.zeros(mi.Spectrum, PILOT_PATHS)
         active = dr.full(mi.Bool, True, PILOT_PATHS)
-        places = []
+        segments = []
         for bounce in range(PILOT_BOUNCES):
             ray.maxt, ray.time = (x + dr.zeros(mi.Float, PILOT_PATHS) for x in (ray.maxt, ray.time))
             dr.make_opaque(ray, active, throughput, rng)  # so that all have the same kernel
+            segments.append((ray.o, ray.d, ray.maxt, ray.time, ray.wavelengths, throughput, active))
+            if bounce == PILOT_BOUNCES - 1:
+                break
             si = self.scene.ray_intersect(ray, active)
-            active &= si.is_valid()
-            bsdf = si.bsdf()
-            smooth = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-            own = streams(
-                dr.arange(mi.UInt32, PILOT_PATHS), dr.opaque(mi.UInt32, 0x706C6163 + bounce)
-            )  # a literal would have kernels made anew
-            places.append((Place(si, bsdf, throughput, smooth), own))
-            bs, value = bsdf.sample(mi.BSDFContext(), si, rng.next_float32(), next_2d(rng), active)
+            active = active & si.is_valid()
+            bs, value = si.bsdf().sample(
+                mi.BSDFContext(), si, rng.next_float32(), next_2d(rng), active
+            )
             throughput = throughput * value
-            active &= channel_mean(throughput) > 0
+            active = active & (channel_mean(throughput) > 0)
             ray = si.spawn_ray(si.to_world(bs.wo))
-            dr.eval(ray, active, throughput, rng, si, smooth, own)
-        return places
+            dr.eval(ray, active, throughput, rng)
+        *ray, throughput, active = (_joined(arrays) for arrays in zip(*segments))
+        si = self.scene.ray_intersect(mi.Ray3f(*ray), active)
+        bsdf = si.bsdf()
+        smooth = active & si.is_valid() & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+        own = streams(dr.arange(mi.UInt32, PILOT_BOUNCES * PILOT_PATHS), mi.UInt32(0x706C6163))
+        dr.eval(si, smooth, own)
+        return Places(si, bsdf, throughput, smooth), own
 
     @staticmethod
-    def _response(place, towards, active):
+    def _response(places, towards, active):
         return channel_mean(
-            place.bsdf.eval(mi.BSDFContext(), place.si, place.si.to_local(towards), active)
+            places.bsdf.eval(mi.BSDFContext(), places.si, places.si.to_local(towards), active)
         )
 
-    def _scatters(self, place, towards):
-        """On which lanes the place scatters light that comes from there."""
-        return place.smooth & (self._response(place, towards, place.smooth) > 0)
+    def _scatters(self, places, towards):
+        """On which lanes the places scatter light that comes from there."""
+        return places.smooth & (self._response(places, towards, places.smooth) > 0)
 
-    def _look(self, index, emitter, place, rng):
+    def _look(self, index, emitter, places, rng):
         """Records (p, direction to the light, table row, weight, density, own density) of a place
         each, where sub-paths of the emitter would come from; the weight estimates what light from
         there adds to the image. The densities of the direction, and of the emitter's own sampler
         there, are zero but for environments; the latter also where next-event estimation has
         something in its way."""
-        pdf = own = dr.zeros(mi.Float, PILOT_PATHS)
+        vertices = dr.width(places.smooth)
+        pdf = own = dr.zeros(mi.Float, vertices)
         if emitter.is_environment():
             towards, pdf, row, _ = self.sample_direction(
-                emitter, mi.UInt32(index), place.si, next_2d(rng), rng.next_float32(), place.smooth
+                emitter,
+                mi.UInt32(index),
+                places.si,
+                next_2d(rng),
+                rng.next_float32(),
+                places.smooth,
             )
-            light = self._radiance(emitter, towards, place.smooth) * dr.select(
+            light = self._radiance(emitter, towards, places.smooth) * dr.select(
                 pdf > 0, dr.rcp(pdf), 0
             )
         else:
-            ds, irradiance = emitter.sample_direction(place.si, next_2d(rng), place.smooth)
+            ds, irradiance = emitter.sample_direction(places.si, next_2d(rng), places.smooth)
             towards, light, row = (
                 ds.d,
                 channel_mean(irradiance),
                 self.row_of_emitter(mi.UInt32(index)),
             )
-        response = self._response(place, towards, place.smooth)
-        ray = place.si.spawn_ray(towards)
-        reached = _sees_sky(self.scene, ray, place.smooth & (response > 0) & (light > 0))
+        response = self._response(places, towards, places.smooth)
+        ray = places.si.spawn_ray(towards)
+        reached = _sees_sky(self.scene, ray, places.smooth & (response > 0) & (light > 0))
         if emitter.is_environment():
-            ds = dr.zeros(mi.DirectionSample3f, PILOT_PATHS)
+            ds = dr.zeros(mi.DirectionSample3f, vertices)
             ds.d = towards
             direct = reached & ~self.scene.ray_test(ray, reached)
-            own = dr.select(direct, emitter.pdf_direction(place.si, ds, direct), 0)
+            own = dr.select(direct, emitter.pdf_direction(places.si, ds, direct), 0)
         weight = dr.select(
-            reached, light * channel_mean(place.throughput) * dr.minimum(response, 1), 0
+            reached, light * channel_mean(places.throughput) * dr.minimum(response, 1), 0
         )
         return (
-            place.si.p,
-            *(x + dr.zeros(type(x), PILOT_PATHS) for x in (towards, row, weight, pdf, own)),
+            places.si.p,
+            *(x + dr.zeros(type(x), vertices) for x in (towards, row, weight, pdf, own)),
         )
 
     # ------------------------------------------------------------------ densities

@@ -49,17 +49,17 @@ class PilotIteration(Protocol):
         """Photons of a kind within `radius` of a vertex, on average; volume photons along beams: of
         a path's way through media."""
 
-    def gather(self, radii: dict[str, np.ndarray]) -> dict[tuple[str, bool], np.ndarray]:
+    def gather(
+        self, radii: dict[str, np.ndarray]
+    ) -> tuple[dict[tuple[str, bool], np.ndarray], np.ndarray | None]:
         """What photons bring for the radii of each kind, by kind and whether the estimate is
-        corrected at edges: mean over the channels, (radii, groups of camera paths, pixels)."""
+        corrected at edges: mean over the channels, (radii, groups of camera paths, pixels). And the
+        second moment of one camera path that meets the light of caustic photons by chance, (groups,
+        pixels); None where nobody asks."""
 
     def direct(self) -> np.ndarray:
         """Light that neither photons bring nor other paths see: mean over the channels, (groups,
         pixels)."""
-
-    def chance(self) -> np.ndarray | None:
-        """After `gather`: the second moment of one camera path that meets the light of caustic
-        photons by chance, (groups, pixels); None where nobody asks."""
 
     def joined(self) -> np.ndarray:
         """Light of photons that are joined with the sensor: mean over the channels, (groups,
@@ -110,9 +110,9 @@ def run_pilot(
         if done == 1:
             radii, photons = choose_ladder(setting, iteration)
         if radii or setting.joins_sensor:
-            gathered.append(iteration.gather(radii))
+            estimates, moment = iteration.gather(radii)
+            gathered.append(estimates)
             direct.append(iteration.direct())
-            moment = iteration.chance()
             if moment is not None:
                 chance.append(moment)
         if setting.joins_sensor:
@@ -124,12 +124,12 @@ def run_pilot(
             break
     samples = None
     if radii or np.any(joined):
-        estimates = {key: np.array([step[key] for step in gathered]) for key in gathered[0]}
+        of_all = {key: np.array([step[key] for step in gathered]) for key in gathered[0]}
         of_photons = np.array(joined) if joined else None
         samples = PilotSamples(
             radii,
             photons,
-            estimates,
+            of_all,
             np.array(direct),
             passes.seen(),
             of_photons,

@@ -605,8 +605,8 @@ def test_direction_cells():
 
 
 def test_places_of_a_guide_share_kernels(rgb):
-    """A guide looks for the sky from four vertices of camera paths with three kernels that take
-    long to compile: one goes from vertex to vertex, two look from each."""
+    """A guide looks for the sky from four vertices of camera paths with few kernels that take long
+    to compile: one goes from vertex to vertex, one meets all of them again, two look from each."""
     scene = tray("lambertian", "constant")
     made = kernels_of(lambda: EnvironmentGuide(scene, scene.sensors()[0]), 800)
     assert 0 < len(made) <= 3
