@@ -388,7 +388,7 @@ class EnvironmentGuide:
             if bounce == PILOT_BOUNCES - 1:
                 break
             si = self.scene.ray_intersect(ray, active)
-            active = active & si.is_valid()
+            active = active & si.is_valid()  # not in place: the segment keeps its own
             bs, value = si.bsdf().sample(
                 mi.BSDFContext(), si, rng.next_float32(), next_2d(rng), active
             )
