@@ -825,7 +825,7 @@ MUTATIONS = [
     ),
     Mutation(
         "integrators/choice.py",
-        "(LEFT if path.integrator.denoised else 1)",
+        "share_left(path.integrator.denoised)",
         "1",
         "all noise of path counts where a denoiser leaves little of it",
         "tests/integrators/test_denoised.py::test_of_the_noise_of_path_a_denoiser_leaves_its_share",

@@ -141,7 +141,7 @@ def denoise(
     split = planes[..., :0]
     if set(direct_channels()) <= set(channels):
         split = planes[..., [channels.index(name) for name in direct_channels()]]
-    if split.any():  # `path` has these channels, and nothing in them
+    if split.any():  # `volpath_multiview` has these channels, and nothing in them
         *direct, variance = np.moveaxis(split, -1, 0)
         light = np.clip(np.stack(direct[: colours.shape[2]], axis=-1), 0, finite)
         found = shrunk(light, without_noise(light, guides), variance)

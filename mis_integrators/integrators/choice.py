@@ -24,7 +24,7 @@ from ..core.traits import UnsupportedScene
 from ..paths.camera import film_sample_count
 from ..paths.layers import written
 from ..paths.path_length_statistics import mean_segments
-from ..pilot.denoiser import LEFT
+from ..pilot.denoiser import share_left
 from ..pilot.noise import MEASURES, trimmed_mean
 from ..pilot.setting import UNPLANNED_ITERATIONS
 from . import costs
@@ -265,7 +265,7 @@ def _samples(path, pixels, first):
         value = channel_mean(radiance) + dr.zeros(mi.Float, at_once * count)
         parts = [channel_mean(part) + dr.zeros(mi.Float, at_once * count) for part in parts]
         start = now()
-        dr.eval(value, parts)
+        dr.eval(value, parts)  # all that a render makes
         dr.sync_thread()
         seconds += now() - start
         values.append(np.array(value).reshape(at_once, count))
@@ -275,7 +275,7 @@ def _samples(path, pixels, first):
 def _trial_of_path(path, values, prediction, budget, cost):
     """`path`, by the `values` of samples that `cost` so much, for a render of this `budget`. How
     noisy caustics are that it meets by chance, photons tell: its few samples may have met none."""
-    share = (LEFT if path.integrator.denoised else 1) / path.camera_paths
+    share = share_left(path.integrator.denoised) / path.camera_paths
     parts = parts_of_samples(path, values, prediction.mean, budget / cost, share)
     for measure, chance in prediction.chance.items():
         squared_bias, variance = parts[measure]

@@ -18,7 +18,7 @@ from ..paths.light_classes import by_class, class_of
 from ..paths.setting import ListedPass
 from ..photons.queries import Queries, trace_camera_paths
 from ..pilot.cost import USUAL_PHOTONS
-from ..pilot.denoiser import LEFT
+from ..pilot.denoiser import share_left
 from ..pilot.direct_paths import (
     EXPONENTS,
     MOST_PATHS,
@@ -116,9 +116,8 @@ class DirectLight:
             rows, columns, nearest = coarser(width, height)
             pixels = (rows[:, None] * width + columns).ravel()
             found = measure(self._trials(pixels), len(columns))
-            self.noise = DirectNoise(*(values[nearest] for values in found))
-            if self.session.integrator.denoised:
-                self.noise = self.noise.times(LEFT)
+            noise = DirectNoise(*(values[nearest] for values in found))
+            self.noise = noise.times(share_left(self.session.integrator.denoised))
         return self.noise
 
     def _trials(self, pixels):

@@ -15,7 +15,7 @@ import numpy as np
 from ..core.spectra import channel_mean
 from ..core.traits import UnsupportedScene
 from ..paths.layers import written
-from ..pilot.denoiser import LEFT
+from ..pilot.denoiser import share_left
 from ..pilot.setting import UNPLANNED_ITERATIONS
 from ..volume.views import views_of
 from .choice import (
@@ -114,18 +114,17 @@ def _judged(camera, photons, iterations, seconds):
     if reason:
         reasons.append(reason)
     else:
-        left = LEFT if photons.integrator.denoised else 1
-        trials.insert(0, _trial_of_camera_paths(camera, prediction, budget, left))
+        trials.insert(0, _trial_of_camera_paths(camera, prediction, budget))
     return decide(trials, reasons, budget, cost)
 
 
-def _trial_of_camera_paths(session, prediction, budget, left):
-    """Camera paths on the pilot's pixels, each of which costs one; `left`: what a denoiser leaves
-    of their noise."""
+def _trial_of_camera_paths(session, prediction, budget):
+    """Camera paths on the pilot's pixels, each of which costs one."""
     pixels = prediction.pixels
     numbers = dr.arange(mi.UInt32, pixels.count) * (pixels.stride * session.camera_paths)
     values = np.empty((PATH_TRIALS, pixels.count))
     for number in range(PATH_TRIALS):
         values[number] = channel_mean(session.radiance(TRIAL_INDEX, numbers, number))
-    parts = parts_of_samples(session, values, prediction.mean, budget, left)
+    share = share_left(session.integrator.denoised)
+    parts = parts_of_samples(session, values, prediction.mean, budget, share)
     return Trial(CAMERA, session, parts, 1.0)

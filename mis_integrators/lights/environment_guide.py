@@ -372,7 +372,10 @@ class EnvironmentGuide:
         return channel_mean(emitter.eval(si, active)) + dr.zeros(mi.Float, dr.width(towards))
 
     def _places(self, sensor):
-        """Places that matter: the first surfaces of camera paths, and random numbers for each."""
+        """Places that matter: the first surfaces of camera paths, and random numbers for each.
+
+        Their segments are intersected again, all at once: what looks from the places is then traced
+        once, which with many BSDFs takes longer than the rays."""
         rng = streams(dr.arange(mi.UInt32, PILOT_PATHS), mi.UInt32(0x67756964))
         wavelength_sample = 0.5
         ray, throughput = sample_camera_ray(
