@@ -191,7 +191,7 @@ class EnvironmentGuide:
             first_rows[index] = row
             row += direction_cells() if emitter.is_environment() else 1
         self.row_count = row
-        self._first_row = mi.UInt32(first_rows)
+        self._first_row = from_numpy(mi.UInt32, first_rows)
         self.direction_share = 1.0
         self.portals = None
         self.aims = False

@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..core.packing import from_numpy
 from ..core.random import next_2d
 from ..core.traits import UnsupportedScene, check_bands
 from ..paths.layers import written
@@ -200,7 +201,7 @@ class Views:
 
         cameras = [Camera.of(s) for s in sensors]
         self.table = {
-            "first": mi.UInt32(np.cumsum([0] + counts[:-1])),
+            "first": from_numpy(mi.UInt32, np.cumsum([0] + counts[:-1])),
             "width": mi.UInt32([w for w, _ in self.sizes]),
             "height": mi.UInt32([h for _, h in self.sizes]),
             "border": mi.UInt32(self.borders),

@@ -268,15 +268,23 @@ def grey_pictures(session, count):
     return np.array([picture[..., :3].mean(axis=2) for picture in pictures(session, count)])
 
 
-def kernels_of(run, operations=0):
-    """Hashes of the kernels, of more than so many operations, that `run()` launches."""
+def _launched(run):
+    """The history's entries of the kernels that `run()` launches."""
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True), watched_kernels() as kernels:
         run()
+    return [kernel for kernel in kernels if kernel["type"] == dr.KernelType.JIT]
+
+
+def kernels_of(run, operations=0):
+    """Hashes of the kernels, of more than so many operations, that `run()` launches."""
     return {
-        kernel["hash"]
-        for kernel in kernels
-        if kernel["type"] == dr.KernelType.JIT and kernel["operation_count"] > operations
+        kernel["hash"] for kernel in _launched(run) if kernel["operation_count"] > operations
     }
+
+
+def kernel_sources(run):
+    """The code, in LLVM's language, of the kernels that `run()` launches."""
+    return [kernel["ir"].getvalue() for kernel in _launched(run)]
 
 
 class SessionBatches:
