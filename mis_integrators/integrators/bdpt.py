@@ -18,7 +18,6 @@ from ..core.packing import rounded_up
 from ..core.random import vertex_streams
 from ..core.recording import lanes
 from ..mis.vertex_merging import ConnectionWeights
-from ..paths.camera import with_gaps
 from ..paths.connect import by_path, join, kept_between, list_pairs, visible
 from ..paths.layers import CHANNELS, SPLIT
 from ..paths.light_classes import LightClasses, class_of
@@ -192,11 +191,11 @@ class BDPTSession(SubpathSession):
         classes = None
         if self.integrator.splits_light:
             classes = LightClasses(self.chunk, None, ("met", "next_event"))
-        first = with_gaps(first, skip, self.chunk, self.camera_paths)
+        path = self.part_of_paths(first, skip)
         radiance, alpha, position, vertices, count = trace_camera_subpaths(
             self.world,
             self.limits,
-            self.describe_camera_pass(sensor, sequence, first, spectral),
+            self.describe_camera_pass(sensor, sequence, path, spectral),
             self.weights(spectral),
             self.capacity["camera"],
             ledger,

@@ -248,27 +248,18 @@ def _samples(path, pixels, first):
         PATH_TRIALS if mi.is_spectral else 1
     )  # wavelengths are shared by all that is traced at once
     at_once = PATH_TRIALS // passes
-    count, stride = pixels.count, pixels.stride * path.camera_paths
-    trial = lanes(at_once * count) // count
-    back = trial * (-count * stride % 2**32)  # to the first pixel
+    lane = lanes(at_once * pixels.count)
+    trial = lane // pixels.count
+    pixel = (lane - trial * pixels.count) * pixels.stride
     values, seconds = [], 0.0
     for number in range(first, first + passes):
         spectral = path._spectral(TRIAL_INDEX + number)
-        radiance, *_, parts = path.trace(
-            TRIAL_INDEX,
-            back,
-            stride,
-            at_once * count,
-            spectral,
-            trial + dr.opaque(mi.UInt32, number),  # one kernel for all
-        )
-        value = channel_mean(radiance) + dr.zeros(mi.Float, at_once * count)
-        parts = [channel_mean(part) + dr.zeros(mi.Float, at_once * count) for part in parts]
         start = now()
-        dr.eval(value, parts)  # all that a render makes
+        radiance, *_ = path.trace(TRIAL_INDEX, pixel, trial + number, spectral)
         dr.sync_thread()
         seconds += now() - start
-        values.append(np.array(value).reshape(at_once, count))
+        value = channel_mean(radiance) + dr.zeros(mi.Float, len(lane))
+        values.append(np.array(value).reshape(at_once, pixels.count))
     return np.concatenate(values), seconds
 
 

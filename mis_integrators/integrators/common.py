@@ -12,7 +12,7 @@ import numpy as np
 
 from ..core.film import Accumulator, direct_channels, shared_wavelengths, variance_channels
 from ..core.random import mix, reversed_bits
-from ..core.recording import settle
+from ..core.recording import lanes, settle
 from ..core.render_lock import render_lock, under_render_lock
 from ..core.sequences import SampleSequence
 from ..core.traits import (
@@ -28,7 +28,7 @@ from ..core.traits import (
 )
 from ..core.untrusted import Fields
 from ..lights.lights import Lights
-from ..paths.camera import film_sample_count, with_gaps
+from ..paths.camera import film_sample_count
 from ..paths.layers import CHANNELS, channel_names, render_layers, written
 from ..paths.light_classes import CLASSES
 from ..paths.setting import CameraPass, LightPass, Limits, World
@@ -421,17 +421,18 @@ class IterativeSession:
         shutter = sensor.shutter_open(), sensor.shutter_open_time()
         return LightPass(sequence, count, spectral["wavelengths"], *shutter, first)
 
-    def describe_camera_pass(self, sensor, sequence, first, spectral):
-        """The camera paths of a part, from number `first` on."""
-        return CameraPass(
-            sensor,
-            self.integrator,
-            sequence,
-            first,
-            self.chunk,
-            self.camera_paths,
-            spectral["sample"],
-        )
+    def part_of_paths(self, first, skip=0):
+        """The numbers of a part's camera paths, all those of a pixel together: from `first` on,
+        with gaps of `skip` after each pixel's. The last part may have some that are beyond the
+        film's."""
+        path = lanes(self.chunk)
+        return path + first + path // self.camera_paths * skip
+
+    def describe_camera_pass(self, sensor, sequence, path, spectral):
+        """The camera paths of these numbers (as of `part_of_paths`)."""
+        pixel = path // self.camera_paths
+        index = path - pixel * self.camera_paths
+        return CameraPass(sensor, self.integrator, sequence, pixel, index, spectral["sample"])
 
     def sum_of_chunks(self, render):
         """What `render(chunk, first)` returns, a tuple of tensors or `None`s, summed over all
@@ -447,18 +448,14 @@ class IterativeSession:
         return total
 
     def all_over_the_film(self, chunk=0):
-        """Numbers `first` and `skip` (see `with_gaps`) of a part's camera paths that see all of the
-        film: for pilots, or for all parts."""
+        """Numbers `first` and `skip` (see `part_of_paths`) of a part's camera paths that see all of
+        the film: for pilots, or for all parts."""
         paths = self.camera_paths
         return dr.opaque(mi.UInt32, chunk * paths), dr.opaque(mi.UInt32, paths * (self.chunks - 1))
 
     def in_chunk(self, first, skip=0):
-        """Which of `chunk` paths from number `first` on there are, with gaps of `skip` after each
-        pixel's: the last part may have fewer."""
-        return (
-            dr.arange(mi.UInt32, self.chunk) + with_gaps(first, skip, self.chunk, self.camera_paths)
-            < self.path_count
-        )
+        """Which of the `part_of_paths` there are."""
+        return self.part_of_paths(first, skip) < self.path_count
 
     def _run(self, iteration):
         """Adds an iteration to the sums."""

@@ -15,7 +15,7 @@ from ..core.sequences import SampleSequence
 from ..core.spectra import channel_mean
 from ..paths.camera import film_sample_count, film_size
 from ..paths.light_classes import by_class, class_of
-from ..paths.setting import ListedPass
+from ..paths.setting import CameraPass
 from ..photons.queries import Queries, trace_camera_paths
 from ..pilot.cost import USUAL_PHOTONS
 from ..pilot.denoiser import share_left
@@ -199,13 +199,12 @@ class DirectLight:
         finite counts as none: the paths that gather meet its cause, too, and tell of it."""
         pixel, number, of_pixel = part
         session = self.session
-        camera_pass = ListedPass(
+        camera_pass = CameraPass(
             sensor,
             session.integrator,
             sequence,
             pixel,
             done * of_pixel + number,
-            dr.width(pixel),
             spectral["sample"],
         )
         radiance, alpha, position, _, _ = trace_camera_paths(

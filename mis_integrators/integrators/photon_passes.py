@@ -163,11 +163,17 @@ class PhotonPasses(PilotedSession):
         """The weights of camera paths (a `mis.state.MergeState`); None where there are none."""
         return None
 
-    def _trace_camera(
-        self, camera_pass, capacity, spectral, first=1.0, beyond=None, classes=None, beams=0
-    ):
-        """Traces the paths of a `CameraPass`, with room for so many vertices and beams; other
-        arguments as of `trace_camera_paths`."""
+    def _trace_camera(self, camera_pass, capacity, spectral, first=1.0, beyond=None, beams=0):
+        """What `trace_camera_paths` returns, and the radiance by class (a list; empty where none is
+        kept), with room for so many vertices and beams. All is evaluated, and what differs between
+        pilots and renders is evaluated before: they share the kernel, which takes long to
+        compile."""
+        paths, kept, classes = dr.width(camera_pass.pixel), self.integrator.kept_classes, None
+        first = dr.opaque(mi.Float, first)
+        beyond = dr.full(mi.Float, 1, paths) if beyond is None else beyond
+        dr.make_opaque(camera_pass.pixel, camera_pass.index, beyond)
+        if kept:
+            classes = LightClasses(paths, None, ("met", "next_event"))
         queries = Queries(
             bdd=self.last_vertex,
             capacity=capacity,
@@ -181,16 +187,12 @@ class PhotonPasses(PilotedSession):
             near_zone=self.near_zone,
             meets_lights=self.by_chance,
         )
-        return trace_camera_paths(
-            self.world,
-            self.limits,
-            camera_pass,
-            queries,
-            self._merge_state(spectral),
-            first,
-            beyond,
-            classes,
+        merge_state = self._merge_state(spectral)
+        found = trace_camera_paths(
+            self.world, self.limits, camera_pass, queries, merge_state, first, beyond, classes
         )
+        dr.eval(found, classes and classes.entries)
+        return *found, classes.radiance()[:kept] if classes else []
 
     def _join_sensor(self, sensor, in_media, seed, spectral):
         """The `SensorLight` of an iteration's volume photons: its values are radiance."""
@@ -384,28 +386,14 @@ class PhotonPasses(PilotedSession):
         )
 
     def _render_chunk(self, scene, sensor, tables, maps, sequence, first, spectral, radii, beyond):
-        camera_pass = self.describe_camera_pass(sensor, sequence, first, spectral)
-        there = self.in_chunk(first)
+        path = self.part_of_paths(first)
+        camera_pass = self.describe_camera_pass(sensor, sequence, path, spectral)
+        there = path < self.path_count
         if beyond is not None:
-            pixel = (dr.arange(mi.UInt32, self.chunk) + first) // self.camera_paths
-            beyond = dr.gather(mi.Float, beyond, pixel, there)
-        classes, kept = None, self.integrator.kept_classes
-        if kept:
-            classes = LightClasses(self.chunk, None, ("met", "next_event"))
-        radiance, alpha, position, vertices, count = self._trace_camera(
-            camera_pass,
-            self.vertex_capacity,
-            spectral,
-            1.0,
-            beyond,
-            classes,
-            self.beam_capacity,
+            beyond = dr.gather(mi.Float, beyond, camera_pass.pixel, there)
+        radiance, alpha, position, vertices, count, classes = self._trace_camera(
+            camera_pass, self.vertex_capacity, spectral, 1.0, beyond, self.beam_capacity
         )
-        if classes is not None:
-            dr.eval(radiance, alpha, position, vertices, count, classes.entries)
-            classes = classes.radiance()[:kept]
-        elif radii:
-            dr.eval(radiance, alpha, position, vertices, count)
         for kind, radius in radii.items():
             photon_map = self._map_again(maps[kind], kind, radius)
             parts = self._gather(photon_map, vertices, kind, [radius], spectral)
@@ -424,7 +412,7 @@ class PhotonPasses(PilotedSession):
             radiance = dr.select(
                 alpha > 0, radiance, 0
             )  # as `path` does: what is behind nothing but null surfaces is hidden
-            classes = classes and [dr.select(alpha > 0, light, 0) for light in classes]
+            classes = [dr.select(alpha > 0, light, 0) for light in classes]
         return splat_samples(
             sensor.film(),
             position,
@@ -433,7 +421,7 @@ class PhotonPasses(PilotedSession):
             spectral["matrix"],
             there,
             1 if beyond is None else dr.rcp(beyond),
-            classes or (),
+            classes,
         ), {"vertices": count, "beams": vertices.get("beam_count")}
 
     def _photons(self, iteration, spectral, purpose=LIGHT):

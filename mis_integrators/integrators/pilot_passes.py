@@ -3,7 +3,6 @@ radii."""
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import NamedTuple
 
 import drjit as dr
@@ -14,6 +13,7 @@ from ..core.packing import with_reserve
 from ..core.recording import lanes
 from ..core.spectra import channel_mean
 from ..paths.camera import film_sample_count, pixel_at
+from ..paths.setting import CameraPass
 from ..photons.queries import read_queries
 from ..pilot.radius import middle_index
 
@@ -34,22 +34,15 @@ class SubsetPasses:
     def _record_camera(self, capacity, beams):
         session, pixels = self.session, self.pixels
         self.capacity, self.beam_capacity = capacity, beams
-        stride = pixels.stride * pixels.camera_paths
 
         def trace(scene, sensor, tables, sequence, spectral):
-            number = lanes(pixels.paths) // pixels.count  # of a path through its pixel
-            group = number * pixels.groups // pixels.camera_paths
-            first = number * ((1 - pixels.count * stride) % 2**32)  # back to the first pixel
-            first += group * (pixels.apart * pixels.camera_paths)
-            camera_pass = replace(
-                session.describe_camera_pass(sensor, sequence, first, spectral),
-                count=pixels.paths,
-                camera_paths=pixels.camera_paths,
-                stride=stride,
-            )
-            return session._trace_camera(
-                camera_pass, capacity, spectral, 0.0, mi.Float(1), beams=beams
-            )
+            path = lanes(pixels.paths)
+            index = path // pixels.count  # of a path in its pixel
+            pixel = (path - index * pixels.count) * pixels.stride
+            pixel += index * pixels.groups // pixels.camera_paths * pixels.apart
+            wavelength = spectral["sample"]
+            camera_pass = CameraPass(sensor, session.integrator, sequence, pixel, index, wavelength)
+            return session._trace_camera(camera_pass, capacity, spectral, 0.0, beams=beams)
 
         self._camera = session.recorded(trace)
 
@@ -105,7 +98,7 @@ class SubsetPasses:
         grows and the pass runs again."""
         session = self.session
         while True:
-            radiance, _, _, vertices, count = self._camera(
+            radiance, _, _, vertices, count, _ = self._camera(
                 session.scene, session.sensor, session._tables, sequence, spectral
             )
             counts = {"vertices": count, "beams": vertices.get("beam_count")}

@@ -128,11 +128,11 @@ class PublishedSession(BDPMSession):
         """The image of the camera paths from number `first` on."""
         integrator = self.integrator
         there = self.in_chunk(first)
+        path = self.part_of_paths(first)
+        camera_pass = self.describe_camera_pass(self.sensor, sequence, path, spectral)
         beyond = self.direct_light.beyond
         if beyond is not None:
-            pixel = (dr.arange(mi.UInt32, self.chunk) + first) // self.camera_paths
-            beyond = dr.gather(mi.Float, beyond, pixel, there)
-        camera_pass = self.describe_camera_pass(self.sensor, sequence, first, spectral)
+            beyond = dr.gather(mi.Float, beyond, camera_pass.pixel, there)
         last = integrator.first_vertex + integrator.strategies - 1
         capacity = self.chunk
         while True:

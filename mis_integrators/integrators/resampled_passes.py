@@ -20,7 +20,6 @@ from ..core.spectra import channel_mean
 from ..mis.published_resampling import PublishedWeights, unknown_tables
 from ..mis.resampling import ResampledWeights, guessed_weight, uniform_tables
 from ..mis.step_sums import LightEnd, sum_before
-from ..paths.camera import with_gaps
 from ..paths.camera_vertices import STEP, hit_layout, trace_camera_vertices
 from ..paths.light_classes import LightClasses, class_of
 from ..paths.light_starts import sample_light_starts
@@ -189,11 +188,11 @@ class ResampledPasses(SubpathSession):
     # ------------------------------------------------------------------ passes
 
     def _trace_camera(self, scene, sensor, tables, sequence, first, skip, spectral):
-        first = with_gaps(first, skip, self.chunk, self.camera_paths)
+        path = self.part_of_paths(first, skip)
         return trace_camera_vertices(
             self.world,
             self.limits,
-            self.describe_camera_pass(sensor, sequence, first, spectral),
+            self.describe_camera_pass(sensor, sequence, path, spectral),
             self.weights(spectral),
             self.ratio,
             self.capacity["camera"],

@@ -7,6 +7,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.film import splat_samples
+from ..core.recording import recorder
 from ..core.untrusted import Fields
 from ..paths.camera import film_sample_count, start_camera_paths
 from ..paths.setting import CameraPass
@@ -54,6 +55,7 @@ class PathSession(IterativeSession):
     def __init__(self, integrator, scene, sensor, seed, iterations):
         super().__init__(integrator, scene, sensor, seed, iterations)
         self.path_integrator = self._path(integrator.max_depth)
+        self._trace = recorder()(self._trace_paths)
         self.segments_apart = 0  # of the longest paths whose light is kept apart
         if integrator.denoised:
             longest = DIRECT_SEGMENTS if integrator.max_depth < 0 else integrator.max_depth
@@ -92,42 +94,48 @@ class PathSession(IterativeSession):
         fields.finish()
         self.split_paths(CHUNK)
 
-    def trace(self, iteration, first, stride, paths, spectral, variation=0):
-        """Radiance and alpha of camera paths `first`, `first + stride`, ..., their positions on the
-        film, which of them there are, and the part of the radiance that is `direct` (a list: none
-        where none is kept). Where `first` and `variation` are arrays, each lane has its own; the
-        variations of a pixel's first path are parts of one sequence."""
+    def trace(self, iteration, pixel, index, spectral):
+        """Camera paths of an iteration, of number `index` in their `pixel` (uint32 arrays): their
+        radiance and alpha, positions on the film, which of them there are, and the part of the
+        radiance that is direct (a list: empty where none is kept). All is evaluated, and so are the
+        arguments: trials and renders share the kernel."""
+        dr.make_opaque(pixel, index)
         sequence = self._sequence(iteration, PATHS, self.camera_paths)
-        sequence.first += variation
-        camera_pass = CameraPass(
-            self.sensor, None, sequence, first, paths, self.camera_paths, spectral["sample"], stride
-        )
+        return self._trace(self.scene, self.sensor, sequence, pixel, index, spectral)
+
+    def _trace_paths(self, scene, sensor, sequence, pixel, index, spectral):
+        camera_pass = CameraPass(sensor, None, sequence, pixel, index, spectral["sample"])
         _, active, numbers, ray, weight, position, _ = start_camera_paths(camera_pass)
         differential = mi.RayDifferential3f(ray)
         radiance, valid, _ = self.path_integrator.sample(
-            self.scene, PathSampler(numbers), differential, None, active
+            scene, PathSampler(numbers), differential, None, active
         )
         direct = []
         if self.integrator.denoised:
             # The same numbers make the same vertices and shadow rays: nothing is counted twice.
             part, *_ = self.direct_integrator.sample(
-                self.scene, PathSampler(numbers), differential, None, active
+                scene, PathSampler(numbers), differential, None, active
             )
             direct.append(dr.select(active, weight * part, 0))
-        return (
+        found = (
             dr.select(active, weight * radiance, 0),
             dr.select(valid, mi.Float(1), 0),
             position,
             active,
             direct,
         )
+        dr.eval(found)
+        return found
 
     def _iteration(self, iteration):
         spectral = self._spectral(iteration)
 
         def render(chunk, first):
+            path = self.part_of_paths(first)
+            pixel = path // self.camera_paths
+            index = path - pixel * self.camera_paths
             radiance, alpha, position, active, classes = self.trace(
-                iteration, first, 1, self.chunk, spectral
+                iteration, pixel, index, spectral
             )
             return (
                 splat_samples(

@@ -230,7 +230,7 @@ class EnvironmentGuide:
         places, rng = self._places(sensor)
         self._learn_directions(places, rng)
         records = [
-            self._numpy(self._look(index, emitter, places, rng), rng)
+            [np.array(x) for x in self._look(index, emitter, places, rng)]
             for index, emitter in self.infinite
             for _ in range(TESTS if emitter.is_environment() else 1)
         ]
@@ -317,9 +317,11 @@ class EnvironmentGuide:
             return
         _, emitter = environment
         towards = mi.warp.square_to_uniform_sphere(next_2d(rng))
-        tested = self._scatters(places, towards)
-        reached = _sees_sky(self.scene, places.si.spawn_ray(towards), tested)
-        cell, tested, reached = self._numpy((direction_cell(towards), tested, reached), rng)
+        dr.eval(towards, rng)
+        response, reached, _ = self._test(places, towards, places.smooth)
+        cell, tested, reached = (
+            np.array(x) for x in (direction_cell(towards), response > 0, reached)
+        )
         tests = np.bincount(cell[tested], minlength=direction_cells())
         seen = np.bincount(cell[reached], minlength=direction_cells())
         reach = seen / np.maximum(tests, 1)
@@ -347,13 +349,6 @@ class EnvironmentGuide:
         pmf = smooth_power / smooth_power.sum()
         self._direction_pmf = from_numpy(mi.Float, pmf)
         self._direction_cdf = from_numpy(mi.Float, np.cumsum(pmf))
-
-    @staticmethod
-    def _numpy(record, rng):
-        """The record's arrays, and the random numbers after it, made by one kernel: the same for
-        all looks."""
-        dr.eval(record, rng)
-        return [np.array(x) for x in record]
 
     @staticmethod
     def _point(p, time):
@@ -407,15 +402,17 @@ class EnvironmentGuide:
         dr.eval(si, smooth, own)
         return Places(si, bsdf, throughput, smooth), own
 
-    @staticmethod
-    def _response(places, towards, active):
-        return channel_mean(
-            places.bsdf.eval(mi.BSDFContext(), places.si, places.si.to_local(towards), active)
-        )
-
-    def _scatters(self, places, towards):
-        """On which lanes the places scatter light that comes from there."""
-        return places.smooth & (self._response(places, towards, places.smooth) > 0)
+    def _test(self, places, towards, active):
+        """What the places make of light from `towards`: their BSDF's value, whether a ray gets
+        there through panes, and whether nothing at all is in its way. Evaluated, as the arguments
+        are to be: all tests have the same kernel, which with many BSDFs takes long to compile."""
+        value = places.bsdf.eval(mi.BSDFContext(), places.si, places.si.to_local(towards), active)
+        response = dr.select(active, channel_mean(value), 0)
+        ray = places.si.spawn_ray(towards)
+        reached = _sees_sky(self.scene, ray, active & (response > 0))
+        direct = reached & ~self.scene.ray_test(ray, reached)
+        dr.eval(response, reached, direct)
+        return response, reached, direct
 
     def _look(self, index, emitter, places, rng):
         """Records (p, direction to the light, table row, weight, density, own density) of a place
@@ -444,21 +441,22 @@ class EnvironmentGuide:
                 channel_mean(irradiance),
                 self.row_of_emitter(mi.UInt32(index)),
             )
-        response = self._response(places, towards, places.smooth)
-        ray = places.si.spawn_ray(towards)
-        reached = _sees_sky(self.scene, ray, places.smooth & (response > 0) & (light > 0))
+        lit = places.smooth & (light > 0)
+        dr.eval(towards, light, pdf, row, lit, rng)
+        response, reached, direct = self._test(places, towards, lit)
         if emitter.is_environment():
             ds = dr.zeros(mi.DirectionSample3f, vertices)
             ds.d = towards
-            direct = reached & ~self.scene.ray_test(ray, reached)
             own = dr.select(direct, emitter.pdf_direction(places.si, ds, direct), 0)
         weight = dr.select(
             reached, light * channel_mean(places.throughput) * dr.minimum(response, 1), 0
         )
-        return (
+        record = (
             places.si.p,
             *(x + dr.zeros(type(x), vertices) for x in (towards, row, weight, pdf, own)),
         )
+        dr.eval(record)
+        return record
 
     # ------------------------------------------------------------------ densities
 

@@ -12,7 +12,7 @@ from ..core.random import next_1d_and_2d, next_2d
 from .camera_rays import sample_camera_ray
 from .media import begin_flights, interaction_at, medium_behind, sample_phase
 from .roulette import russian_roulette
-from .setting import CameraPass, Limits, ListedPass, World
+from .setting import CameraPass, Limits, World
 
 Array = State = Any
 
@@ -72,7 +72,7 @@ def within_crop(film, splat):
     return dr.all((splat >= offset) & (splat < offset + size))
 
 
-def start_camera_paths(camera_pass: CameraPass | ListedPass):
+def start_camera_paths(camera_pass: CameraPass):
     """Camera rays of a pass.
 
     Returns `(path, active, numbers, ray, weight, splat, aperture)`: the index of each, whether
@@ -80,8 +80,8 @@ def start_camera_paths(camera_pass: CameraPass | ListedPass):
     position for splatting, and the sample that chose the point of the lens.
     """
     sensor = camera_pass.sensor
-    path = dr.arange(mi.UInt32, camera_pass.count)
-    pixel, numbers = camera_pass.pixels_and_numbers(path)
+    pixel, numbers = camera_pass.pixel, camera_pass.numbers
+    path = dr.arange(mi.UInt32, dr.width(pixel))
     active = pixel < film_sample_count(sensor)
     rng = numbers.at(0)
     unit, splat = film_samples(sensor, pixel, rng)
@@ -98,12 +98,6 @@ def start_camera_paths(camera_pass: CameraPass | ListedPass):
 def whole_or_nothing(visible):
     """The coverage of paths: one where they are `visible`, as of `CameraArrival`."""
     return dr.select(visible, mi.Float(1), mi.Float(0))
-
-
-def with_gaps(first, skip, n_paths: int, camera_paths: int):
-    """What a `CameraPass` with a `stride` of one takes as `first` to leave out `skip` numbers after
-    each pixel's `camera_paths`."""
-    return first + dr.arange(mi.UInt32, n_paths) // camera_paths * skip
 
 
 def behind_emitters(scene, integrator, hit, ray, active):
@@ -212,7 +206,7 @@ def traveller(visitor, numbers, path, hide_emitters):
 def trace_camera(
     world: World,
     limits: Limits,
-    camera_pass: CameraPass | ListedPass,
+    camera_pass: CameraPass,
     visitor: CameraVisitor,
 ):
     """Traces the camera paths of a pass and shows what they meet to the `visitor`.
@@ -229,7 +223,7 @@ def trace_camera(
     depth = mi.UInt32(0)
     eta = mi.Float(1)
     context = mi.BSDFContext()
-    state = visitor.begin(camera_pass.count, splat, aperture)
+    state = visitor.begin(dr.width(path), splat, aperture)
     visible = mi.Bool((scene.environment() is not None) and not hide_emitters)
     if dr.hint(max_depth == 0, mode="scalar"):
         active &= False

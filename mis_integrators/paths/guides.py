@@ -59,14 +59,13 @@ def first_smooth_surface(scene, camera_pass, hide_emitters=False):
 def camera_passes(sensor, samples: int, seed=0):
     """Passes of one camera path a pixel each, `samples` of them: parts of one sequence, each with
     wavelengths of its own. `seed`: an integer."""
+    pixels = dr.arange(mi.UInt32, film_sample_count(sensor))
     for number in range(samples):
         sequence = SampleSequence(
             dr.opaque(mi.UInt32, seed), dr.opaque(mi.UInt32, number), 1, low_discrepancy=True
         )
         wavelength = dr.opaque(mi.Float, reversed_bits(number) / 2**32)
-        yield CameraPass(
-            sensor, None, sequence, mi.UInt32(0), film_sample_count(sensor), 1, wavelength
-        )
+        yield CameraPass(sensor, None, sequence, pixels, mi.UInt32(0), wavelength)
 
 
 def displayed_albedo(albedo):

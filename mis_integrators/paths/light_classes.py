@@ -52,9 +52,9 @@ def scattered_history(history, delta, active):
 
 
 class LightClasses:
-    """Radiance of `paths` camera paths by class: `entries`, an array of all their spectra for each
-    class, one after the other, by the name of what finds it. `new`: names of entries that are yet
-    to be filled. (A plain object, as `core.packing.Store`.)"""
+    """Radiance of `paths` camera paths by class: `entries`, an array of the spectra of each path's
+    classes, path by path, by the name of what finds it. `new`: names of entries that are yet to be
+    filled. (A plain object, as `core.packing.Store`.)"""
 
     def __init__(self, paths, entries, new=()):
         self.paths = paths
@@ -67,7 +67,7 @@ class LightClasses:
             dr.ReduceOp.Add,
             self.entries[_key(name)],
             value,
-            number * self.paths + path,
+            path * len(CLASSES) + number,
             mask,
             dr.ReduceMode.Direct,
         )
@@ -78,7 +78,7 @@ class LightClasses:
         mine = [entry for name, entry in self.entries.items() if name.startswith(_key(""))]
         return [
             sum(
-                (dr.gather(mi.Spectrum, entry, place * self.paths + path) for entry in mine),
+                (dr.gather(mi.Spectrum, entry, path * len(CLASSES) + place) for entry in mine),
                 mi.Spectrum(0),
             )
             for place in range(len(CLASSES))

@@ -21,18 +21,11 @@ SMOOTH_VERTICES = 4
 @dr.syntax
 def count_segments(scene, sensor, seed, stride: int, paths: int, max_depth: int, rr_depth: int):
     """Segments of BSDF-sampled camera paths that end as those of Mitsuba's `path` do: an array
-    (`SMOOTH_VERTICES` + 1,), mean over `paths` paths, numbers 0, `stride`, ...; entry k counts the
-    segments that follow k smooth vertices (the last entry: or more)."""
-    camera_pass = CameraPass(
-        sensor,
-        None,
-        SampleSequence(seed, mi.UInt32(0), 1, False),
-        mi.UInt32(0),
-        paths,
-        1,
-        mi.Float(0.5),
-        stride,
-    )
+    (`SMOOTH_VERTICES` + 1,), mean over `paths` paths, one through each of the pixels 0, `stride`,
+    ...; entry k counts the segments that follow k smooth vertices (the last entry: or more)."""
+    sequence = SampleSequence(seed, mi.UInt32(0), 1, False)
+    pixel = dr.arange(mi.UInt32, paths) * stride
+    camera_pass = CameraPass(sensor, None, sequence, pixel, mi.UInt32(0), mi.Float(0.5))
     _, active, numbers, ray, weight, _, _ = start_camera_paths(camera_pass)
     throughput = mi.Spectrum(weight)
     eta = mi.Float(1)

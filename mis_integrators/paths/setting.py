@@ -55,44 +55,22 @@ class LightPass:
 
 @dataclass(frozen=True)
 class CameraPass:
-    """`count` camera paths through a `sensor`: numbers `first`, `first + stride`, ... of
-    `camera.film_samples`, where each pixel has `camera_paths`.
+    """Camera paths through a `sensor`: path i is the one of number `index[i]` in the sequence of
+    `pixel[i]` (uint32, one a path; a pixel that the film does not have: no path).
 
-    `integrator`: what moves rays on behind emitters that are hidden (None: none are);
-    `sequence`: their random numbers (a `SampleSequence`); `first`: uint32
-    of width one, or one a path (see `camera.with_gaps`); `wavelength_sample`: in
-    [0, 1), makes the wavelengths that all paths share.
+    `integrator`: what moves rays on behind emitters that are hidden (None: none are); `sequence`:
+    their random numbers (a `SampleSequence`); `wavelength_sample`: in [0, 1), makes the wavelengths
+    that all paths share.
     """
-
-    sensor: Any
-    integrator: Any
-    sequence: Any
-    first: Array
-    count: int
-    camera_paths: int
-    wavelength_sample: Array
-    stride: int = 1
-
-    def pixels_and_numbers(self, path):
-        """The pixel of each path, and its random numbers (`PathNumbers`)."""
-        number = path * self.stride + self.first
-        return number // self.camera_paths, self.sequence.of_paths(number)
-
-
-@dataclass(frozen=True)
-class ListedPass:
-    """`count` camera paths through any pixels: path i is the one of number `index[i]` in the
-    sequence of `pixel[i]` (uint32; a pixel that the film does not have: no path). All else as in
-    `CameraPass`."""
 
     sensor: Any
     integrator: Any
     sequence: Any
     pixel: Array
     index: Array
-    count: int
     wavelength_sample: Array
 
-    def pixels_and_numbers(self, path):
-        """As of `CameraPass`; the paths are those of all lanes."""
-        return self.pixel, self.sequence.of_members(self.pixel, self.index)
+    @property
+    def numbers(self):
+        """The paths' random numbers (`PathNumbers`)."""
+        return self.sequence.of_members(self.pixel, self.index)

@@ -18,7 +18,7 @@ from ..core.spectra import channel_mean
 from ..paths.camera import trace_camera, whole_or_nothing
 from ..paths.light_classes import class_of, scattered_history, start_of_camera_path
 from ..paths.media import direct_light, next_hit_either, next_hit_straight_on
-from ..paths.setting import CameraPass, Limits, ListedPass, World
+from ..paths.setting import CameraPass, Limits, World
 from ..paths.subpaths import selected, smooth_at
 from ..paths.vertex import PhaseOrBSDF, Sides
 from .beams import FIRST, LEVEL_SHIFT, LONG, SHORT, beam_layout, new_beams
@@ -373,7 +373,7 @@ class QueryVisitor:
             throughput,
             cosine,
             scatter_pdf,
-            met & (dr.max(light) > 0) & (slot < self.queries.capacity),
+            met & (dr.max(light) > 0) & (slot < self.store.room),
         )
 
     def unfinished(self, state, at):
@@ -544,7 +544,7 @@ class QueryVisitor:
 def trace_camera_paths(
     world: World,
     limits: Limits,
-    camera_pass: CameraPass | ListedPass,
+    camera_pass: CameraPass,
     queries: Queries,
     weights=None,
     first=1.0,

@@ -277,9 +277,7 @@ def _launched(run):
 
 def kernels_of(run, operations=0):
     """Hashes of the kernels, of more than so many operations, that `run()` launches."""
-    return {
-        kernel["hash"] for kernel in _launched(run) if kernel["operation_count"] > operations
-    }
+    return {kernel["hash"] for kernel in _launched(run) if kernel["operation_count"] > operations}
 
 
 def kernel_sources(run):

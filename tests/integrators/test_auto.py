@@ -166,10 +166,9 @@ def test_pilot_of_path_draws_independent_numbers(rgb):
     def radiance(sampler, variation):
         session = Unidirectional(sampler=sampler).session(scene, 0, 1, 0)
         spectral = session._spectral(PILOT_INDEX)
-        first = dr.opaque(mi.UInt32, 0)
-        return np.array(
-            session.trace(PILOT_INDEX, first, 1, 500, spectral, mi.UInt32(variation))[0]
-        )
+        pixels = dr.arange(mi.UInt32, 500)
+        index = dr.full(mi.UInt32, variation, 500)
+        return np.array(session.trace(PILOT_INDEX, pixels, index, spectral)[0])
 
     scene = tray("lambertian", "rectangle")
     for variation in (0, 1):

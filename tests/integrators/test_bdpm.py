@@ -1380,7 +1380,8 @@ def test_buffers_that_grow_keep_their_kernels(rgb):
         sequence = session._sequence(0, 0, 100)
 
         def traced(session=session, spectral=spectral, sequence=sequence):
-            seen = session.describe_camera_pass(session.sensor, sequence, mi.UInt32(0), spectral)
+            path = session.part_of_paths(mi.UInt32(0))
+            seen = session.describe_camera_pass(session.sensor, sequence, path, spectral)
             light = session._trace_light(session.scene, session.sensor, [], sequence, spectral)
             dr.eval(light)
             dr.eval(session._trace_camera(seen, session.vertex_capacity, spectral))

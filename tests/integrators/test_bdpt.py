@@ -394,7 +394,7 @@ def test_states_of_traced_subpaths(rgb, kind):
         *_, vertices, found = trace_camera_subpaths(
             world,
             Limits(6, 50),
-            CameraPass(sensor, None, sequence, mi.UInt32(0), 64, 1, 0.5),
+            CameraPass(sensor, None, sequence, dr.arange(mi.UInt32, 64), mi.UInt32(0), 0.5),
             weights,
             capacity,
         )

@@ -374,7 +374,8 @@ def test_states_behind_half_transparent_surfaces(rgb, kind):
         light_pass = LightPass(sequence, 2000, [])
         vertices, found, _ = trace_light_subpaths(world, limits, light_pass, weights, capacity)
     else:
-        camera_pass = CameraPass(sensor, None, sequence, mi.UInt32(0), 256, 4, 0.5)
+        path = dr.arange(mi.UInt32, 256)
+        camera_pass = CameraPass(sensor, None, sequence, path // 4, path % 4, 0.5)
         traced = trace_camera_subpaths(world, limits, camera_pass, weights, capacity)
         vertices, found = traced[-2:]
     found = int(found[0])

@@ -937,14 +937,13 @@ def test_parts_share_their_proposals(rgb, monkeypatch):
 def test_parts_hold_every_path_once(rgb, monkeypatch):
     """Parts of a film, each of which sees all of it."""
     from mis_integrators.integrators import resampled_passes
-    from mis_integrators.paths.camera import with_gaps
 
     monkeypatch.setattr(resampled_passes, "CHUNK", 470)
     session = plugin("pcbpt").session(box_scene(23), 0, 1, 0)
     numbers = []
     for chunk in range(session.chunks):
         gaps = session.all_over_the_film(chunk)
-        some = dr.arange(mi.UInt32, session.chunk) + with_gaps(*gaps, session.chunk, 4)
+        some = session.part_of_paths(*gaps)
         numbers.append(np.array(some)[np.array(session.in_chunk(*gaps))])
         assert np.ptp(numbers[-1]) > 0.9 * session.path_count
     assert (

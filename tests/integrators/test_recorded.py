@@ -3,10 +3,13 @@ more slowly. And its kernels are those of other renders of the scene."""
 
 import re
 
+from mis_integrators.pilot.run import PILOT_INDEX
+from mis_integrators.pilot.setting import pilot_pixels
+
 import drjit as dr
 import mitsuba as mi
 import pytest
-from comparing import kernel_sources
+from comparing import kernel_sources, kernels_of
 from selection import extended
 from test_bdpm import glossy_box
 
@@ -63,3 +66,32 @@ def test_no_kernel_depends_on_where_numbers_lie(rgb, medium):
     sources = kernel_sources(render)
     assert sources
     assert not [source for source in sources if UNALIGNED.search(source)]
+
+
+LARGE = 500
+"""Operations of kernels that take long to compile."""
+
+
+@pytest.mark.parametrize("denoised", [False, True])
+def test_pilot_and_render_trace_camera_paths_by_one_kernel(rgb, denoised):
+    integrator = mi.load_dict({"type": "bdpm", "bdd": 0, "denoised": denoised})
+    session = integrator.session(glossy_box(), seed=1, spp=2)
+    session.start()  # with the room that a render has in the end
+    setting = session.pilot_setting()
+    pilot = session.pilot_passes(setting, pilot_pixels(setting))
+    sequence = session._sequence(PILOT_INDEX, 0, pilot.pixels.camera_paths)
+    spectral = session._spectral(PILOT_INDEX)
+    of_pilot = kernels_of(lambda: pilot._trace_camera(sequence, spectral), LARGE)
+    assert of_pilot and of_pilot <= kernels_of(session.iterate, LARGE)
+
+
+@pytest.mark.parametrize("denoised", [False, True])
+def test_trial_and_render_of_path_have_one_kernel(rgb, denoised):
+    from mis_integrators.integrators import choice
+    from mis_integrators.integrators.unidirectional import PathSession
+
+    integrator = mi.load_dict({"type": "bdpm_auto", "denoised": denoised})
+    session = PathSession(integrator, glossy_box(), glossy_box().sensors()[0], 1, 2)
+    pixels = pilot_pixels(mi.load_dict({"type": "bdpm"}).session(glossy_box()).pilot_setting())
+    of_trial = kernels_of(lambda: choice._samples(session, pixels, 0), LARGE)
+    assert of_trial and of_trial == kernels_of(session.iterate, LARGE)
