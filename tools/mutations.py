@@ -58,6 +58,7 @@ VOLUME_RADII = "tests/photons/test_volume_radii.py"
 LOBES = "tests/integrators/test_narrow_lobes.py"
 VCM = "tests/integrators/test_vcm.py"
 OPT_FOG = "tests/integrators/test_opt_media.py"
+RECORDED = "tests/integrators/test_recorded.py"
 HIDDEN = "tests/integrators/test_hidden_emitters_in_media.py"
 
 MUTATIONS = [
@@ -843,5 +844,26 @@ MUTATIONS = [
         "pass",
         "for denoisers nothing tells of the caustics that path meets where the camera sees them",
         f"{CHANCE}::test_photons_tell_how_noisy_paths_are",
+    ),
+    Mutation(
+        "lights/environment_guide.py",
+        "from_numpy(mi.UInt32, first_rows)",
+        "mi.UInt32(first_rows)",
+        "kernels know where NumPy has put the rows of environments",
+        f"{RECORDED}::test_no_kernel_depends_on_where_numbers_lie",
+    ),
+    Mutation(
+        "integrators/photon_passes.py",
+        "dr.make_opaque(camera_pass.pixel, camera_pass.index, beyond)",
+        "dr.make_opaque(camera_pass.pixel, beyond)",
+        "pilots compile a kernel for camera paths of their own",
+        f"{RECORDED}::test_pilot_and_render_trace_camera_paths_by_one_kernel",
+    ),
+    Mutation(
+        "integrators/unidirectional.py",
+        "dr.make_opaque(pixel, index)",
+        "pass",
+        "trials of path compile a kernel of their own",
+        f"{RECORDED}::test_trial_and_render_of_path_have_one_kernel",
     ),
 ]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import hashlib
+import os
 from dataclasses import dataclass, field
 from pathlib import Path
 from xml.etree import ElementTree
@@ -134,7 +135,7 @@ def files_of(path: Path) -> list[Path]:
 def digests(path: Path) -> dict[str, str]:
     """SHA-256 of the scene's files, by their names relative to its folder."""
     return {
-        file.relative_to(path.parent).as_posix(): hashlib.sha256(file.read_bytes()).hexdigest()
+        Path(os.path.relpath(file, path.parent)).as_posix(): hashlib.sha256(file.read_bytes()).hexdigest()
         for file in files_of(path)
     }
 

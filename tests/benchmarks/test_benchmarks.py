@@ -740,3 +740,16 @@ def test_distances_of_shifted_densities(module):
             assert row["tentative"] < 0.02
         elif row["base majorant"] != pytest.approx(1.05):
             assert row["tentative"] > 0.1
+
+
+def test_files_of_scenes_may_lie_anywhere(tmp_path):
+    """Files are known by their place beside the scene's, wherever they are."""
+    digests = module("common.scene_files").digests
+    (tmp_path / "scene").mkdir()
+    for name in ("scene/near.png", "far.png"):
+        (tmp_path / name).write_bytes(name.encode())
+    file = tmp_path / "scene/scene.xml"
+    names = "near.png", "../far.png", str(tmp_path / "far.png")
+    strings = "".join(f'<string name="filename" value="{name}"/>' for name in names)
+    file.write_text(f'<scene version="3.0.0">{strings}</scene>')
+    assert sorted(digests(file)) == ["../far.png", "near.png", "scene.xml"]
