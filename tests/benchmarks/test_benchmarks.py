@@ -742,7 +742,7 @@ def test_distances_of_shifted_densities(module):
             assert row["tentative"] > 0.1
 
 
-def test_files_of_scenes_may_lie_anywhere(tmp_path):
+def test_files_of_scenes_may_lie_anywhere(module, tmp_path):
     """Files are known by their place beside the scene's, wherever they are."""
     digests = module("common.scene_files").digests
     (tmp_path / "scene").mkdir()
