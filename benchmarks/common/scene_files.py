@@ -135,7 +135,9 @@ def files_of(path: Path) -> list[Path]:
 def digests(path: Path) -> dict[str, str]:
     """SHA-256 of the scene's files, by their names relative to its folder."""
     return {
-        Path(os.path.relpath(file, path.parent)).as_posix(): hashlib.sha256(file.read_bytes()).hexdigest()
+        Path(os.path.relpath(file, path.parent)).as_posix(): hashlib.sha256(
+            file.read_bytes()
+        ).hexdigest()
         for file in files_of(path)
     }
 

@@ -20,7 +20,7 @@ from ..core.clock import now
 from ..core.recording import lanes
 from ..core.spectra import channel_mean
 from ..core.stratified_variance import contrasts, extrapolated
-from ..core.traits import UnsupportedScene
+from ..core.traits import SceneTraits, UnsupportedScene
 from ..paths.camera import film_sample_count
 from ..paths.layers import written
 from ..paths.path_length_statistics import mean_segments
@@ -40,6 +40,9 @@ PATH_TRIALS = 16
 """Tuned: samples of `path` on each of the pilot's pixels; a power of two."""
 TRIAL_INDEX = 1 << 28
 """Iteration number of these samples: consecutive in the pixels' sequences."""
+MOST_INSTANCES = 64
+"""Instances of shape groups, more than which leave no choice. Each is a function of its own in each
+kernel: compiling takes 0.04 s an instance and kernel, and photons need a dozen kernels."""
 UNSEEN = 1e-3
 """Tuned: share of the light, brought by caustics, from which on camera paths that cannot see them
 are out of the question."""
@@ -103,6 +106,8 @@ def choose(integrator, scene, sensor, seed, iterations, seconds):
     `None`)."""
     render = integrator, scene, sensor, seed, iterations
     path = new_session(CAMERA, *render)
+    if not integrator.splits_light and (reason := too_many_instances(scene)):
+        return Decision(CAMERA, path, [f"{CAMERA}: {reason}"])
     try:
         photons = new_session(PHOTONS, *render)
     except UnsupportedScene as refusal:
@@ -183,6 +188,17 @@ def own_parameters(candidates, plugin, integrator):
     """The parameters of one of the `candidates` that others do not share."""
     own = candidates[plugin]
     return FOR_DENOISERS.get(plugin, own) if integrator.denoised else own
+
+
+def too_many_instances(scene):
+    """Why a scene's instances leave no choice, in one line; `None` if they do."""
+    count = sum(shape.class_name() == "Instance" for shape in scene.shapes())
+    if count <= MOST_INSTANCES:
+        return None
+    traits = SceneTraits(scene)
+    if traits.has_delta and traits.has_unmet_lights:
+        return None  # caustics that camera paths alone cannot make
+    return f"with {count} instances each kernel of {PHOTONS} takes long to compile"
 
 
 def no_photons(integrator, session):

@@ -28,7 +28,7 @@ from comparing import (
 from selection import extended
 from test_against_path import MONO, RGB, SPECTRAL, caustic_scene
 from test_bdpm import box_scene, glossy_box, last_words
-from worlds import T, diffuse, film, look, path, tray
+from worlds import T, diffuse, film, look, path, sensor, tray
 
 
 def auto(**parameters):
@@ -550,3 +550,34 @@ def test_errors(rgb):
     with pytest.raises(Exception) as error:
         auto(photon_count=5)
     assert 'unknown parameter "photon_count"' in last_words(error.value)
+
+
+@pytest.mark.parametrize(
+    "lit, glass, count", [("sky", False, 65), ("sky", True, 65), ("sun", True, 0)]
+)
+def test_many_instances_leave_no_choice(rgb, lit, glass, count):
+    """Each is a function of its own in every kernel; only where `path` cannot see caustics is it
+    compared all the same."""
+    from mis_integrators.integrators.choice import MOST_INSTANCES, too_many_instances
+
+    sky = {"type": "constant"}
+    sun = {"type": "directional", "direction": [0, 0, -1]}
+    ball = {"type": "sphere", "bsdf": {"type": "dielectric"} if glass else diffuse(0.5)}
+    scene = mi.load_dict(
+        {"type": "scene", "group": {"type": "shapegroup", "ball": ball}}
+        | {"light": sky if lit == "sky" else sun, "sensor": sensor(size=8)}
+        | {
+            f"instance{k}": {
+                "type": "instance",
+                "group": {"type": "ref", "id": "group"},
+                "to_world": T().translate([k, 0, 0]),
+            }
+            for k in range(MOST_INSTANCES + 1)
+        }
+    )
+    reason = too_many_instances(scene)
+    assert (f"with {count} instances" in reason) if count else reason is None
+    if count:
+        session = mi.load_dict({"type": "bdpm_auto"}).session(scene, seed=1, spp=1)
+        session.start()
+        assert session.decision.plugin == "path" and reason in session.decision.reasons[0]
