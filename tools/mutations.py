@@ -665,8 +665,8 @@ MUTATIONS = [
     ),
     Mutation(
         "integrators/pilot_passes.py",
-        "first += group * (pixels.apart * pixels.camera_paths)",
-        "first += group * 0",
+        "pixel += index * pixels.groups // pixels.camera_paths * pixels.apart",
+        "pass",
         "the pilot takes noise within a pixel for noise that near pixels share",
         f"{PIXEL_DISKS}::test_groups_of_a_pilot_look_through_near_pixels",
     ),
