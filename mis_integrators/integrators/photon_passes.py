@@ -16,7 +16,8 @@ from ..paths.light_classes import LightClasses, by_class_of_photons
 from ..paths.sensor import Lens
 from ..photons.beams import Beams, gather_along, mean_count_along, read_beams
 from ..photons.coverage import covered_share
-from ..photons.gather import QueryVertices, gather_photons, mean_photon_count
+from ..photons.curvature import bounded
+from ..photons.gather import FLAGS, QueryVertices, gather_photons, mean_photon_count
 from ..photons.grid import PhotonMap, build_photon_map
 from ..photons.hits import meets_one_light
 from ..photons.queries import (
@@ -45,6 +46,9 @@ class PhotonPasses(PilotedSession):
     judges_chance = False
     """Whether photons carry what tells how noisy camera paths are that meet their light by chance
     (`moment_of_chance`)."""
+    follows_curvature = True
+    """Whether merge disks of indirect light are smaller where surfaces are bent, if their radius is
+    automatic. (Weights know one radius for all.)"""
     points = False
     """Whether volume photons are gathered at vertices in media, and not along beams."""
 
@@ -248,6 +252,8 @@ class PhotonPasses(PilotedSession):
         vertices = QueryVertices(self.traits, record, spectral["wavelengths"], takes, scale)
         if kind == "seen_caustic":
             radii = [dr.minimum(radius, pixel_disk(record)) for radius in radii]
+        elif kind == "indirect" and self._bounds_disks:
+            radii = [bounded(vertices.si, radius) for radius in radii]
         light_paths, max_depth = self._light_paths, self.integrator.max_depth
         marked, chance = self.integrator.splits_light, None
         if self.by_chance and kind != "indirect":
@@ -270,6 +276,10 @@ class PhotonPasses(PilotedSession):
                 photon_map, vertices, radii, light_paths, max_depth, weigh, grey, marked
             )
         return found if chance is None else chance.with_hits(found, radii, grey)
+
+    @property
+    def _bounds_disks(self):
+        return self.follows_curvature and not self.integrator.initial_radius
 
     def moment_of_chance(self, photon_map, vertices, radius, spectral):
         """The second moment of one camera path that goes on from a vertex and meets the light of
@@ -303,6 +313,9 @@ class PhotonPasses(PilotedSession):
         Lambertian: in a highlight the noise of dividing by an estimate would outweigh what it
         mends. `record` as of `read_queries`."""
         probed = dr.max(record["throughput"]) > 0
+        if self._bounds_disks:
+            ray = mi.Ray3f(record["ray_o"], record["ray_d"])
+            radius = bounded(record["hit"].compute_surface_interaction(ray, FLAGS, probed), radius)
         if self.traits.has_rough:
             bsdf = record["hit"].shape.bsdf()
             probed &= lookup(self.traits.lambertian, bsdf, mi.Bool, probed)

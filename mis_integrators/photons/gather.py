@@ -25,6 +25,8 @@ SAME_SURFACE_OFFSET = 0.5
 """Tuned: ... and that lie closer than this share of the radius along the normal (steps, thin
 objects)."""
 SAME_PLANE_COSINE_SQUARED = 0.9999
+FLAGS = mi.RayFlags.All | mi.RayFlags.dNSdUV
+"""What is found out about the surface at a vertex: how its normals turn, too."""
 LARGEST_COSINE_RATIO = 4.0
 """Tuned: bound on shading over geometric cosine of a photon's direction, which grazing light on
 smoothed meshes would exceed."""
@@ -44,7 +46,7 @@ class QueryVertices:
         throughput, depth = record["throughput"], record["depth"]
         active = (dr.max(throughput) > 0) & takes
         ray = mi.Ray3f(record["ray_o"], record["ray_d"], 0, wavelengths)
-        si = record["hit"].compute_surface_interaction(ray, mi.RayFlags.All, active)
+        si = record["hit"].compute_surface_interaction(ray, FLAGS, active)
         self.traits, self.si, self.bsdf, self.active = traits, si, si.bsdf(), active
         self.p, self.n, self.plane, self.depth = si.p, si.n, si.n, depth & (LAST_VERTEX - 1)
         self.facing = mi.Frame3f.cos_theta(si.wi)

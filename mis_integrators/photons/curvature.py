@@ -1,0 +1,31 @@
+"""Merge disks on curved surfaces.
+
+A disk as wide as the ball that it touches finds few photons: most of the surface is bent away from
+its plane, and beyond the ball there is none. The estimate is too dark then, by any share. So the
+radius of a disk is bounded by the surface's radius of curvature.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+
+MOST_BENT = 0.5
+"""Tuned: radius of a disk over the radius of curvature, at most. On a ball the area within this
+distance of a point is exactly that of the disk, but its edge sees 30 degrees less of what the
+point sees."""
+LEAST_LEFT = 0.25
+"""Tuned: share of its radius that a disk keeps, however bent the surface is: smaller ones would
+find hardly a photon."""
+
+
+def bounded(si, radius):
+    """The radius of a merge disk around surface interactions that know how their normals turn
+    (`gather.FLAGS`): no more than `MOST_BENT` radii of curvature, the least of those along the
+    surface's parameters."""
+    bent = [
+        dr.squared_norm(dn) * dr.rcp(dr.maximum(dr.squared_norm(dp), 1e-30))
+        for dn, dp in ((si.dn_du, si.dp_du), (si.dn_dv, si.dp_dv))
+    ]
+    curvature = dr.sqrt(dr.maximum(*bent))
+    share = MOST_BENT * dr.rcp(dr.maximum(curvature * radius, MOST_BENT))
+    return radius * dr.maximum(share, LEAST_LEFT)
