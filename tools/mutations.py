@@ -866,4 +866,11 @@ MUTATIONS = [
         "trials of path compile a kernel of their own",
         f"{RECORDED}::test_trial_and_render_of_path_have_one_kernel",
     ),
+    Mutation(
+        "photons/curvature.py",
+        "dr.maximum(share, LEAST_LEFT)",
+        "1",
+        "merge disks are wider than the balls that they touch",
+        "tests/photons/test_curvature.py",
+    ),
 ]

@@ -7,12 +7,15 @@ radius of a disk is bounded by the surface's radius of curvature.
 
 from __future__ import annotations
 
+import math
+
 import drjit as dr
 
-MOST_BENT = 0.5
-"""Tuned: radius of a disk over the radius of curvature, at most. On a ball the area within this
-distance of a point is exactly that of the disk, but its edge sees 30 degrees less of what the
-point sees."""
+from .gather import SAME_SURFACE_COSINE
+
+MOST_BENT = math.sqrt(2 * (1 - SAME_SURFACE_COSINE))
+"""Radius of a disk over the radius of curvature, at most. On a ball all normals within this
+distance are like those of the disk's centre, and the area there is exactly that of the disk."""
 LEAST_LEFT = 0.25
 """Tuned: share of its radius that a disk keeps, however bent the surface is: smaller ones would
 find hardly a photon."""
