@@ -218,10 +218,11 @@ def radius_for(session, photons_a_gather: float) -> tuple[float, int, int, float
     camera_pass = session.describe_camera_pass(
         session.sensor,
         session._sequence(0, 1, session.camera_paths),
-        mi.UInt32(0),
+        session.part_of_paths(mi.UInt32(0)),
         spectral,
     )
-    *_, vertices, _ = session._trace_camera(camera_pass, session.vertex_capacity, spectral)
+    traced = session._trace_camera(camera_pass, session.vertex_capacity, spectral)
+    _, _, _, vertices, _, _ = traced
     vertices = read_queries(vertices)
     radius = session.integrator.initial_radius
     for _ in range(3):
