@@ -196,8 +196,8 @@ def too_many_instances(scene):
     if count <= MOST_INSTANCES:
         return None
     traits = SceneTraits(scene)
-    if traits.has_delta and traits.has_unmet_lights:
-        return None  # caustics that camera paths alone cannot make
+    if traits.has_unmet_lights and (traits.has_delta or traits.has_unsampled_lights):
+        return None  # as `camera_paths_are_blind`, of paths of any length
     return f"with {count} instances each kernel of {PHOTONS} takes long to compile"
 
 
@@ -264,17 +264,16 @@ def _samples(path, pixels, first):
         PATH_TRIALS if mi.is_spectral else 1
     )  # wavelengths are shared by all that is traced at once
     at_once = PATH_TRIALS // passes
-    lane = lanes(at_once * pixels.count)
-    trial = lane // pixels.count
-    pixel = (lane - trial * pixels.count) * pixels.stride
+    pixel, trial = pixels.places(lanes(at_once * pixels.count))
     values, seconds = [], 0.0
     for number in range(first, first + passes):
         spectral = path._spectral(TRIAL_INDEX + number)
         start = now()
-        radiance, *_ = path.trace(TRIAL_INDEX, pixel, trial + number, spectral)
+        index = trial + dr.opaque(mi.UInt32, number)  # one kernel for all
+        radiance, *_ = path.trace(TRIAL_INDEX, pixel, index, spectral)
         dr.sync_thread()
         seconds += now() - start
-        value = channel_mean(radiance) + dr.zeros(mi.Float, len(lane))
+        value = channel_mean(radiance) + dr.zeros(mi.Float, dr.width(pixel))
         values.append(np.array(value).reshape(at_once, pixels.count))
     return np.concatenate(values), seconds
 

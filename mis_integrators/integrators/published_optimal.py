@@ -45,7 +45,7 @@ class PublishedSession(BDPMSession):
     The pilot of an automatic radius merges at the first strategy's vertex, unweighted.
     """
 
-    chooses_light_paths = widens_caustics = False
+    chooses_light_paths = widens_caustics = follows_curvature = False
 
     def __init__(self, integrator, scene, sensor, seed, iterations):
         super().__init__(integrator, scene, sensor, seed, iterations)
@@ -127,8 +127,8 @@ class PublishedSession(BDPMSession):
     def _render_part(self, light, sequence, first, spectral):
         """The image of the camera paths from number `first` on."""
         integrator = self.integrator
-        there = self.in_chunk(first)
         path = self.part_of_paths(first)
+        there = path < self.path_count
         camera_pass = self.describe_camera_pass(self.sensor, sequence, path, spectral)
         beyond = self.direct_light.beyond
         if beyond is not None:

@@ -553,19 +553,29 @@ def test_errors(rgb):
 
 
 @pytest.mark.parametrize(
-    "lit, glass, count", [("sky", False, 65), ("sky", True, 65), ("sun", True, 0)]
+    "lit, glass, count",
+    [
+        ("sky", False, 65),
+        ("sky", True, 65),
+        ("sun", False, 65),
+        ("sun", True, 0),
+        ("beam", False, 0),
+    ],
 )
 def test_many_instances_leave_no_choice(rgb, lit, glass, count):
     """Each is a function of its own in every kernel; only where `path` cannot see caustics is it
     compared all the same."""
     from mis_integrators.integrators.choice import MOST_INSTANCES, too_many_instances
 
-    sky = {"type": "constant"}
-    sun = {"type": "directional", "direction": [0, 0, -1]}
+    light = {
+        "sky": {"type": "constant"},
+        "sun": {"type": "directional", "direction": [0, 0, -1]},
+        "beam": {"type": "rectangle", "emitter": {"type": "directionalarea"}},
+    }[lit]
     ball = {"type": "sphere", "bsdf": {"type": "dielectric"} if glass else diffuse(0.5)}
     scene = mi.load_dict(
         {"type": "scene", "group": {"type": "shapegroup", "ball": ball}}
-        | {"light": sky if lit == "sky" else sun, "sensor": sensor(size=8)}
+        | {"light": light, "sensor": sensor(size=8)}
         | {
             f"instance{k}": {
                 "type": "instance",

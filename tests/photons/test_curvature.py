@@ -3,6 +3,7 @@
 import mitsuba as mi
 import numpy as np
 import pytest
+from test_bdpm import glossy_box
 from worlds import T, diffuse, film, grey, look
 
 
@@ -76,3 +77,23 @@ def test_small_balls_are_as_bright_as_they_should_be():
         session.iterate()
     direct = path(2)
     assert mean(session.image()) - direct == pytest.approx(path(6) - direct, rel=0.14)
+
+
+@pytest.mark.parametrize(
+    "weighted",
+    [
+        {"type": "bdpm_opt", "weights": "published", "strategies": 2},
+        {"type": "bdpm_opt2"},
+        {"type": "bdpm_balance"},
+    ],
+)
+def test_under_weights_all_disks_are_as_wide(weighted):
+    """Weights know one radius. So it is, too, where `bdpm` is given one."""
+    scene = glossy_box()
+    for integrator, bounds in (
+        (weighted, False),
+        ({"type": "bdpm"}, True),
+        ({"type": "bdpm", "initial_radius": 0.1}, False),
+    ):
+        session = mi.load_dict(integrator).session(scene, seed=1, spp=1)
+        assert session._bounds_disks == bounds
