@@ -221,8 +221,7 @@ def radius_for(session, photons_a_gather: float) -> tuple[float, int, int, float
         session.part_of_paths(mi.UInt32(0)),
         spectral,
     )
-    traced = session._trace_camera(camera_pass, session.vertex_capacity, spectral)
-    _, _, _, vertices, _, _ = traced
+    _, _, _, vertices, *_ = session._trace_camera(camera_pass, session.vertex_capacity, spectral)
     vertices = read_queries(vertices)
     radius = session.integrator.initial_radius
     for _ in range(3):

@@ -430,9 +430,13 @@ class IterativeSession:
 
     def describe_camera_pass(self, sensor, sequence, path, spectral):
         """The camera paths of these numbers (as of `part_of_paths`)."""
+        places = self.pixels_and_indices(path)
+        return CameraPass(sensor, self.integrator, sequence, *places, spectral["sample"])
+
+    def pixels_and_indices(self, path):
+        """The pixels of the camera paths of these numbers, and which paths of these they are."""
         pixel = path // self.camera_paths
-        index = path - pixel * self.camera_paths
-        return CameraPass(sensor, self.integrator, sequence, pixel, index, spectral["sample"])
+        return pixel, path - pixel * self.camera_paths
 
     def sum_of_chunks(self, render):
         """What `render(chunk, first)` returns, a tuple of tensors or `None`s, summed over all

@@ -169,9 +169,9 @@ class PhotonPasses(PilotedSession):
 
     def _trace_camera(self, camera_pass, capacity, spectral, first=1.0, beyond=None, beams=0):
         """What `trace_camera_paths` returns, and the radiance by class (a list; empty where none is
-        kept), with room for so many vertices and beams. All is evaluated, and what differs between
-        pilots and renders is evaluated before: they share the kernel, which takes long to
-        compile."""
+        kept), with room for so many vertices and beams; `first`, `beyond`: as there. All is
+        evaluated, and what differs between pilots and renders is evaluated before: they share the
+        kernel, which takes long to compile."""
         paths, kept, classes = dr.width(camera_pass.pixel), self.integrator.kept_classes, None
         first = dr.opaque(mi.Float, first)
         beyond = dr.full(mi.Float, 1, paths) if beyond is None else beyond
@@ -279,6 +279,7 @@ class PhotonPasses(PilotedSession):
 
     @property
     def _bounds_disks(self):
+        """Whether `follows_curvature` is of use in this render."""
         return self.follows_curvature and not self.integrator.initial_radius
 
     def moment_of_chance(self, photon_map, vertices, radius, spectral):
@@ -313,13 +314,15 @@ class PhotonPasses(PilotedSession):
         Lambertian: in a highlight the noise of dividing by an estimate would outweigh what it
         mends. `record` as of `read_queries`."""
         probed = dr.max(record["throughput"]) > 0
+        ray = mi.Ray3f(record["ray_o"], record["ray_d"])
+        flags = FLAGS if self._bounds_disks else mi.RayFlags.Minimal
+        si = record["hit"].compute_surface_interaction(ray, flags, probed)
         if self._bounds_disks:
-            ray = mi.Ray3f(record["ray_o"], record["ray_d"])
-            radius = bounded(record["hit"].compute_surface_interaction(ray, FLAGS, probed), radius)
+            radius = bounded(si, radius)
         if self.traits.has_rough:
             bsdf = record["hit"].shape.bsdf()
             probed &= lookup(self.traits.lambertian, bsdf, mi.Bool, probed)
-        return dr.select(probed, covered_share(scene, record, radius, seed, probed), 1)
+        return dr.select(probed, covered_share(scene, record, si, radius, seed, probed), 1)
 
     def _records(self, vertices, kind):
         """What gathers photons of a kind, a dictionary of fields: vertices, or beams."""

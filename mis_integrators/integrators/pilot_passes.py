@@ -36,13 +36,12 @@ class SubsetPasses:
         self.capacity, self.beam_capacity = capacity, beams
 
         def trace(scene, sensor, tables, sequence, spectral):
-            path = lanes(pixels.paths)
-            index = path // pixels.count  # of a path in its pixel
-            pixel = (path - index * pixels.count) * pixels.stride
+            pixel, index = pixels.places(lanes(pixels.paths))
             pixel += index * pixels.groups // pixels.camera_paths * pixels.apart
             wavelength = spectral["sample"]
             camera_pass = CameraPass(sensor, session.integrator, sequence, pixel, index, wavelength)
-            return session._trace_camera(camera_pass, capacity, spectral, 0.0, beams=beams)
+            *found, _ = session._trace_camera(camera_pass, capacity, spectral, 0.0, beams=beams)
+            return found
 
         self._camera = session.recorded(trace)
 
@@ -98,7 +97,7 @@ class SubsetPasses:
         grows and the pass runs again."""
         session = self.session
         while True:
-            radiance, _, _, vertices, count, _ = self._camera(
+            radiance, _, _, vertices, count = self._camera(
                 session.scene, session.sensor, session._tables, sequence, spectral
             )
             counts = {"vertices": count, "beams": vertices.get("beam_count")}

@@ -131,12 +131,8 @@ class PathSession(IterativeSession):
         spectral = self._spectral(iteration)
 
         def render(chunk, first):
-            path = self.part_of_paths(first)
-            pixel = path // self.camera_paths
-            index = path - pixel * self.camera_paths
-            radiance, alpha, position, active, classes = self.trace(
-                iteration, pixel, index, spectral
-            )
+            places = self.pixels_and_indices(self.part_of_paths(first))
+            radiance, alpha, position, active, classes = self.trace(iteration, *places, spectral)
             return (
                 splat_samples(
                     self.sensor.film(),

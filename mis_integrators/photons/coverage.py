@@ -26,13 +26,11 @@ OWN_STREAM = 0x70726F62
 
 
 @dr.syntax
-def covered_share(scene, vertices, radius, seed, active):
+def covered_share(scene, vertices, si, radius, seed, active):
     """Estimated share, in [0.4, 1], of the disk of `radius` around each vertex that lies on surface
     seen from just above the vertex and like its own (same tests as for photons). `vertices` as of
-    `read_queries`; width as theirs."""
-    ray = mi.Ray3f(vertices["ray_o"], vertices["ray_d"])
-    si = vertices["hit"].compute_surface_interaction(ray, mi.RayFlags.Minimal, active)
-    normal = mi.Vector3f(dr.mulsign(si.n, -dr.dot(si.n, ray.d)))
+    `read_queries`, `si` their surface interactions; width as theirs."""
+    normal = mi.Vector3f(dr.mulsign(si.n, -dr.dot(si.n, vertices["ray_d"])))
     frame = mi.Frame3f(normal)
     rng = vertex_streams(vertices["path"], vertices["depth"], seed ^ OWN_STREAM)
     turn, shift = rng.next_float32() * dr.two_pi, rng.next_float32()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -112,6 +113,12 @@ class PilotPixels:
     def paths(self) -> int:
         """Camera paths in one iteration of the pilot."""
         return self.count * self.camera_paths
+
+    def places(self, path: Any) -> tuple[Any, Any]:
+        """The pixels of paths (an array of their numbers: one through each pixel, then the second
+        ones, ...), and which paths of these they are."""
+        index = path // self.count
+        return (path - index * self.count) * self.stride, index
 
 
 def pilot_pixels(setting: PilotSetting) -> PilotPixels:

@@ -25,16 +25,15 @@ def share_at(scene, x, height=0.5):
     from mis_integrators.photons.coverage import covered_share  # of the active variant
 
     ray = mi.Ray3f(mi.Point3f(dr.full(mi.Float, x, COUNT), 0, height), mi.Vector3f(0, 0, -1))
+    si = scene.ray_intersect_preliminary(ray).compute_surface_interaction(ray)
     vertices = {
-        "ray_o": ray.o,
         "ray_d": ray.d,
-        "hit": scene.ray_intersect_preliminary(ray),
         "path": dr.arange(mi.UInt32, COUNT),
         "depth": dr.ones(mi.UInt32, COUNT),
     }
     return np.array(
         covered_share(
-            scene, vertices, dr.opaque(mi.Float, RADIUS), dr.opaque(mi.UInt32, 7), mi.Bool(True)
+            scene, vertices, si, dr.opaque(mi.Float, RADIUS), dr.opaque(mi.UInt32, 7), mi.Bool(True)
         )
     )
 
