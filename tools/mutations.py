@@ -873,4 +873,18 @@ MUTATIONS = [
         "merge disks are wider than the balls that they touch",
         "tests/photons/test_curvature.py",
     ),
+    Mutation(
+        "lights/environment_sampler.py",
+        "probability * (cells / (4 * dr.pi))",
+        "probability * (cells / (2 * dr.pi))",
+        "the table of an environment's radiance counts double",
+        "tests/lights/test_environment_sampler.py",
+    ),
+    Mutation(
+        "lights/environment_sampler.py",
+        "self.by_table = moment * WORTH_A_TABLE > 1",
+        "self.by_table = False",
+        "wide suns are left to Mitsuba's sampler, which misses them",
+        "tests/lights/test_environment_sampler.py",
+    ),
 ]

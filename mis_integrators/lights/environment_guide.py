@@ -22,6 +22,7 @@ from ..core.random import next_2d, streams
 from ..core.spectra import channel_mean
 from ..core.traits import scene_bounds
 from ..paths.camera_rays import sample_camera_ray
+from .environment_sampler import EnvironmentSampler, point, radiance
 from .histograms import draw_cell, in_square_cell, smoothed, square_cell
 from .portals import PortalDistribution
 
@@ -49,8 +50,6 @@ LEVEL_SHARES = (0.55, 0.25, 0.1, 0.1)
 """Tuned: shares of the position histogram at full, half, quarter and eighth resolution."""
 FEWEST_RECORDS = 64
 """Tuned: records, fewer than which tell nothing."""
-SPREAD_WAVELENGTHS = 450, 520, 590, 640
-"""Wavelengths [nm] at which lights are looked at where no path brings its own."""
 AIMED_SHARE = 0.5
 """Tuned: share of the directions of direct light that are aimed at the entrances, if any are."""
 WORTH_AIMING = 0.9
@@ -172,11 +171,12 @@ class EnvironmentGuide:
     """Densities of position and direction for infinite emitters (`environment` and `directional`
     kinds).
 
-    Attributes: `center`, `radius` of the scene's bounding sphere; `focus_center`, `focus_radius` of
-    the lit places that the pilot met; `portals` of the light of environments (`None` where the
-    pilot saw next to none); `direction_share`, the share of environment sub-paths whose direction
-    comes from the emitter's own sampler; `aims`, whether next-event estimation in the box around
-    the lit places aims at the entrances. Without a `sensor` (None) there is no pilot, and all
+    Attributes: `sampler`, the `EnvironmentSampler` (`None` without an environment); `center`,
+    `radius` of the scene's bounding sphere; `focus_center`, `focus_radius` of the lit places that
+    the pilot met; `portals` of the light of environments (`None` where the pilot saw next to none);
+    `direction_share`, the share of environment sub-paths whose direction comes from the `sampler`;
+    `aims`, whether next-event estimation in the box around the lit places aims at the entrances.
+    Without a `sensor` (None) there is no pilot, and all
     densities are the plain ones.
     """
 
@@ -195,6 +195,9 @@ class EnvironmentGuide:
         self.direction_share = 1.0
         self.portals = None
         self.aims = False
+        self.sampler = next(
+            (EnvironmentSampler(e) for _, e in self.infinite if e.is_environment()), None
+        )
         if sensor is None:
             self._keep(np.zeros((self.row_count, POSITION_CELLS**2)), np.zeros(0, np.uint32))
         else:
@@ -216,6 +219,8 @@ class EnvironmentGuide:
         ]
         if self.portals is not None:
             arrays += [self._entering, *self.portals.tables()]
+        if self.sampler is not None:
+            arrays += self.sampler.tables()
         return arrays + (
             [self._direction_pmf, self._direction_cdf] if self.direction_share < 1 else []
         )
@@ -328,19 +333,12 @@ class EnvironmentGuide:
         draws = 64
         cell = dr.arange(mi.UInt32, direction_cells() * draws) // draws
         rng = streams(dr.arange(mi.UInt32, direction_cells() * draws), mi.UInt32(0x64697273))
-        smooth = (
-            self._radiance(emitter, cell_direction(cell, next_2d(rng))).numpy().reshape(-1, draws)
-        )
+        smooth = radiance(emitter, cell_direction(cell, next_2d(rng))).numpy().reshape(-1, draws)
         smooth = np.minimum(
             smooth, 4 * np.median(smooth, axis=1, keepdims=True) + 1e-6 * smooth.mean()
         ).mean(axis=1)
         smooth_power = smooth * reach * (4 * np.pi / direction_cells())
-        ds, weight = emitter.sample_direction(
-            self._point(self.center, mi.Float(0)), next_2d(streams(cell, mi.UInt32(1)))
-        )
-        drawn = np.array(direction_cell(ds.d))
-        weight = np.nan_to_num(np.broadcast_to(np.array(channel_mean(weight)), drawn.shape))
-        total_power = np.bincount(drawn, weights=weight, minlength=direction_cells()) / len(drawn)
+        total_power = self.sampler.power(direction_cell, direction_cells())
         if smooth_power.sum() <= 0:
             return
         self.direction_share = float(
@@ -349,22 +347,6 @@ class EnvironmentGuide:
         pmf = smooth_power / smooth_power.sum()
         self._direction_pmf = from_numpy(mi.Float, pmf)
         self._direction_cdf = from_numpy(mi.Float, np.cumsum(pmf))
-
-    @staticmethod
-    def _point(p, time):
-        it = dr.zeros(mi.Interaction3f)
-        it.p = p
-        it.time = time
-        if mi.is_spectral:
-            it.wavelengths = mi.UnpolarizedSpectrum(*SPREAD_WAVELENGTHS)
-        return it
-
-    def _radiance(self, emitter, towards, active=True):
-        si = dr.zeros(mi.SurfaceInteraction3f, dr.width(towards))
-        si.wi = -towards
-        if mi.is_spectral:
-            si.wavelengths = mi.UnpolarizedSpectrum(*SPREAD_WAVELENGTHS)
-        return channel_mean(emitter.eval(si, active)) + dr.zeros(mi.Float, dr.width(towards))
 
     def _places(self, sensor):
         """Places that matter: the first surfaces of camera paths, and random numbers for each.
@@ -417,7 +399,7 @@ class EnvironmentGuide:
     def _look(self, index, emitter, places, rng):
         """Records (p, direction to the light, table row, weight, density, own density) of a place
         each, where sub-paths of the emitter would come from; the weight estimates what light from
-        there adds to the image. The densities of the direction, and of the emitter's own sampler
+        there adds to the image. The densities of the direction, and of the `sampler`
         there, are zero but for environments; the latter also where next-event estimation has
         something in its way."""
         vertices = dr.width(places.smooth)
@@ -431,9 +413,7 @@ class EnvironmentGuide:
                 rng.next_float32(),
                 places.smooth,
             )
-            light = self._radiance(emitter, towards, places.smooth) * dr.select(
-                pdf > 0, dr.rcp(pdf), 0
-            )
+            light = radiance(emitter, towards, places.smooth) * dr.select(pdf > 0, dr.rcp(pdf), 0)
         else:
             ds, irradiance = emitter.sample_direction(places.si, next_2d(rng), places.smooth)
             towards, light, row = (
@@ -447,7 +427,8 @@ class EnvironmentGuide:
         if emitter.is_environment():
             ds = dr.zeros(mi.DirectionSample3f, vertices)
             ds.d = towards
-            own = dr.select(direct, emitter.pdf_direction(places.si, ds, direct), 0)
+            own = emitter.pdf_direction(places.si, ds, direct)
+            own = dr.select(direct, self.sampler.density(own, towards, direct), 0)
         weight = dr.select(
             reached, light * channel_mean(places.throughput) * dr.minimum(response, 1), 0
         )
@@ -529,39 +510,73 @@ class EnvironmentGuide:
         """Direction towards an environment, its density per solid angle, its table row, and what is
         left of `extra`."""
         first = self.row_of_emitter(index)
+        if self.sampler.by_table:
+            turned, towards, sample = self.sampler.turn(sample, active)
         ds, _ = emitter.sample_direction(it, sample, active)
-        if self.direction_share == 1.0:
-            return ds.d, ds.pdf, first + direction_cell(ds.d), extra
-        share = self.direction_share
-        own = extra < share
-        extra = dr.select(own, extra / share, (extra - share) / (1 - share))
-        cell, leftover = draw_cell(
-            self._direction_cdf, mi.UInt32(0), direction_cells(), sample.x, active
-        )
-        ds.d = dr.select(own, ds.d, cell_direction(cell, mi.Point2f(leftover, sample.y)))
-        return (
-            ds.d,
-            self.direction_density(emitter.pdf_direction(it, ds, active), ds.d, active),
-            first + direction_cell(ds.d),
-            extra,
-        )
+        if self.sampler.by_table:
+            ds.d = dr.select(turned, towards, ds.d)
+        if self.direction_share < 1:
+            share = self.direction_share
+            own = extra < share
+            extra = dr.select(own, extra / share, (extra - share) / (1 - share))
+            cell, leftover = draw_cell(
+                self._direction_cdf, mi.UInt32(0), direction_cells(), sample.x, active
+            )
+            ds.d = dr.select(own, ds.d, cell_direction(cell, mi.Point2f(leftover, sample.y)))
+        if self.direction_share < 1 or self.sampler.by_table:
+            own_pdf = emitter.pdf_direction(it, ds, active)
+            ds.pdf = self.direction_density(own_pdf, ds.d, active)
+        return ds.d, ds.pdf, first + direction_cell(ds.d), extra
 
     def direction_density(self, own_pdf, towards, active=True):
         """Density per solid angle of `sample_direction`, where the environment's own sampler has
         density `own_pdf`."""
+        density = self.sampler.density(own_pdf, towards, active)
         if self.direction_share == 1.0:
-            return own_pdf
+            return density
         table_pdf = dr.gather(mi.Float, self._direction_pmf, direction_cell(towards), active) * (
             direction_cells() / (4 * dr.pi)
         )
-        return self.direction_share * own_pdf + (1 - self.direction_share) * table_pdf
+        return self.direction_share * density + (1 - self.direction_share) * table_pdf
 
     # ------------------------------------------------------------------ direct light
+
+    @property
+    def turns(self):
+        """Whether next-event estimation of an environment asks others than its own sampler, too."""
+        return self.aims or (self.sampler is not None and self.sampler.by_table)
+
+    def turn(self, p, sample, active):
+        """Directions of next-event estimation of an environment from `p` that its own sampler does
+        not draw.
+
+        Returns `(counted, turned, towards, good, sample)`: which of the `active` lanes have the
+        density `direct_density`, and not just that of the own sampler; which of these have a
+        direction `towards` from here, and whether it is any good; and what is left of `sample`,
+        pairs of uniform numbers.
+        """
+        counted, turned, good = mi.Bool(False), mi.Bool(False), mi.Bool(True)
+        towards = mi.Vector3f(0, 0, 1)
+        if self.aims:
+            counted = active & self.portals.near(p)
+            turned = counted & (sample.x < AIMED_SHARE)
+            left = dr.select(
+                turned, sample.x / AIMED_SHARE, (sample.x - AIMED_SHARE) / (1 - AIMED_SHARE)
+            )
+            sample = mi.Point2f(dr.select(counted, left, sample.x), sample.y)
+            towards, good = self.portals.sample_direction(p, sample, turned)
+        if self.sampler.by_table:
+            counted, others = active, active & ~turned
+            by_table, by_radiance, sample = self.sampler.turn(sample, others)
+            towards = dr.select(by_table, by_radiance, towards)
+            turned, good = turned | by_table, good | by_table
+        return counted, turned, towards, good, sample
 
     def direct_density(self, own_pdf, p, towards, active=True):
         """Density per solid angle of next-event estimation of an environment from `p`, where its
         own sampler has density `own_pdf`."""
-        return _aimed_density(self.portals, own_pdf, p, towards, active) if self.aims else own_pdf
+        density = self.sampler.density(own_pdf, towards, active)
+        return _aimed_density(self.portals, density, p, towards, active) if self.aims else density
 
     # ------------------------------------------------------------------ power
 
@@ -573,12 +588,12 @@ class EnvironmentGuide:
         rng = streams(dr.arange(mi.UInt32, count), mi.UInt32(0x75736566))
         for index, emitter in self.infinite:
             number = mi.UInt32(index)
-            it = self._point(self.center, mi.Float(0))
+            it = point(self.center, mi.Float(0))
             if emitter.is_environment():
                 towards, pdf, row, extra = self.sample_direction(
                     emitter, number, it, next_2d(rng), rng.next_float32(), True
                 )
-                value = self._radiance(emitter, towards) * dr.select(pdf > 0, dr.rcp(pdf), 0)
+                value = radiance(emitter, towards) * dr.select(pdf > 0, dr.rcp(pdf), 0)
             else:
                 ds, irradiance = emitter.sample_direction(it, mi.Point2f(0.5))
                 towards, value = ds.d + dr.zeros(mi.Vector3f, count), channel_mean(irradiance)

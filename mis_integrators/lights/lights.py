@@ -21,7 +21,7 @@ from ..core.spectra import channel_mean
 from ..core.traits import lookup, registry_table
 from .emitter_choice import UNIFORM_SHARE, EmitterSelection, powers
 from .emitter_media import media_at_emitters, media_beyond_boundaries
-from .environment_guide import AIMED_SHARE, EnvironmentGuide, infinite_emitters
+from .environment_guide import EnvironmentGuide, infinite_emitters
 from .kinds import KINDS, NUMBERS, Samples, is_textured_area, kind_of, textured_mask
 from .nearby import NearbyChoice
 from .surfaces import LightSurfaces
@@ -146,20 +146,12 @@ class Lights:
             index, probability = self.choice.sample(choice)
         emitter = self.pointer(index)
         textured = active & textured_mask(emitter) if self.has_textured else mi.Bool(False)
-        if self._aims:
-            aims = (
-                active
-                & self._of_kind(index, "environment", active=active)
-                & self.guide.portals.near(ref.p)
-            )
-            aimed = aims & (sample.x < AIMED_SHARE)
-            left = dr.select(
-                aimed, sample.x / AIMED_SHARE, (sample.x - AIMED_SHARE) / (1 - AIMED_SHARE)
-            )
-            sample.x = dr.select(aims, left, sample.x)
+        if self._turns:
+            there = active & self._of_kind(index, "environment", active=active)
+            *turn, sample = self.guide.turn(ref.p, sample, there)
         ds, weight = emitter.sample_direction(ref, sample, active & ~textured)
-        if self._aims:
-            ds, weight = self._aim(ref, ds, weight, sample, aims, aimed)
+        if self._turns:
+            ds, weight = self._turn(ref, ds, weight, *turn)
         if self.has_textured:
             ds_t, weight_t = self._sample_by_area(ref, emitter, index, sample, textured)
             ds = dr.select(textured, ds_t, ds)
@@ -169,29 +161,25 @@ class Lights:
         return ds, dr.select(valid, weight * dr.rcp(probability), 0), ds.pdf * probability
 
     @property
-    def _aims(self):
-        """Whether direct light of an environment is looked for where it enters."""
-        return self.guide is not None and self.guide.aims
+    def _turns(self):
+        """Whether direct light of an environment comes from others than its own sampler, too."""
+        return self.guide is not None and self.guide.turns
 
-    def _aim(self, ref, ds, weight, sample, aims, aimed):
-        """`(ds, weight)` of `propose_direct` with the lanes `aimed` turned towards the entrances,
-        and the lanes `aims`, among which they are, counted by the density of both ways together."""
-        towards, good = self.guide.portals.sample_direction(ref.p, sample, aimed)
-        ds.d = dr.select(aimed, towards, ds.d)
-        ds.n = dr.select(aimed, mi.Normal3f(-towards), ds.n)
-        ds.p = dr.select(aimed, ref.p + towards * (2 * self.guide.radius), ds.p)
-        ds.dist = dr.select(aimed, 2 * self.guide.radius, ds.dist)
+    def _turn(self, ref, ds, weight, counted, turned, towards, good):
+        """`(ds, weight)` of `propose_direct` after `EnvironmentGuide.turn`, whose results the other
+        arguments are."""
+        ds.d = dr.select(turned, towards, ds.d)
+        ds.n = dr.select(turned, mi.Normal3f(-towards), ds.n)
+        ds.p = dr.select(turned, ref.p + towards * (2 * self.guide.radius), ds.p)
+        ds.dist = dr.select(turned, 2 * self.guide.radius, ds.dist)
         si = dr.zeros(mi.SurfaceInteraction3f, dr.width(ref.p))
         si.wi, si.time, si.wavelengths = -ds.d, ref.time, ref.wavelengths
-        ds.pdf = dr.select(
-            aims,
-            self.guide.direct_density(ds.emitter.pdf_direction(ref, ds, aims), ref.p, ds.d, aims),
-            ds.pdf,
+        own = ds.emitter.pdf_direction(ref, ds, counted)
+        ds.pdf = dr.select(counted, self.guide.direct_density(own, ref.p, ds.d, counted), ds.pdf)
+        light = ds.emitter.eval(si, counted) * dr.select(
+            (good | ~turned) & (ds.pdf > 0), dr.rcp(ds.pdf), 0
         )
-        light = ds.emitter.eval(si, aims) * dr.select(
-            (good | ~aimed) & (ds.pdf > 0), dr.rcp(ds.pdf), 0
-        )
-        return ds, dr.select(aims, light, weight)
+        return ds, dr.select(counted, light, weight)
 
     @staticmethod
     def shadow_ray(ref, ds, infinite):
@@ -246,7 +234,7 @@ class Lights:
     def _pdf_of_emitter(self, ref, ds, active):
         """`pdf_direct` without the emitter's choice."""
         pdf = own = ds.emitter.pdf_direction(ref, ds, active)
-        if self.has_textured or self._aims:
+        if self.has_textured or self._turns:
             index = lookup(self.numbers, ds.emitter, mi.UInt32, active)
             for kind, chosen in self._lanes_by_kind(index, active):
                 pdf = dr.select(chosen, kind.direct(own, ref, ds, index, chosen), pdf)

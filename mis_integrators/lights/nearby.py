@@ -19,7 +19,7 @@ from ..core.random import next_2d, streams
 from ..core.spectra import channel_mean
 from ..core.traits import scene_bounds
 from ..paths.camera_rays import sample_camera_ray
-from .environment_guide import SPREAD_WAVELENGTHS
+from .environment_sampler import SPREAD_WAVELENGTHS
 from .histograms import draw_cell
 
 CELLS = 16

@@ -388,3 +388,8 @@ def extrapolate(radii, estimates) -> Estimate:
     det = s * sxx - sx**2
     value = (sxx * (weight * mean).sum(0) - sx * (weight * x * mean).sum(0)) / det
     return Estimate(value, sxx / det, min(e.freedom for e in estimates))
+
+
+def mean_and_error(values):
+    """The mean of independent values, and its standard error."""
+    return values.mean(), values.std() / np.sqrt(len(values))

@@ -259,6 +259,17 @@ EMITTERS = {
             "sky_scale": 10.0,
         }
     },
+    # Mitsuba's own sampler misses most of the light of a sun so wide.
+    "wide sun": lambda f: {
+        "e": {
+            "type": "sunsky",
+            "turbidity": 4.0,
+            "sun_direction": [0.5, 0.3, 0.8],
+            "sun_aperture": 12.0,
+            "sun_scale": 2.0,
+            "sky_scale": 10.0,
+        }
+    },
     "several": lambda f: {
         "e1": _lamp("rectangle", 0.7),
         "e2": {"type": "constant", "radiance": grey(0.4)},

@@ -46,6 +46,7 @@ ROWS = [
     ("envmap", "mixed1", 2, PERSPECTIVE, MONO, "mitchell"),
     ("envmap rotated", "mixed2", 0, LENS, RGB, "box"),
     ("sunsky", "mixed0", 2, LENS, RGB, "box"),
+    ("wide sun", "mixed1", 1, PERSPECTIVE, RGB, "box"),
     ("several", "mixed1", 3, PERSPECTIVE, RGB, "box"),
     ("point", "smooth0", 0, LENS, MONO, "box"),
     ("spot", "smooth1", 1, ORTHO, SPECTRAL, "box"),

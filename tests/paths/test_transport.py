@@ -19,7 +19,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from comparing import assert_frequencies, kernels_of
+from comparing import assert_frequencies, kernels_of, mean_and_error
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from selection import extended, one_of_each_kind
@@ -327,10 +327,6 @@ def emission(scene, count=1 << 18, seed=7):
     return lights, ray, grey
 
 
-def mean_and_error(x):
-    return x.mean(), x.std() / np.sqrt(len(x))
-
-
 def flux_through_floor(scene, half):
     """Estimated flux that arrives directly on the square |x|, |y| < half of the plane z = 0, and
     its standard error."""
@@ -544,7 +540,7 @@ def test_density_of_direct_light(emitter):
     )
     guide = (
         EnvironmentGuide(scene, scene.sensors()[0])
-        if emitter in ("constant", "envmap", "envmap rotated", "sunsky", "several")
+        if emitter in ("constant", "envmap", "envmap rotated", "sunsky", "wide sun", "several")
         else None
     )
     lights = Lights(scene, guide=guide)
@@ -613,7 +609,7 @@ def test_places_of_a_guide_share_kernels(rgb):
     assert 0 < len(made) <= 3
 
 
-@pytest.mark.parametrize("emitter", ["envmap rotated", "sunsky", *extended("constant")])
+@pytest.mark.parametrize("emitter", ["envmap rotated", "wide sun", *extended("constant", "sunsky")])
 def test_environment_directions(emitter):
     """Densities over the sphere integrate to one and are those of the samples."""
     scene = tray("lambertian", emitter)
@@ -827,6 +823,24 @@ def test_direct_light_is_looked_for_at_windows(sky):
     assert abs(a - b) < 5.3 * error, f"{a} against {b}"
     assert (5.3 + 1.65) * error < 0.1 * b, "test too weak"
     assert aimed.var() < 0.3 * own.var(), aimed.var() / own.var()
+
+
+def test_a_wide_sun_is_found_at_windows():
+    """As above, with a sun that its own sampler misses: three ways to choose a direction have one
+    density (20 % are seen)."""
+    sky = {"type": "sunsky", "sun_direction": [0.1, 0.8, 0.5], "sun_aperture": 10.0}
+    scene = room_with_window(sky)
+    guide = EnvironmentGuide(scene, scene.sensors()[0])
+    assert guide.aims and guide.sampler.by_table
+    mended, stated, again = direct_light_of_floor(scene, Lights(scene, guide=guide), 1 << 20)
+    assert np.quantile(np.abs(again / stated - 1), 0.999) < 0.01
+    guide.aims = guide.sampler.by_table = False
+    own, *_ = direct_light_of_floor(scene, Lights(scene, guide=guide), 1 << 23)
+    (a, error_a), (b, error_b) = mean_and_error(mended), mean_and_error(own)
+    error = np.hypot(error_a, error_b)
+    assert abs(a - b) < 5.3 * error, f"{a} against {b}"
+    assert (5.3 + 1.65) * error < 0.2 * b, "test too weak"
+    assert mended.var() < 0.2 * own.var(), mended.var() / own.var()
 
 
 def test_densities_of_direct_light_at_windows_are_one_in_all():
