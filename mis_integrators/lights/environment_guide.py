@@ -32,7 +32,7 @@ AZIMUTH_CELLS = 32
 """Tuned: cells of directions around."""
 POSITION_CELLS = 64
 """Tuned: cells along each edge of the position histograms."""
-DEFENSIVE_SHARE = 0.1
+DEFENSIVE_SHARE = 0.2
 """Tuned: share of sub-paths that start anywhere on the scene's disk."""
 ENOUGH_RECORDS = 256
 """Tuned: records of a direction cell at which its own histogram has as large a share as the one
