@@ -887,4 +887,11 @@ MUTATIONS = [
         "wide suns are left to Mitsuba's sampler, which misses them",
         "tests/lights/test_environment_sampler.py",
     ),
+    Mutation(
+        "app/denoising.py",
+        "return np.minimum(clean, np.moveaxis(",
+        "return np.maximum(clean, 0 * np.moveaxis(",
+        "denoised highlights are brighter than any of their samples",
+        f"{DENOISING}::test_highlights_are_no_brighter_than_their_samples",
+    ),
 ]

@@ -14,14 +14,15 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.film import WINDOW, direct_channels
-from ..core.windows import mean_without_largest, window_mean
+from ..core.windows import mean_without_largest, window_max, window_mean
 from ..paths.guides import albedo_and_normal
 from .output import picture_channels
 
 DOUBT = 4.0
 """Tuned: by what the variance of direct light is multiplied before its noise is judged."""
 AROUND = 25
-"""Tuned: width in pixels of the windows whose mean the variance of a pixel is not below."""
+"""Tuned: width in pixels of the windows whose mean the variance of a pixel is not below, and whose
+brightest pixel no other is above."""
 MISSING = "denoising needs mitsuba-oidn: pip install 'mis-integrators[denoise]'"
 
 
@@ -77,6 +78,13 @@ def without_noise(
     return np.asarray(oidn.denoise(np.ascontiguousarray(colours), *guides, **told))[
         ..., : light.shape[2]
     ]
+
+
+def no_brighter(clean: np.ndarray, raw: np.ndarray) -> np.ndarray:
+    """A denoised image (H, W, C) where no pixel is brighter than all of the `raw` ones within a
+    window: Open Image Denoise makes some highlights that few samples have met several times as
+    bright as any of these."""
+    return np.minimum(clean, np.moveaxis(window_max(np.moveaxis(raw, -1, 0), AROUND), 0, -1))
 
 
 def denoise(
@@ -146,9 +154,9 @@ def denoise(
         light = np.clip(np.stack(direct[: colours.shape[2]], axis=-1), 0, finite)
         found = shrunk(light, without_noise(light, guides), variance)
         found += without_noise(finite - light, guides, all_edges=True)
-        colours[...] = np.maximum(found, 0)
+        colours[...] = np.maximum(no_brighter(found, finite), 0)
     else:
-        colours[...] = without_noise(finite, guides)
+        colours[...] = no_brighter(without_noise(finite, guides), finite)
     return pixels
 
 

@@ -1,4 +1,4 @@
-"""Means over windows of an image."""
+"""Means and maxima over windows of an image."""
 
 from __future__ import annotations
 
@@ -14,16 +14,22 @@ def window_mean(values: np.ndarray, width: int) -> np.ndarray:
 
 def mean_without_largest(values: np.ndarray, width: int) -> np.ndarray:
     """The same means without the largest value of each window (0 where there is no other)."""
-    values = np.asarray(values, np.float64)
-    largest, number = values, np.ones(())
+    values, number = np.asarray(values, np.float64), np.ones(())
+    for axis in (-2, -1):
+        low, high = _windows(values.shape[axis], width)
+        number = np.multiply.outer(number, high - low)
+    others = window_mean(values, width) * number - window_max(values, width)
+    return others / np.maximum(number - 1, 1)
+
+
+def window_max(values: np.ndarray, width: int) -> np.ndarray:
+    """The largest value of each of these windows."""
     for axis in (-2, -1):
         at_borders = [(0, 0)] * values.ndim
         at_borders[axis] = (width // 2, width // 2)
-        padded = np.pad(largest, at_borders, mode="edge")
-        largest = sliding_window_view(padded, width, axis=axis).max(axis=-1)
-        low, high = _windows(values.shape[axis], width)
-        number = np.multiply.outer(number, high - low)
-    return (window_mean(values, width) * number - largest) / np.maximum(number - 1, 1)
+        padded = np.pad(values, at_borders, mode="edge")
+        values = sliding_window_view(padded, width, axis=axis).max(axis=-1)
+    return values
 
 
 def _windows(size: int, width: int) -> tuple[np.ndarray, np.ndarray]:

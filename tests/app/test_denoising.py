@@ -5,7 +5,7 @@ import sys
 import mis_integrators
 from mis_integrators.app import cli, denoising
 from mis_integrators.app.denoising import DOUBT, shrunk, without_noise
-from mis_integrators.core.film import WINDOW
+from mis_integrators.core.film import WINDOW, direct_channels
 from mis_integrators.core.windows import window_mean
 from mis_integrators.paths.guides import albedo_and_normal
 
@@ -185,6 +185,24 @@ def test_images_of_other_shapes_are_refused(rgb):
         mis_integrators.denoise(np.zeros(3))
     with pytest.raises(ValueError, match=r"3 x 5 pixels, the sensor's film 6 x 4"):
         mis_integrators.denoise(np.zeros((5, 3, 3)), painted_wall())
+
+
+@pytest.mark.parametrize("apart", [False, True])
+def test_highlights_are_no_brighter_than_their_samples(rgb, apart):
+    """Small highlights of which each sample meets all or nothing, on black: Open Image Denoise alone
+    makes them brighter than any sample."""
+    rng, image = np.random.default_rng(1), np.zeros((128, 128, 3), np.float32)
+    row, column = np.mgrid[:128, :128]
+    for y, x in rng.integers(10, 118, (12, 2)):
+        highlight = (row - y) ** 2 + ((column - x) / 2) ** 2 < 4
+        image[highlight & (rng.random((128, 128)) < 0.6)] = 2.5
+    assert without_noise(image).max() > 1.3 * image.max()
+    names = ["R", "G", "B"]
+    if apart:
+        names += direct_channels()
+        image = np.concatenate([image, image, np.ones((128, 128, 1), np.float32)], axis=-1)
+    clean = mis_integrators.denoise(image, channels=names)[..., :3]
+    assert 2 < clean.max() <= 2.5
 
 
 # --- direct light apart --------------------------------------------------------------------------
