@@ -189,8 +189,8 @@ def test_images_of_other_shapes_are_refused(rgb):
 
 @pytest.mark.parametrize("apart", [False, True])
 def test_highlights_are_no_brighter_than_their_samples(rgb, apart):
-    """Small highlights of which each sample meets all or nothing, on black: Open Image Denoise alone
-    makes them brighter than any sample."""
+    """Small highlights of which each sample meets all or nothing, on black: Open Image Denoise
+    alone makes them brighter than any sample."""
     rng, image = np.random.default_rng(1), np.zeros((128, 128, 3), np.float32)
     row, column = np.mgrid[:128, :128]
     for y, x in rng.integers(10, 118, (12, 2)):
