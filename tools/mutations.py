@@ -894,4 +894,18 @@ MUTATIONS = [
         "denoised highlights are brighter than any of their samples",
         f"{DENOISING}::test_highlights_are_no_brighter_than_their_samples",
     ),
+    Mutation(
+        "lights/environment_guide.py",
+        "towards, active) if self.aims else density",
+        "towards, active) if self.aims else own_pdf",
+        "wide suns are drawn by one density and weighted by another",
+        f"{TRANSPORT}::test_density_of_direct_light",
+    ),
+    Mutation(
+        "lights/environment_sampler.py",
+        "left = dr.select(\n            turned, sample.x / TABLE_SHARE,",
+        "left = dr.select(\n            turned, sample.x,",
+        "of a table of radiance only a part is drawn",
+        "tests/lights/test_environment_sampler.py",
+    ),
 ]

@@ -53,7 +53,11 @@ BY_CLOCK = (
 """Constants, or those of modules, that only renders of a given time read."""
 OF_SEVERAL_VIEWS = "volume."
 """Modules that none of these scenes needs."""
-SEEN_BY_ENVIRONMENTS = ("lights.environment_guide", "lights.portals")
+SEEN_BY_ENVIRONMENTS = (
+    "lights.environment_guide",
+    "lights.environment_sampler",
+    "lights.portals",
+)
 """Modules of no use where no light comes from infinitely far away."""
 
 

@@ -21,8 +21,9 @@ from .output import picture_channels
 DOUBT = 4.0
 """Tuned: by what the variance of direct light is multiplied before its noise is judged."""
 AROUND = 25
-"""Tuned: width in pixels of the windows whose mean the variance of a pixel is not below, and whose
-brightest pixel no other is above."""
+"""Tuned: width in pixels of the windows whose mean the variance of a pixel is not below."""
+HIGHLIGHTS = 25
+"""Tuned: width in pixels of the windows whose brightest pixel no denoised one is above."""
 MISSING = "denoising needs mitsuba-oidn: pip install 'mis-integrators[denoise]'"
 
 
@@ -81,10 +82,11 @@ def without_noise(
 
 
 def no_brighter(clean: np.ndarray, raw: np.ndarray) -> np.ndarray:
-    """A denoised image (H, W, C) where no pixel is brighter than all of the `raw` ones within a
-    window: Open Image Denoise makes some highlights that few samples have met several times as
-    bright as any of these."""
-    return np.minimum(clean, np.moveaxis(window_max(np.moveaxis(raw, -1, 0), AROUND), 0, -1))
+    """A denoised image (H, W, C) where no pixel is brighter, in any channel, than all of the `raw`
+    ones (finite numbers) within a window: Open Image Denoise makes some highlights that few samples
+    have met several times as bright as any of these."""
+    brightest = window_max(np.moveaxis(raw, -1, 0), HIGHLIGHTS)
+    return np.minimum(clean, np.moveaxis(brightest, 0, -1))
 
 
 def denoise(
@@ -94,7 +96,8 @@ def denoise(
     channels: Sequence[str] = (),
     hide_emitters: bool = False,
 ) -> np.ndarray:
-    """A denoised copy of a rendered image.
+    """A denoised copy of a rendered image. No pixel of it is brighter than all of the image's near
+    ones.
 
     Images should be rendered with a box filter (``<rfilter type="box"/>``): wider ones make the
     noise of neighbouring pixels alike, and a denoiser then takes it for detail.

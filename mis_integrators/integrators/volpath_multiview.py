@@ -14,6 +14,7 @@ from ..core.random import mix
 from ..core.recording import recorder
 from ..core.render_lock import render_lock, under_render_lock
 from ..core.traits import UnsupportedScene, check_film, check_variant
+from ..lights.environment_guide import EnvironmentGuide, infinite_emitters
 from ..lights.lights import Lights
 from ..volume.films import OWN, SHARED, ViewAccumulator, own_values, splat, write_film
 from ..volume.lines import common_nulls, connect, follow_nulls, sight
@@ -184,7 +185,8 @@ class MultiViewSession(IterativeSession):
         self.camera_paths = camera_paths
         self.views = Views(sensors, camera_paths, integrator.plugin)
         self.traits = VolumeTraits(scene, sensors)
-        self.lights = Lights(scene, integrator.plugin, by_power=False)
+        guide = EnvironmentGuide(scene, None) if infinite_emitters(scene) else None
+        self.lights = Lights(scene, integrator.plugin, guide, by_power=False)
         self.restart(seed)
         self.slots = 1
         self.paths = min(self.views.paths, max(PAIRS // self.views.count, FEWEST))

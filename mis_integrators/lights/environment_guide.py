@@ -139,7 +139,7 @@ def _worth_aiming(portals, p, d, light, density, own):
 
     Records (NumPy arrays): places `p` and directions `d` (3, n) to environments that a shadow ray
     reaches, `light` from there, densities per solid angle with which they were drawn, and with
-    which the emitter's own sampler draws them. At a place, light has the second moment of its ratio
+    which the `EnvironmentSampler` draws them. At a place, light has the second moment of its ratio
     to the density of its direction; here that is taken relative to the light, so that dark places
     count as much as bright ones.
     """
@@ -167,6 +167,21 @@ class Places(NamedTuple):
     smooth: mi.Bool
 
 
+class Turn(NamedTuple):
+    """Directions of next-event estimation that an environment's own sampler does not draw."""
+
+    counted: mi.Bool
+    """Which lanes have the density `EnvironmentGuide.direct_density`, and not just that of the own
+    sampler."""
+    turned: mi.Bool
+    """Which of these have the direction `towards`."""
+    towards: mi.Vector3f
+    good: mi.Bool
+    """Whether that is any good."""
+    sample: mi.Point2f
+    """What is left of the pairs of uniform numbers, for the own sampler."""
+
+
 class EnvironmentGuide:
     """Densities of position and direction for infinite emitters (`environment` and `directional`
     kinds).
@@ -176,8 +191,8 @@ class EnvironmentGuide:
     the pilot met; `portals` of the light of environments (`None` where the pilot saw next to none);
     `direction_share`, the share of environment sub-paths whose direction comes from the `sampler`;
     `aims`, whether next-event estimation in the box around the lit places aims at the entrances.
-    Without a `sensor` (None) there is no pilot, and all
-    densities are the plain ones.
+    Without a `sensor` (None) there is no pilot: positions have the plain density, and directions
+    that of the `sampler`.
     """
 
     def __init__(self, scene, sensor):
@@ -399,9 +414,9 @@ class EnvironmentGuide:
     def _look(self, index, emitter, places, rng):
         """Records (p, direction to the light, table row, weight, density, own density) of a place
         each, where sub-paths of the emitter would come from; the weight estimates what light from
-        there adds to the image. The densities of the direction, and of the `sampler`
-        there, are zero but for environments; the latter also where next-event estimation has
-        something in its way."""
+        there adds to the image. The densities of the direction, and of the `sampler` there, are
+        zero but for environments; the latter also where next-event estimation has something in its
+        way."""
         vertices = dr.width(places.smooth)
         pdf = own = dr.zeros(mi.Float, vertices)
         if emitter.is_environment():
@@ -547,14 +562,8 @@ class EnvironmentGuide:
         return self.aims or (self.sampler is not None and self.sampler.by_table)
 
     def turn(self, p, sample, active):
-        """Directions of next-event estimation of an environment from `p` that its own sampler does
-        not draw.
-
-        Returns `(counted, turned, towards, good, sample)`: which of the `active` lanes have the
-        density `direct_density`, and not just that of the own sampler; which of these have a
-        direction `towards` from here, and whether it is any good; and what is left of `sample`,
-        pairs of uniform numbers.
-        """
+        """The `Turn` of next-event estimation of an environment from `p`, by `sample`, pairs of
+        uniform numbers."""
         counted, turned, good = mi.Bool(False), mi.Bool(False), mi.Bool(True)
         towards = mi.Vector3f(0, 0, 1)
         if self.aims:
@@ -570,7 +579,7 @@ class EnvironmentGuide:
             by_table, by_radiance, sample = self.sampler.turn(sample, others)
             towards = dr.select(by_table, by_radiance, towards)
             turned, good = turned | by_table, good | by_table
-        return counted, turned, towards, good, sample
+        return Turn(counted, turned, towards, good, sample)
 
     def direct_density(self, own_pdf, p, towards, active=True):
         """Density per solid angle of next-event estimation of an environment from `p`, where its

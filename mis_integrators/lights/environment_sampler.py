@@ -18,16 +18,16 @@ from ..core.spectra import channel_mean
 from .histograms import draw_cell, in_square_cell, square_cell
 
 TABLE_CELLS = 256
-"""Cells along each edge of the table of a hemisphere: half a degree each."""
+"""Tuned: cells along each edge of the table of a hemisphere: half a degree each."""
 LOOKS = 4
-"""Directions in each cell that tell its radiance."""
+"""Tuned: directions in each cell that tell its radiance."""
 TABLE_SHARE = 0.5
-"""Share of the directions that come from the table, if any do: the noise is then at most twice what
-the table alone or the environment's own sampler alone would leave."""
+"""Tuned: share of the directions that come from the table, if any do: the second moment of radiance
+over density is then at most twice that of the table alone, or of the environment's own sampler."""
 WORTH_A_TABLE = 0.5
-"""None do if that leaves more than this of the second moment of radiance over density."""
+"""Tuned: none do if that leaves more than this of the second moment."""
 TRIALS = 1 << 15
-"""Directions that tell how good the environment's own sampler is."""
+"""Tuned: directions that tell how good the environment's own sampler is."""
 SPREAD_WAVELENGTHS = 450, 520, 590, 640
 """Wavelengths [nm] at which lights are looked at where no path brings its own."""
 
@@ -51,7 +51,7 @@ def radiance(emitter, towards, active=True):
 
 
 def _hemisphere_cell(towards):
-    """Number of a direction's cell: those of the upper hemisphere first."""
+    """Number of a direction's cell, row by row: those of the upper hemisphere first."""
     up = mi.Vector3f(towards.x, towards.y, dr.abs(towards.z))
     place = mi.warp.uniform_hemisphere_to_square(up)
     cell = square_cell(place.x, place.y, TABLE_CELLS)
@@ -80,7 +80,7 @@ class EnvironmentSampler:
         self.by_table = moment * WORTH_A_TABLE > 1  # no sampler does better than one
         if self.by_table:
             self._make_table(emitter)
-            ratio = np.array(own / self.density(own, ds.d))
+            ratio = np.array(dr.select(own > 0, own / self.density(own, ds.d), 0))
             self.by_table = _second_moment(self._light, ratio) < WORTH_A_TABLE * moment
 
     def _make_table(self, emitter):
@@ -90,7 +90,10 @@ class EnvironmentSampler:
         found = radiance(emitter, _direction_in(cell, next_2d(rng))).numpy().reshape(cells, LOOKS)
         pmf = np.nan_to_num(np.maximum(found, 0), posinf=0).mean(axis=1, dtype=np.float64)
         pmf /= max(pmf.sum(), 1e-300)
-        self._pmf, self._cdf = from_numpy(mi.Float, pmf), from_numpy(mi.Float, np.cumsum(pmf))
+        rows = pmf.reshape(2 * TABLE_CELLS, TABLE_CELLS)
+        in_row = np.cumsum(rows, axis=1) / np.maximum(rows.sum(axis=1, keepdims=True), 1e-300)
+        self._pmf, self._in_row = (from_numpy(mi.Float, x.ravel()) for x in (pmf, in_row))
+        self._rows = from_numpy(mi.Float, np.cumsum(rows.sum(axis=1)))
 
     def power(self, cell_of, cells):
         """Radiance times solid angle of each of so many `cells` of directions; `cell_of`: numbers
@@ -100,7 +103,7 @@ class EnvironmentSampler:
 
     def tables(self):
         """Every evaluated array that the sampling routines read, for `dr.freeze` to track."""
-        return [self._pmf, self._cdf] if self.by_table else []
+        return [self._pmf, self._rows, self._in_row] if self.by_table else []
 
     def turn(self, sample, active=True):
         """Which of the directions that these pairs of uniform numbers stand for come from the
@@ -110,9 +113,10 @@ class EnvironmentSampler:
             turned, sample.x / TABLE_SHARE, (sample.x - TABLE_SHARE) / (1 - TABLE_SHARE)
         )
         sample = mi.Point2f(dr.select(active, left, sample.x), sample.y)
-        cells = 2 * TABLE_CELLS**2
-        cell, leftover = draw_cell(self._cdf, mi.UInt32(0), cells, sample.x, turned)
-        return turned, _direction_in(cell, mi.Point2f(leftover, sample.y)), sample
+        row, down = draw_cell(self._rows, mi.UInt32(0), 2 * TABLE_CELLS, sample.x, turned)
+        first = row * TABLE_CELLS
+        column, along = draw_cell(self._in_row, first, TABLE_CELLS, sample.y, turned)
+        return turned, _direction_in(first + column, mi.Point2f(along, down)), sample
 
     def density(self, own_pdf, towards, active=True):
         """Density per solid angle, where the environment's own sampler has `own_pdf`."""

@@ -146,12 +146,7 @@ class Lights:
             index, probability = self.choice.sample(choice)
         emitter = self.pointer(index)
         textured = active & textured_mask(emitter) if self.has_textured else mi.Bool(False)
-        if self._turns:
-            there = active & self._of_kind(index, "environment", active=active)
-            *turn, sample = self.guide.turn(ref.p, sample, there)
-        ds, weight = emitter.sample_direction(ref, sample, active & ~textured)
-        if self._turns:
-            ds, weight = self._turn(ref, ds, weight, *turn)
+        ds, weight = self.sample_emitter(ref, index, sample, active & ~textured)
         if self.has_textured:
             ds_t, weight_t = self._sample_by_area(ref, emitter, index, sample, textured)
             ds = dr.select(textured, ds_t, ds)
@@ -165,9 +160,14 @@ class Lights:
         """Whether direct light of an environment comes from others than its own sampler, too."""
         return self.guide is not None and self.guide.turns
 
-    def _turn(self, ref, ds, weight, counted, turned, towards, good):
-        """`(ds, weight)` of `propose_direct` after `EnvironmentGuide.turn`, whose results the other
-        arguments are."""
+    def sample_emitter(self, ref, index, sample, active):
+        """`(ds, weight)` of `propose_direct` for emitter `index`, from pairs of uniform numbers,
+        without the emitter's choice; not for textured area lights."""
+        if not self._turns:
+            return self.pointer(index).sample_direction(ref, sample, active)
+        there = active & self._of_kind(index, "environment", active=active)
+        counted, turned, towards, good, sample = self.guide.turn(ref.p, sample, there)
+        ds, weight = self.pointer(index).sample_direction(ref, sample, active)
         ds.d = dr.select(turned, towards, ds.d)
         ds.n = dr.select(turned, mi.Normal3f(-towards), ds.n)
         ds.p = dr.select(turned, ref.p + towards * (2 * self.guide.radius), ds.p)

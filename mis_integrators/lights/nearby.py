@@ -140,7 +140,7 @@ class NearbyChoice:
         ref.p = self._low + (mi.Vector3f(place) + within) / self._scale
         if mi.is_spectral:
             ref.wavelengths = mi.UnpolarizedSpectrum(*SPREAD_WAVELENGTHS)
-        ds, weight = lights.pointer(emitter).sample_direction(ref, next_2d(rng), True)
+        ds, weight = lights.sample_emitter(ref, emitter, next_2d(rng), mi.Bool(True))
         value = channel_mean(weight)
         lit = dr.isfinite(value) & (value > 0)
         hidden = lights.scene.ray_test(lights.shadow_ray(ref, ds, lights.guide is not None), lit)

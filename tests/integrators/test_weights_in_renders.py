@@ -203,6 +203,7 @@ ROWS = [
         RGB,
         "box",
     ),
+    ("wide sun", "lambertian", {"strategies": 3, "mix_diffuse": True}, ORTHO, MONO, "box"),
     ("several", "smooth1", {"strategies": 3, "mix_diffuse": True}, PERSPECTIVE, RGB, "box"),
     ("point", "smooth0", {"strategies": 2}, LENS, MONO, "box"),
     (

@@ -516,7 +516,10 @@ SINGULAR = "point", "spot", "directional", "projector", "directionalarea"
 
 @pytest.mark.parametrize(
     "emitter",
-    one_of_each_kind(name for name in EMITTERS if name not in SINGULAR),
+    [
+        *one_of_each_kind(name for name in EMITTERS if name not in SINGULAR),
+        "wide sun and textured",
+    ],
 )
 def test_density_of_direct_light(emitter):
     """The density that `sample_direct` states is the one that `pdf_direct` gives for the same
@@ -535,14 +538,16 @@ def test_density_of_direct_light(emitter):
                 "to_world": look((0, 0, 5), (0, 0, 0)),
                 "film": film(16),
             },
-            **EMITTERS[emitter]("delta"),
+            **{
+                f"{name} of {kind}": light
+                for kind in emitter.split(" and ")
+                for name, light in EMITTERS[kind]("delta").items()
+            },
         }
     )
-    guide = (
-        EnvironmentGuide(scene, scene.sensors()[0])
-        if emitter in ("constant", "envmap", "envmap rotated", "sunsky", "wide sun", "several")
-        else None
-    )
+    infinite = environment_guide.infinite_emitters(scene)
+    guide = EnvironmentGuide(scene, scene.sensors()[0]) if infinite else None
+    assert "wide sun" not in emitter or guide.sampler.by_table
     lights = Lights(scene, guide=guide)
     n = 1 << 20
     si = dr.zeros(mi.SurfaceInteraction3f, n)

@@ -48,7 +48,7 @@ from foggy import (
     world,
 )
 from selection import extended
-from worlds import bitmap, diffuse, film, grey, path, waves
+from worlds import EMITTERS, bitmap, diffuse, film, grey, path, waves
 
 STRETCHES = ("majorant_optical_depth", "raw_depth", "primary_sample")
 
@@ -113,6 +113,13 @@ def test_one_view_is_volpath(variant_name):
     if mi.is_spectral:
         sensor["srf"] = {"type": "spectrum", "value": [(554, 0.0), (555, 1.0), (556, 0.0)]}
     views_agree(multiview(), volpath("volpathmis" if mi.is_spectral else "volpath"), smoky(sensor))
+
+
+@pytest.mark.parametrize("sky", ["constant", *extended("wide sun")])
+def test_a_sky_and_a_picture_that_shines(rgb, sky):
+    """Lamps whose own samplers are not used, or not alone, together."""
+    lights = {"sky": EMITTERS[sky]("delta")["e"], "picture": EMITTERS["textured"]("")["e"]}
+    views_agree(multiview(), volpath(), smoky(view((0.5, 1.2, 4.5)), **lights))
 
 
 @pytest.mark.parametrize("medium", ["grid", *extended("homogeneous")])
