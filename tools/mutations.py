@@ -903,8 +903,8 @@ MUTATIONS = [
     ),
     Mutation(
         "lights/environment_sampler.py",
-        "left = dr.select(\n            turned, sample.x / TABLE_SHARE,",
-        "left = dr.select(\n            turned, sample.x,",
+        "mi.Point2f(dr.select(active, left, sample.x), sample.y)",
+        "mi.Point2f(sample.x, sample.y)",
         "of a table of radiance only a part is drawn",
         "tests/lights/test_environment_sampler.py",
     ),

@@ -23,7 +23,7 @@ from ..core.spectra import channel_mean
 from ..core.traits import scene_bounds
 from ..paths.camera_rays import sample_camera_ray
 from .environment_sampler import EnvironmentSampler, point, radiance
-from .histograms import draw_cell, in_square_cell, smoothed, square_cell
+from .histograms import draw_cell, in_square_cell, smoothed, split, square_cell
 from .portals import PortalDistribution
 
 POLAR_CELLS = 16
@@ -531,9 +531,7 @@ class EnvironmentGuide:
         if self.sampler.by_table:
             ds.d = dr.select(turned, towards, ds.d)
         if self.direction_share < 1:
-            share = self.direction_share
-            own = extra < share
-            extra = dr.select(own, extra / share, (extra - share) / (1 - share))
+            own, extra = split(extra, self.direction_share)
             cell, leftover = draw_cell(
                 self._direction_cdf, mi.UInt32(0), direction_cells(), sample.x, active
             )
@@ -568,10 +566,8 @@ class EnvironmentGuide:
         towards = mi.Vector3f(0, 0, 1)
         if self.aims:
             counted = active & self.portals.near(p)
-            turned = counted & (sample.x < AIMED_SHARE)
-            left = dr.select(
-                turned, sample.x / AIMED_SHARE, (sample.x - AIMED_SHARE) / (1 - AIMED_SHARE)
-            )
+            turned, left = split(sample.x, AIMED_SHARE)
+            turned &= counted
             sample = mi.Point2f(dr.select(counted, left, sample.x), sample.y)
             towards, good = self.portals.sample_direction(p, sample, turned)
         if self.sampler.by_table:

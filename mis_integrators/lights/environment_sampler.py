@@ -15,7 +15,7 @@ import numpy as np
 from ..core.packing import from_numpy
 from ..core.random import next_2d, streams
 from ..core.spectra import channel_mean
-from .histograms import draw_cell, in_square_cell, square_cell
+from .histograms import draw_cell, in_square_cell, split, square_cell
 
 TABLE_CELLS = 256
 """Tuned: cells along each edge of the table of a hemisphere: half a degree each."""
@@ -108,10 +108,8 @@ class EnvironmentSampler:
     def turn(self, sample, active=True):
         """Which of the directions that these pairs of uniform numbers stand for come from the
         table, these directions, and the pairs for both ways. Only where there is a table."""
-        turned = active & (sample.x < TABLE_SHARE)
-        left = dr.select(
-            turned, sample.x / TABLE_SHARE, (sample.x - TABLE_SHARE) / (1 - TABLE_SHARE)
-        )
+        turned, left = split(sample.x, TABLE_SHARE)
+        turned &= active
         sample = mi.Point2f(dr.select(active, left, sample.x), sample.y)
         row, down = draw_cell(self._rows, mi.UInt32(0), 2 * TABLE_CELLS, sample.x, turned)
         first = row * TABLE_CELLS

@@ -20,6 +20,13 @@ def in_square_cell(cell, offset, n: int):
     return (mi.Float(cell % n) + offset.x) * (1 / n), (mi.Float(cell // n) + offset.y) * (1 / n)
 
 
+def split(u, share: float):
+    """Which of uniform numbers `u` are below `share`; and for either side a uniform number that is
+    left of them."""
+    below = u < share
+    return below, dr.select(below, u / share, (u - share) / (1 - share))
+
+
 def draw_cell(cdf, first, count: int, u, active=True):
     """A cell, from uniform numbers `u` and the cumulative sums of `count` cells, which stand at
     places `first` and on of `cdf`; and a uniform number that is left of `u`, in [0, 1)."""

@@ -146,7 +146,7 @@ class Lights:
             index, probability = self.choice.sample(choice)
         emitter = self.pointer(index)
         textured = active & textured_mask(emitter) if self.has_textured else mi.Bool(False)
-        ds, weight = self.sample_emitter(ref, index, sample, active & ~textured)
+        ds, weight = self.sample_emitter(ref, emitter, index, sample, active & ~textured)
         if self.has_textured:
             ds_t, weight_t = self._sample_by_area(ref, emitter, index, sample, textured)
             ds = dr.select(textured, ds_t, ds)
@@ -160,14 +160,14 @@ class Lights:
         """Whether direct light of an environment comes from others than its own sampler, too."""
         return self.guide is not None and self.guide.turns
 
-    def sample_emitter(self, ref, index, sample, active):
-        """`(ds, weight)` of `propose_direct` for emitter `index`, from pairs of uniform numbers,
-        without the emitter's choice; not for textured area lights."""
+    def sample_emitter(self, ref, emitter, index, sample, active):
+        """`(ds, weight)` of `propose_direct` for an `emitter` and its `index`, from pairs of
+        uniform numbers, without the emitter's choice; not for textured area lights."""
         if not self._turns:
-            return self.pointer(index).sample_direction(ref, sample, active)
+            return emitter.sample_direction(ref, sample, active)
         there = active & self._of_kind(index, "environment", active=active)
         counted, turned, towards, good, sample = self.guide.turn(ref.p, sample, there)
-        ds, weight = self.pointer(index).sample_direction(ref, sample, active)
+        ds, weight = emitter.sample_direction(ref, sample, active)
         ds.d = dr.select(turned, towards, ds.d)
         ds.n = dr.select(turned, mi.Normal3f(-towards), ds.n)
         ds.p = dr.select(turned, ref.p + towards * (2 * self.guide.radius), ds.p)

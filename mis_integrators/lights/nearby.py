@@ -140,7 +140,9 @@ class NearbyChoice:
         ref.p = self._low + (mi.Vector3f(place) + within) / self._scale
         if mi.is_spectral:
             ref.wavelengths = mi.UnpolarizedSpectrum(*SPREAD_WAVELENGTHS)
-        ds, weight = lights.sample_emitter(ref, emitter, next_2d(rng), mi.Bool(True))
+        ds, weight = lights.sample_emitter(
+            ref, lights.pointer(emitter), emitter, next_2d(rng), mi.Bool(True)
+        )
         value = channel_mean(weight)
         lit = dr.isfinite(value) & (value > 0)
         hidden = lights.scene.ray_test(lights.shadow_ray(ref, ds, lights.guide is not None), lit)

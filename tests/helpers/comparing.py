@@ -390,6 +390,13 @@ def extrapolate(radii, estimates) -> Estimate:
     return Estimate(value, sxx / det, min(e.freedom for e in estimates))
 
 
+def stratified_directions(n, seed=3):
+    """n x n directions all around, one in each of as many parts of equal size."""
+    rng = np.random.default_rng(seed)
+    u = (np.stack(np.meshgrid(range(n), range(n))).reshape(2, -1) + rng.random((2, n * n))) / n
+    return mi.warp.square_to_uniform_sphere(mi.Point2f(u.astype(np.float32)))
+
+
 def mean_and_error(values):
     """The mean of independent values, and its standard error."""
     return values.mean(), values.std() / np.sqrt(len(values))

@@ -7,7 +7,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from comparing import mean_and_error
+from comparing import mean_and_error, stratified_directions
 from worlds import EMITTERS, T
 
 COUNT = 1 << 19
@@ -26,13 +26,6 @@ def drawn(emitter, sampler):
     ds, _ = emitter.sample_direction(it, sample)
     ds.d = dr.select(turned, towards, ds.d)
     return ds.d, sampler.density(emitter.pdf_direction(it, ds), ds.d)
-
-
-def stratified(n, seed=3):
-    """n x n directions all around, one in each of as many parts of equal size."""
-    rng = np.random.default_rng(seed)
-    u = (np.stack(np.meshgrid(range(n), range(n))).reshape(2, -1) + rng.random((2, n * n))) / n
-    return mi.warp.square_to_uniform_sphere(mi.Point2f(u.astype(np.float32)))
 
 
 @pytest.mark.parametrize("name", ["constant", "envmap rotated", "sunsky"])
@@ -60,11 +53,8 @@ def test_a_wide_sun_is_found(rgb, angle, height):
     assert sampler.by_table
     towards, density = drawn(emitter, sampler)
     value = np.array(dr.select(density > 0, radiance(emitter, towards) / density, 0))
-    expected, expected_error = mean_and_error(
-        np.array(
-            [np.mean(radiance(emitter, stratified(1024, k)).numpy()) * 4 * np.pi for k in range(8)]
-        )
-    )
+    sets = [radiance(emitter, stratified_directions(1024, k)).numpy() for k in range(8)]
+    expected, expected_error = mean_and_error(4 * np.pi * np.mean(sets, axis=1))
     mean, error = mean_and_error(value)
     error = np.hypot(error, expected_error)
     assert abs(mean - expected) < 5.3 * error, f"{mean} against {expected}"
@@ -76,7 +66,7 @@ def test_a_wide_sun_is_found(rgb, angle, height):
 
 def test_density_is_one_in_all(rgb):
     """The integral of the density over all directions; stratified ones, 5 standard errors."""
-    sampler, towards = EnvironmentSampler(environment("wide sun")), stratified(1024)
+    sampler, towards = EnvironmentSampler(environment("wide sun")), stratified_directions(1024)
     assert sampler.by_table
     density = sampler.density(mi.Float(1 / (4 * np.pi)), towards)
     total, error = mean_and_error(4 * np.pi * np.array(density))
