@@ -908,4 +908,32 @@ MUTATIONS = [
         "of a table of radiance only a part is drawn",
         "tests/lights/test_environment_sampler.py",
     ),
+    Mutation(
+        "paths/media.py",
+        "return dr.select(of_flakes, reflected, wo), weight",
+        "return wo, weight",
+        "flakes reflect by another density than they say",
+        f"{FOG}::test_each_technique_alone",
+    ),
+    Mutation(
+        "paths/connect.py",
+        """value *= vertex_bsdf.adjoint(d, light["towards"], active)""",
+        """value *= vertex_bsdf.adjoint(d, d, active)""",
+        "light from flakes to the sensor has the phase function of camera paths",
+        f"{FOG}::test_each_technique_alone",
+    ),
+    Mutation(
+        "photons/beams.py",
+        "return value * adjoint_factor(*where, -self.d, towards, active), pdf",
+        "return value, pdf",
+        "photons in media of flakes scatter as camera paths do",
+        "tests/integrators/test_flakes_media.py::test_furnace",
+    ),
+    Mutation(
+        "volume/lines.py",
+        "dr.select(within, density * area, density)",
+        "density",
+        "views share what flakes scatter as if all saw them alike",
+        "tests/integrators/test_flakes_media.py::test_views_agree_with_bdpt",
+    ),
 ]

@@ -200,8 +200,10 @@ class MediaTraits:
     Attributes: `media` (a list of all), `has_grids` (media that are not homogeneous),
     `has_delta` (specular scattering somewhere: boundaries that let light pass are none),
     `has_null_media` (media in which collisions may be null: grids, and media whose extinction
-    depends on the channel), `has_null_vertices` (BSDFs that scatter and let part of the light pass
-    straight on), `boundary_flags` (what must be known of surfaces that only let light pass).
+    depends on the channel), `has_flakes` (media whose extinction depends on the direction, and
+    whose phase functions are not symmetric), `has_null_vertices` (BSDFs that scatter and let part
+    of the light pass straight on), `boundary_flags` (what must be known of surfaces that only let
+    light pass).
     """
 
     def __init__(self, scene, sensors):
@@ -216,6 +218,9 @@ class MediaTraits:
         self.media = all_media(scene, sensors)
         self.has_grids = any(not m.is_homogeneous() for m in self.media)
         self.has_null_media = self.has_grids or any(_is_coloured(m) for m in self.media)
+        self.has_flakes = any(
+            m.phase_function().flags() & mi.PhaseFunctionFlags.Microflake for m in self.media
+        )
 
 
 def all_media(scene, sensors=()):
@@ -229,7 +234,9 @@ def _is_coloured(medium):
     """Whether a homogeneous medium's extinction depends on the channel or wavelength."""
     if mi.is_spectral:
         return True
-    _, _, sigma_t = medium.get_scattering_coefficients(dr.zeros(mi.MediumInteraction3f))
+    somewhere = dr.zeros(mi.MediumInteraction3f)
+    somewhere.wi = mi.Vector3f(0, 0, 1)
+    _, _, sigma_t = medium.get_scattering_coefficients(somewhere)
     return bool((dr.max(sigma_t) > dr.min(sigma_t))[0])
 
 
@@ -249,14 +256,16 @@ def has_media(scene, sensor=None):
     )
 
 
-def check_media(scene, sensor, plugin):
-    """Raises `UnsupportedScene` for media whose phase function is not symmetric (of flakes)."""
-    for medium in all_media(scene, [sensor]):
+def check_media(scene, sensors, plugin):
+    """Raises `UnsupportedScene` for phase functions with flakes that are hidden in others: Mitsuba
+    (3.9.1) then leaves extinction as if there were none."""
+    for medium in all_media(scene, sensors):
         phase = medium.phase_function()
-        if phase.flags() & mi.PhaseFunctionFlags.Microflake:
+        flakes = phase.flags() & mi.PhaseFunctionFlags.Microflake
+        if flakes and phase.class_name() != "SGGXPhaseFunction":
             raise UnsupportedScene(
-                f"{plugin}: phase function {phase.class_name()} is not supported, for its media "
-                'scatter unlike in different directions; use "volpath"'
+                f'{plugin}: phase function "sggx" is not supported as part of another '
+                f"({phase.class_name()}); use it alone"
             )
 
 

@@ -68,7 +68,7 @@ class BDPMAuto(IterativeIntegrator):
 
     def check(self, scene, sensor):
         if has_media(scene, sensor):
-            check_volume_scene(scene, self.plugin)
+            check_volume_scene(scene, [sensor], self.plugin)
             Views.check_sensor(sensor, self.plugin)
             Views.check_layers([sensor], self.layers, self.plugin)
         else:

@@ -106,7 +106,7 @@ class IterativeIntegrator(mi.AdjointIntegrator):
         check_scene(scene, sensor, self.plugin)
         check_bsdfs(scene, self.plugin)
         if has_media(scene, sensor):
-            check_media(scene, sensor, self.plugin)
+            check_media(scene, [sensor], self.plugin)
             for parameter, instead in self.refused_in_media():
                 raise UnsupportedScene(
                     f"{self.plugin}: parameter {parameter} is not supported in scenes with "

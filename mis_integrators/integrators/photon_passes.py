@@ -236,7 +236,7 @@ class PhotonPasses(PilotedSession):
         if kind == "volume":
             return gather_along(
                 photon_map,
-                Beams.read(vertices["beams"], spectral["wavelengths"]),
+                Beams.read(vertices["beams"], spectral["wavelengths"], self.traits),
                 radii,
                 self._light_paths,
                 self.integrator.max_depth,
@@ -347,7 +347,7 @@ class PhotonPasses(PilotedSession):
         """Photons of a kind within `radius` of a vertex, or of a path's beams, on average (a
         number); `vertices` are those of so many `paths`."""
         if kind == "volume":
-            beams = Beams.read(vertices["beams"], spectral["wavelengths"])
+            beams = Beams.read(vertices["beams"], spectral["wavelengths"], self.traits)
             return mean_count_along(photon_map, beams, radius, paths, self.near_zone)
         return mean_photon_count(photon_map, read_queries(vertices), radius)
 

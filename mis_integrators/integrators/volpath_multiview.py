@@ -154,7 +154,7 @@ class VolpathMultiview(IterativeIntegrator):
         return self._session(scene, scene.sensors(), seed, spp)
 
     def _session(self, scene, sensors, seed, spp):
-        check_volume_scene(scene, self.plugin)
+        check_volume_scene(scene, sensors, self.plugin)
         for sensor in sensors:
             check_film(sensor, self.plugin)
             Views.check_sensor(sensor, self.plugin)

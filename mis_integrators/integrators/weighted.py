@@ -249,7 +249,7 @@ class WeightedSession(BDPMSession):
 
     def _gather_weighted_along(self, photon_map, vertices, radii, spectral, grey):
         """`gather_along` of all beams, weighted."""
-        beams = Beams.read(vertices["beams"], spectral["wavelengths"])
+        beams = Beams.read(vertices["beams"], spectral["wavelengths"], self.traits)
         record = weight_layout().read(
             vertices["beam_weights"], lanes(beam_layout().capacity(vertices["beams"]))
         )

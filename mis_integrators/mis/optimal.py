@@ -203,7 +203,7 @@ class OptimalWeights:
         if self.fluence is None:
             return self.surface_lobe(si, bsdf, mask)
         f, p = self.surface_lobe(si, bsdf.bsdf, mask & ~in_medium(si.n))
-        pdf = bsdf.sample_phase(si, mi.Float(0.5), mi.Point2f(0.5), mask).pdf
+        pdf = bsdf.phase_lobe(si, mask)
         f, p = self.per_disk(si, bsdf, mask, f, p, pdf, pdf)
         return f, dr.maximum(p, SMALLEST_DENSITY)
 

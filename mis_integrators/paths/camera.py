@@ -270,7 +270,7 @@ def trace_camera(
         choice, point = next_1d_and_2d(rng, met)
         if dr.hint(traits.has_media, mode="scalar"):
             bs, weight = at.bsdf.sample(context, si, choice, point, met & ~scatters)
-            bs, weight = sample_phase(medium, si, choice, point, bs, weight, met & scatters)
+            bs, weight = sample_phase(traits, medium, si, choice, point, bs, weight, met & scatters)
         else:
             bs, weight = at.bsdf.sample(context, si, choice, point, met)
         delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)

@@ -49,7 +49,7 @@ def scatter_light(traits, si, bsdf, rng, active, medium=None, scatters=None):
         bs, weight = bsdf.sample(context, si, *next_1d_and_2d(rng, active), active)
         delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
     if traits.has_media:
-        bs, weight = sample_phase(medium, si, *next_1d_and_2d(rng), bs, weight, within)
+        bs, weight = sample_phase(traits, medium, si, *next_1d_and_2d(rng), bs, weight, within)
         delta &= ~within
     wo = si.to_world(bs.wo)
     wi_shading, wo_shading = mi.Frame3f.cos_theta(si.wi), mi.Frame3f.cos_theta(bs.wo)

@@ -22,6 +22,7 @@ import mitsuba as mi
 
 from ..core.random import own_stream
 from ..core.spectra import channel_mean
+from . import flakes
 
 FAINT = 0.05
 """Tuned: transmittance below which the estimate on the way to a light plays roulette."""
@@ -57,10 +58,10 @@ def walls_of(normal_behind, start, normal_ahead, distance):
 def point_in(medium, p, time, wavelengths, wi=None):
     """A `MediumInteraction3f` at `p`, for the evaluation of coefficients and of the phase function:
     `wi` (world space) leads to where a path came from. (Coefficients depend on it in media of
-    flakes.)"""
+    flakes: ``None`` stands for a direction that is the same everywhere, along no axis.)"""
     mei = dr.zeros(mi.MediumInteraction3f)
     mei.p, mei.time, mei.wavelengths, mei.medium = p, time, wavelengths, medium
-    mei.wi = mi.Vector3f(0, 0, 1) if wi is None else wi
+    mei.wi = dr.normalize(mi.Vector3f(1)) if wi is None else wi
     mei.sh_frame = mi.Frame3f(mei.wi)
     return mei
 
@@ -425,14 +426,24 @@ def interaction_at(hit, ray, scatters, active):
     return dr.select(active & scatters, within, si)
 
 
-def sample_phase(medium, si, choice, point, bs, weight, active):
+def sample_direction(traits, mei, choice, point, active):
+    """`(wo, weight, pdf)`: a sample of the phase function at `mei` (a `MediumInteraction3f`; its
+    medium is none on inactive lanes), in world space."""
+    phase, context = mei.medium.phase_function(), mi.PhaseFunctionContext(None)
+    wo, weight, pdf = phase.sample(context, mei, choice, point, active)
+    if not traits.has_flakes:
+        return wo, weight, pdf
+    of_flakes = active & mi.has_flag(phase.flags(), mi.PhaseFunctionFlags.Microflake)
+    reflected, density = flakes.sample(mei, point, of_flakes)
+    return dr.select(of_flakes, reflected, wo), weight, dr.select(of_flakes, density, pdf)
+
+
+def sample_phase(traits, medium, si, choice, point, bs, weight, active):
     """`(bs, weight)` of a BSDF's sample, on the lanes `active` those of the medium's phase function
     at `si`."""
     here = dr.select(active, medium, dr.zeros(mi.MediumPtr))
     mei = point_in(here, si.p, si.time, si.wavelengths, si.to_world(si.wi))
-    wo, phase_weight, pdf = here.phase_function().sample(
-        mi.PhaseFunctionContext(None), mei, choice, point, active
-    )
+    wo, phase_weight, pdf = sample_direction(traits, mei, choice, point, active)
     bs.wo = dr.select(active, si.to_local(wo), bs.wo)
     bs.pdf = dr.select(active, pdf, bs.pdf)
     bs.eta = dr.select(active, 1, bs.eta)
@@ -448,24 +459,33 @@ def medium_behind(si, medium, wo, active):
 # --- Vertices ---------------------------------------------------------------------------------
 
 
-def phase_f_and_pdfs(sides, to_camera, to_light, active):
-    """The phase function [1/sr] at vertices in media (`vertex.Sides`), and the densities with which
-    a camera path goes on to the light's side, and a light sub-path to the camera's. Phase functions
-    are symmetric here (media of flakes are refused), in their densities, too."""
+def phase_f_and_pdf(sides, to_camera, to_light, active):
+    """The phase function [1/sr] at vertices in media (`vertex.Sides`), and the density with which a
+    camera path goes on to the light's side."""
     medium = dr.select(active, sides.above, dr.zeros(mi.MediumPtr))
     phase, context = medium.phase_function(), mi.PhaseFunctionContext(None)
     mei = point_in(medium, sides.p, mi.Float(0), sides.wavelengths, to_camera)
-    value, pdf = phase.eval_pdf(context, mei, to_light, active)
-    return value, pdf, pdf
+    return phase.eval_pdf(context, mei, to_light, active)
 
 
-def scattered_share(medium, p, wavelengths, active):
+def adjoint_factor(traits, medium, p, wavelengths, to_camera, to_light, active):
+    """The phase function of a light sub-path over that of a camera path through the same point, and
+    so are their densities: 1 but in media of flakes."""
+    if not traits.has_flakes:
+        return 1
+    medium = dr.select(active, medium, dr.zeros(mi.MediumPtr))
+    here = point_in(medium, p, mi.Float(0), wavelengths)
+    return flakes.adjoint_factor(here, to_camera, to_light, active)
+
+
+def scattered_share(medium, p, wavelengths, active, towards=None):
     """`(sigma_s, albedo, extinction)` at points: scattering coefficient [1/m] (a spectrum), that
     over the extinction (a spectrum: what a scattering multiplies throughput with where all channels
-    have the same, see `collision`), and the extinction, the channels' mean [1/m]. Weights know of
-    these: they need a function of the path's vertices alone."""
+    have the same, see `collision`), and the extinction, the channels' mean [1/m]; in media of
+    flakes for light that goes `towards` a direction. Weights know of these: they need a function of
+    the path's vertices alone, and give no direction."""
     sigma_s, _, sigma_t = medium.get_scattering_coefficients(
-        point_in(medium, p, mi.Float(0), wavelengths), active
+        point_in(medium, p, mi.Float(0), wavelengths, towards), active
     )
     total = channel_mean(sigma_t)
     albedo = dr.select(total > 0, sigma_s * dr.rcp(dr.maximum(total, 1e-30)), 0)

@@ -13,7 +13,13 @@ import mitsuba as mi
 
 from ..core.spectra import channel_mean
 from ..core.traits import lookup
-from .media import albedo_mean, phase_f_and_pdfs, sample_phase, scattered_share
+from .media import (
+    adjoint_factor,
+    albedo_mean,
+    phase_f_and_pdf,
+    point_in,
+    scattered_share,
+)
 from .perturbed import smooth_density
 
 SMALLEST_COSINE = 1e-6
@@ -87,8 +93,7 @@ class PhaseOrBSDF:
 
     def _phase(self, si, wo, inside):
         sides = Sides(self.medium, self.medium, si.p, si.wavelengths)
-        value, pdf, _ = phase_f_and_pdfs(sides, si.to_world(si.wi), si.to_world(wo), inside)
-        return value, pdf
+        return phase_f_and_pdf(sides, si.to_world(si.wi), si.to_world(wo), inside)
 
     def eval_pdf(self, context, si, wo, active=True):
         """Value (on surfaces times the cosine) and density per solid angle."""
@@ -104,12 +109,13 @@ class PhaseOrBSDF:
         _, albedo, extinction = scattered_share(medium, si.p, si.wavelengths, active)
         return albedo, extinction
 
-    def sample_phase(self, si, choice, point, active):
-        """A `BSDFSample3f` of the phase function on lanes that scatter in the medium."""
-        bs = dr.zeros(mi.BSDFSample3f, dr.width(si))
-        inside = active & self.scatters
-        bs, _ = sample_phase(self.medium, si, choice, point, bs, mi.Spectrum(0), inside)
-        return bs
+    def phase_lobe(self, si, active):
+        """Density of the phase function in a typical direction, by one fixed sample, on lanes that
+        scatter in the medium."""
+        medium = dr.select(active & self.scatters, self.medium, dr.zeros(mi.MediumPtr))
+        mei = point_in(medium, si.p, si.time, si.wavelengths, si.to_world(si.wi))
+        fixed = mi.PhaseFunctionContext(None), mei, mi.Float(0.5), mi.Point2f(0.5)
+        return medium.phase_function().sample(*fixed, active & self.scatters)[2]
 
     def pdf(self, context, si, wo, active=True):
         """Density per solid angle."""
@@ -202,13 +208,21 @@ class VertexBSDF:
         p_camera, p_light = p_camera * per_light, dr.select(agreed, p_light * per_camera, 0)
         if traits.has_media:
             inside = active & in_medium(self.n)
-            phase, phase_camera, phase_light = phase_f_and_pdfs(
-                self.sides, to_camera, to_light, inside
-            )
+            phase, pdf = phase_f_and_pdf(self.sides, to_camera, to_light, inside)
             value = dr.select(inside, phase, value)
-            p_camera = dr.select(inside, phase_camera, p_camera)
-            p_light = dr.select(inside, phase_light, p_light)
+            p_camera = dr.select(inside, pdf, p_camera)
+            p_light = dr.select(inside, pdf * self.adjoint(to_camera, to_light, inside), p_light)
         return value, p_camera, p_light
+
+    def adjoint(self, to_camera, to_light, active=True):
+        """What the `value` of `f_and_pdfs`, that of camera paths, is multiplied with where a light
+        sub-path has arrived (`media.adjoint_factor`); 1 on surfaces."""
+        if not self.traits.has_media:
+            return 1
+        inside, sides = active & in_medium(self.n), self.sides
+        return adjoint_factor(
+            self.traits, sides.above, sides.p, sides.wavelengths, to_camera, to_light, inside
+        )
 
     def scattered_mean(self, value, to_light, active=True):
         """Mean over the channels of the BSDF [1/sr], where `value` is that of `f_and_pdfs`: what

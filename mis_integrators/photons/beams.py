@@ -24,7 +24,8 @@ import mitsuba as mi
 from ..core.packing import unpack_direction
 from ..core.recording import lanes
 from ..core.records import Layout
-from ..paths.media import point_in
+from ..core.traits import MediaTraits
+from ..paths.media import adjoint_factor, point_in
 from .grid import Query, visit_hits
 from .kernel_sums import KernelSums, disk_area
 from .volume import number_of_medium, read_place
@@ -96,9 +97,10 @@ class Beams:
     level: mi.UInt32
     extinction: mi.Spectrum
     wavelengths: mi.Float
+    traits: MediaTraits
 
     @classmethod
-    def read(cls, words, wavelengths):
+    def read(cls, words, wavelengths, traits):
         """All beams of a buffer."""
         record = read_beams(words)
         active = dr.max(record["throughput"]) > 0
@@ -116,7 +118,7 @@ class Beams:
         record["depth"] &= (1 << LEVEL_SHIFT) - 1
         record |= {"medium": medium, **normals, "long": long, "first": first}
         record |= {"level": level, "extinction": extinction}
-        return cls(**record, active=active, wavelengths=wavelengths)
+        return cls(**record, active=active, wavelengths=wavelengths, traits=traits)
 
     def takes(self, landing, all_kinds=False):
         """Whether photons (`VolumeLanding`) are of a kind that counts, in the beams' own medium."""
@@ -141,11 +143,14 @@ class Beams:
         return dr.maximum(both, LEAST_COVERAGE)
 
     def phase(self, p, towards, active):
-        """The phase function [1/sr] at points `p`, for light from `towards` that goes on to the
-        camera, and its density."""
+        """The phase function [1/sr] at points `p`, for light sub-paths from `towards` that go on to
+        the camera, and the density with which camera paths go there."""
         medium = dr.select(active, self.medium, dr.zeros(mi.MediumPtr))
         mei = point_in(medium, p, mi.Float(0), self.wavelengths, -self.d)
-        return medium.phase_function().eval_pdf(mi.PhaseFunctionContext(None), mei, towards, active)
+        context = mi.PhaseFunctionContext(None)
+        value, pdf = medium.phase_function().eval_pdf(context, mei, towards, active)
+        where = self.traits, medium, p, self.wavelengths
+        return value * adjoint_factor(*where, -self.d, towards, active), pdf
 
 
 def _side(normal, d, distance, radius):

@@ -17,7 +17,8 @@ import mitsuba as mi
 
 from ..core.recording import lanes
 from ..core.records import Layout
-from ..paths.media import point_in, scattered_share
+from ..core.traits import MediaTraits
+from ..paths.media import adjoint_factor, point_in, scattered_share
 from .grid import DiskQuery, visit_hits
 from .kernel_sums import KernelSums, ball_volume
 from .scattering import Scattering
@@ -57,7 +58,8 @@ def read_points(words, first=0, count=None):
 @dataclass
 class Points:
     """Vertices in media, one a lane: the fields of `point_layout`, which are `active`, which have
-    scattered nowhere before (`first`; None: nobody asks), and their coefficients."""
+    scattered nowhere before (`first`; None: nobody asks), their coefficients, and the scene's
+    `MediaTraits`."""
 
     p: mi.Point3f
     d: mi.Vector3f
@@ -70,14 +72,17 @@ class Points:
     scattering: mi.Spectrum
     albedo: mi.Spectrum
     extinction: mi.Float
-    even: bool
+    traits: MediaTraits
 
     @classmethod
     def of(cls, traits, record, wavelengths):
         """The vertices of records as of `read_points` (a `first` among them, if there is one)."""
         active = dr.max(record["throughput"]) > 0
         medium = dr.select(active, record["medium"], dr.zeros(mi.MediumPtr))
-        sigma_s, albedo, extinction = scattered_share(medium, record["p"], wavelengths, active)
+        where = medium, record["p"], wavelengths, active
+        sigma_s, albedo, extinction = scattered_share(*where)
+        if traits.has_flakes:
+            sigma_s, _, _ = scattered_share(*where, -record["d"])
         return cls(
             record["p"],
             record["d"],
@@ -90,29 +95,32 @@ class Points:
             sigma_s,
             albedo,
             extinction,
-            not traits.has_grids,
+            traits,
         )
 
     def scattering_around(self, p, active):
         """Scattering coefficient [1/m] by which the power that photons at `p` have left per volume
         is divided: the larger one of theirs and the vertex's own, so that at the rim of a cloud
         neither makes a firefly. Where the medium is even both are the same."""
-        if self.even:
+        if not self.traits.has_grids:
             return dr.maximum(self.scattering, SMALLEST_SCATTERING)
         medium = dr.select(active, self.medium, dr.zeros(mi.MediumPtr))
-        there, _, _ = scattered_share(medium, p, self.wavelengths, active)
+        there, _, _ = scattered_share(medium, p, self.wavelengths, active, -self.d)
         return dr.maximum(dr.maximum(there, self.scattering), SMALLEST_SCATTERING)
 
     def phase(self, towards, active):
-        """`Scattering` of light from `towards` (a unit vector): there are no cosines, and phase
-        functions are the same from both sides."""
+        """`Scattering` of light sub-paths from `towards` (a unit vector): there are no cosines."""
         medium = dr.select(active, self.medium, dr.zeros(mi.MediumPtr))
         mei = point_in(medium, self.p, mi.Float(0), self.wavelengths, -self.d)
         value, pdf = medium.phase_function().eval_pdf(
             mi.PhaseFunctionContext(None), mei, towards, active
         )
-        value = mi.Spectrum(value)
-        return Scattering(towards, mi.Float(1), value, value * self.albedo, pdf, lambda: pdf)
+        adjoint = adjoint_factor(
+            self.traits, medium, self.p, self.wavelengths, -self.d, towards, active
+        )
+        f = value * self.albedo
+        value = mi.Spectrum(value) * adjoint
+        return Scattering(towards, mi.Float(1), value, f, pdf, lambda: pdf * adjoint)
 
 
 class BallQuery(DiskQuery):

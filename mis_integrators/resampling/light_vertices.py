@@ -72,7 +72,10 @@ class LightVertices:
         joined = LightConnection(
             d,
             distance,
-            value * y["throughput"] * (leaving * dr.rcp(landing)),
+            value
+            * vertex_bsdf.adjoint(-d, y["towards"], surface)
+            * y["throughput"]
+            * (leaving * dr.rcp(landing)),
             y["strength"] * vertex_bsdf.scattered_mean(value, y["towards"], surface) * leaving,
             forward * leaving,
             leaving * (y["d_vcm"] + back * y["d_vc"] + self.eta_at(y)),

@@ -6,8 +6,16 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from ..paths.media import collision, section
-from .pivots import ON_SURFACE, added_stream, next_gap, null_stream, passing, pivot_surface
+from ..paths.media import collision, point_in, section
+from .pivots import (
+    IN_MEDIUM,
+    ON_SURFACE,
+    added_stream,
+    next_gap,
+    null_stream,
+    passing,
+    pivot_surface,
+)
 from .shifts import Sections, at_optical_depth, total_optical_depth
 
 LARGEST_RATIO = 1e15
@@ -87,10 +95,16 @@ def _walk(scene, traits, ray, medium, slots: int, hide_emitters: bool, active):
 
 def arrival(pivot, surface, d, density, traits, active):
     """Density of a view's paths that come along `-d` to stop at the pivot, up to what all views
-    share: per area of the surface, and with the probability that the surface stops them. Returns
-    `(density, 1 / probability)`."""
+    share: per area of the surface, and with the probability that the surface stops them; in media
+    of flakes times their projected area. Returns `(density, 1 / probability)`."""
     on_surface = active & (pivot["kind"] == ON_SURFACE)
     density = dr.select(on_surface, density * dr.abs(dr.dot(surface.n, d)), density)
+    if traits.has_flakes:
+        within = active & (pivot["kind"] == IN_MEDIUM)
+        medium = dr.select(within, pivot["medium"], dr.zeros(mi.MediumPtr))
+        here = point_in(medium, pivot["p"], pivot["time"], pivot["wavelengths"], d)
+        area = medium.phase_function().projected_area(here, within)
+        density = dr.select(within, density * area, density)
     stopping = mi.Float(1)
     if traits.has_null_vertices:
         seen = mi.SurfaceInteraction3f(surface)
@@ -271,7 +285,7 @@ def follow_nulls(shift, pivot, own, line, common, number, seed, slots: int, acti
         in_medium = evaluated & (medium != None)  # noqa: E711 (array comparison)
         p = pivot["p"] + line["d"] * (line["distance"] - t)
         null, _, probability = collision(
-            medium, p, majorant, pivot["time"], pivot["wavelengths"], in_medium
+            medium, p, majorant, pivot["time"], pivot["wavelengths"], in_medium, line["d"]
         )
         probability = dr.select(in_medium, probability, 0)
         total = probability + rate

@@ -7,7 +7,7 @@ import mitsuba as mi
 
 from ..core.power_heuristic import mis_power
 from ..core.random import next_1d_and_2d
-from ..paths.media import collision, point_in, section, transmittance
+from ..paths.media import collision, point_in, sample_direction, section, transmittance
 from ..paths.roulette import russian_roulette
 
 
@@ -93,7 +93,7 @@ def incident_radiance(
         collided = inside & (majorant > 0) & (t < far)
         p = ray(t)
         null, real, probability = collision(
-            medium, p, majorant, ray.time, ray.wavelengths, collided, throughput=throughput
+            medium, p, majorant, ray.time, ray.wavelengths, collided, -ray.d, throughput
         )
         chance = dr.select(look, draws.next_float32(), rng.next_float32(collided & ~look))
         passes = collided & (chance < probability)
@@ -113,8 +113,9 @@ def incident_radiance(
 
         # ---- Direct light
         bsdf = surface.bsdf(ray)
-        mei = point_in(medium, p, ray.time, ray.wavelengths, -ray.d)
-        phase = dr.select(scatters, medium, dr.zeros(mi.MediumPtr)).phase_function()
+        within = dr.select(scatters, medium, dr.zeros(mi.MediumPtr))
+        mei = point_in(within, p, ray.time, ray.wavelengths, -ray.d)
+        phase = within.phase_function()
         lit = scatters | (met & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth))
         if dr.hint(max_depth > 0, mode="scalar"):
             lit &= depth + 1 < max_depth
@@ -143,7 +144,7 @@ def incident_radiance(
 
         # ---- Scattering in a medium
         choice, point = next_1d_and_2d(draws)
-        wo, phase_weight, phase_pdf = phase.sample(phase_context, mei, choice, point, scatters)
+        wo, phase_weight, phase_pdf = sample_direction(traits, mei, choice, point, scatters)
         scatters &= phase_pdf > 0
 
         # ---- Scattering at a surface

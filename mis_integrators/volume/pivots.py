@@ -118,7 +118,7 @@ def trace_first_segments(
         t = near + gap * dr.rcp(dr.maximum(majorant, 1e-30))
         collided = inside & (majorant > 0) & (t < far)
         null, real, probability = collision(
-            medium, ray(t), majorant, ray.time, ray.wavelengths, collided
+            medium, ray(t), majorant, ray.time, ray.wavelengths, collided, -ray.d
         )
         chance = dr.select(nulls == 0, first_chance, rng.next_float32(collided))
         passes = collided & (chance < probability)

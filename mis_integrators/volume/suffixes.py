@@ -7,7 +7,7 @@ import mitsuba as mi
 
 from ..core.power_heuristic import mis_power
 from ..core.random import next_1d_and_2d, streams
-from ..paths.media import point_in
+from ..paths.media import point_in, sample_direction
 from .paths import direct_light, incident_radiance
 from .pivots import IN_MEDIUM, LATER, NOWHERE, ON_SURFACE, OWN, PIVOT, pivot_surface
 
@@ -51,9 +51,9 @@ def sample_scattering(pivot, surface, d, traits, draws, active):
         bs, weight = dr.select(own, bs_own, bs), dr.select(own, weight_own, weight)
     null = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
     delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-    mei = point_in(pivot["medium"], pivot["p"], pivot["time"], pivot["wavelengths"], d)
-    phase = dr.select(in_medium, pivot["medium"], dr.zeros(mi.MediumPtr)).phase_function()
-    wo, _, phase_pdf = phase.sample(mi.PhaseFunctionContext(None), mei, choice, point, in_medium)
+    medium = dr.select(in_medium, pivot["medium"], dr.zeros(mi.MediumPtr))
+    mei = point_in(medium, pivot["p"], pivot["time"], pivot["wavelengths"], d)
+    wo, _, phase_pdf = sample_direction(traits, mei, choice, point, in_medium)
     taken = (in_medium & (phase_pdf > 0)) | (
         on_surface & ~null & (delta == own) & (dr.max(weight) > 0)
     )

@@ -9,6 +9,7 @@ import numpy as np
 from ..core.traits import (
     MediaTraits,
     check_emitters,
+    check_media,
     check_polarisation,
     check_variant,
     used_bsdfs,
@@ -60,9 +61,10 @@ def _mean_over_majorant(medium):
     return float(values.mean() / values.max()) if values.max() > 0 else 0.0
 
 
-def check_volume_scene(scene, plugin):
+def check_volume_scene(scene, sensors, plugin):
     """Raises `UnsupportedScene` for what the volumetric integrators cannot render, before any
     sampling."""
     check_variant(scene, plugin)
     check_polarisation(plugin)
     check_emitters(scene, plugin)
+    check_media(scene, sensors, plugin)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import mitsuba as mi
 import numpy as np
 from comparing import Estimate, agree, assert_same, collect_until, in_one_thread
@@ -109,6 +111,17 @@ def pockets(rng, n):
     values = rng.uniform(0.05, 0.25, (n, n, n)) * (rng.uniform(size=(n, n, n)) > 0.4)
     values[n // 2, n // 2, 0] = 2.5
     return values
+
+
+PLAIN = SimpleNamespace(has_grids=False, has_flakes=False)
+"""Traits of a scene whose media are homogeneous, and not of flakes."""
+
+
+def flaky():
+    """A phase function of flakes that lie askew."""
+    areas = np.float32([0.9, 0.05, 0.3, 0.1, 0, 0.05])  # xx, yy, zz, xy, xz, yz
+    cells = mi.VolumeGrid(np.broadcast_to(areas, (2, 2, 2, 6)).copy())
+    return {"type": "sggx", "S": {"type": "gridvolume", "grid": cells, "raw": True}}
 
 
 def container(medium, scale=1.0, at=(0, 0, 0), shape="cube"):

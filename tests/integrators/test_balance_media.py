@@ -191,7 +191,7 @@ class JointPaths:
         }
         buffer = beam_layout().room(COUNT)
         beam_layout().write(buffer, beam, index)
-        beams = Beams.read(buffer, [])
+        beams = Beams.read(buffer, [], self.traits)
         weigh = weights.beam_weigher(beams, stored[level], photon_map) if weighed else None
         (radiance,) = gather_along(photon_map, beams, [radius], 1, -1, weigh=weigh)
         dr.eval(radiance)

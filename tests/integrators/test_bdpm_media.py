@@ -331,14 +331,6 @@ def test_scenes_without_media_trace_none_of_this(rgb, monkeypatch):
 # --- What is refused ----------------------------------------------------------
 
 
-def test_flakes_are_refused(rgb):
-    flakes = np.broadcast_to(np.float32([0.9, 0.1, 0.2, 0, 0, 0]), (2, 2, 2, 6))
-    phase = {"type": "sggx", "S": {"type": "gridvolume", "grid": mi.VolumeGrid(flakes.copy())}}
-    with pytest.raises(Exception) as error:
-        mi.render(fog_scene(homogeneous(phase=phase)), integrator=bdpm(), spp=16)
-    assert "bdpm: phase function SGGX" in last_words(error.value)
-
-
 def test_a_sensor_must_name_its_medium(rgb):
     with pytest.raises(Exception) as error:
         mi.render(fog_scene(homogeneous(), view(*WITHIN)), integrator=bdpm(), spp=16)

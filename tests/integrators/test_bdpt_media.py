@@ -31,7 +31,7 @@ from comparing import (
     collect_until,
     differences,
 )
-from foggy import agree_with_volpath, container, even, floor, grid, lamp, pockets, view
+from foggy import agree_with_volpath, container, even, flaky, floor, grid, lamp, pockets, view
 from selection import extended
 from test_bdpm import last_words
 from test_bdpt import JointPaths, pyramid, technique_estimates
@@ -280,12 +280,14 @@ def test_single_scattering_in_closed_form(rgb, albedo, g):
     assert alone[0, 3].mean.max() == 0
 
 
-def cloud(albedo, sky=1.0, size=16, sigma_t=1.5):
+def cloud(albedo, sky=1.0, size=16, sigma_t=1.5, phase=None):
     """A sphere of a medium under an even sky, which fills the view."""
     return mi.load_dict(
         {
             "type": "scene",
-            "cloud": ball({"type": "null"}, 1.0, interior=homogeneous(sigma_t, albedo, hg(0.3))),
+            "cloud": ball(
+                {"type": "null"}, 1.0, interior=homogeneous(sigma_t, albedo, phase or hg(0.3))
+            ),
             "sky": {"type": "constant", "radiance": grey(sky)},
             "sensor": view((0, 0, 4), fov=20.0, size=size),
         }
@@ -300,16 +302,18 @@ def test_furnace(rgb):
     assert_same(*collect_until(batches, exact, 0.005, 0.01), 0.005, 0.01, slack=1e-4)
 
 
-def test_each_technique_alone(rgb):
+@pytest.mark.parametrize("of_flakes", [True, *extended(False)])
+def test_each_technique_alone(rgb, of_flakes):
     """Paths of two and three segments bring the same whether they meet the sky, find it by
     next-event estimation, or come from there to the sensor. (Joining two vertices of a medium has
     no finite variance alone.)"""
-    estimates = technique_estimates(cloud(0.8), pyramid(3, camera_paths=64), 48)
+    phase = flaky() if of_flakes else hg(0.3)
+    estimates = technique_estimates(cloud(0.8, phase=phase), pyramid(3, camera_paths=64), 48)
     for k in (2, 3):
         first = estimates[1, k]
         for other in ((0, k + 1), (k, 1)):
             assert not differences(estimates[other], first), other
-            assert 6 * np.sqrt(estimates[other].error2[0].max()) < 0.05 * first.mean[0].max()
+            assert 6 * np.sqrt(estimates[other].error2[0].max()) < 0.08 * first.mean[0].max()
 
 
 # --- Weights ------------------------------------------------------------------
@@ -399,14 +403,6 @@ def test_states_behind_half_transparent_surfaces(rgb, kind):
 
 
 # --- What is refused ----------------------------------------------------------
-
-
-def test_flakes_are_refused(rgb):
-    flakes = np.broadcast_to(np.float32([0.9, 0.1, 0.2, 0, 0, 0]), (2, 2, 2, 6))
-    phase = {"type": "sggx", "S": {"type": "gridvolume", "grid": mi.VolumeGrid(flakes.copy())}}
-    with pytest.raises(Exception) as error:
-        mi.render(fog_scene(homogeneous(phase=phase)), integrator=bdpt(), spp=16)
-    assert "bdpt: phase function SGGX" in last_words(error.value)
 
 
 def test_a_sensor_must_name_its_medium(rgb):

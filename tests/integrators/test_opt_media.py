@@ -21,7 +21,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from comparing import PathBatches, assert_same, collect_until, grey_pictures, in_one_thread
-from foggy import volpath
+from foggy import PLAIN, volpath
 from selection import extended, one_in_each_row
 from test_balance_media import COUNT, NEAR, JointPaths, room
 from test_bdpm import last_words
@@ -207,7 +207,7 @@ def test_a_ball_finds_what_brute_force_finds(rgb):
         "throughput": dr.full(mi.Spectrum, 1, vertices),
         "medium": medium,
     }
-    points = Points.of(_Even(), record, [])
+    points = Points.of(PLAIN, record, [])
     (light,) = gather_in_balls(photon_map, points, [size], 7, -1, _one)
     near = np.linalg.norm(at[:, :, None] - p[:, None, :], axis=0) < radius
     # Light from +z goes straight on, to a camera whose ray came along +z.
@@ -217,10 +217,6 @@ def test_a_ball_finds_what_brute_force_finds(rgb):
     np.testing.assert_allclose(np.array(light)[0], expected, rtol=2e-4)
     assert float(ball_volume(mi.Float(2.0))[0]) == pytest.approx(32 / 3 * np.pi)
     assert int(number_of_medium(medium)[0]) > 0
-
-
-class _Even:
-    has_grids = False
 
 
 def _one(index, landing, scattering, active):

@@ -29,7 +29,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from comparing import Estimate, differences
-from foggy import container, even, grid, pockets
+from foggy import PLAIN, container, even, grid, pockets
 from test_bdpt_media import FOG, ball, coloured, homogeneous
 
 SIGMA = 0.7
@@ -99,7 +99,7 @@ def beams(
         "ahead": mi.Float(surface),
     }
     beam_layout().write(words, values, dr.arange(mi.UInt32, len(o)))
-    return Beams.read(words, [])
+    return Beams.read(words, [], PLAIN)
 
 
 def expected(points, flux, o, d, length, radius, sigma=SIGMA):
