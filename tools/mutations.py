@@ -931,7 +931,7 @@ MUTATIONS = [
     ),
     Mutation(
         "volume/lines.py",
-        "dr.select(within, density * area, density)",
+        "density * projected_area(here, d, within)",
         "density",
         "views share what flakes scatter as if all saw them alike",
         "tests/integrators/test_flakes_media.py::test_views_agree_with_bdpt",

@@ -364,6 +364,9 @@ class BDPMSession(PhotonPasses):
         else:
             self.prediction = self.direct_light.beside(self.prediction, anew=not self.kept)
 
+    def direct_cost(self):
+        return self.direct_light.cost
+
     def _prepare(self):
         self.caustic_radii.find()
 

@@ -3,12 +3,14 @@ worth."""
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..core.clock import now
 from ..core.film import splat_samples
 from ..core.packing import from_numpy
 from ..core.sequences import SampleSequence
@@ -20,12 +22,14 @@ from ..photons.queries import Queries, trace_camera_paths
 from ..pilot.cost import USUAL_PHOTONS
 from ..pilot.denoiser import share_left
 from ..pilot.direct_paths import (
+    COST,
     EXPONENTS,
     MOST_PATHS,
     TRIALS,
     DirectNoise,
     coarser,
     direct_error,
+    iteration_cost,
     measure,
     paths_per_pixel,
 )
@@ -38,6 +42,8 @@ INDICES = 2**32
 """Of the paths that share a sequence: iterations that would need more have others."""
 LARGEST_PART = 1 << 21
 """Paths traced at once at most (bounds memory)."""
+CHEAPEST = 0.01
+"""Of a path for direct light, over one that gathers: what a clock says is not believed below."""
 LARGEST = 1e18
 """Number that `Beside` can hold."""
 NOTHING_GATHERED = Queries(
@@ -51,17 +57,21 @@ class Beside(NamedTuple):
     photon_light: float
     photon_error: float
     iterations: float
+    cost: float
+    most_cost: float
 
 
 class DirectLight:
     """The passes of a `BDPMSession` that see emission, and direct light at the first smooth vertex.
 
     `mean_paths`: of these paths, a pixel and iteration (None until that is known); `noise`: the
-    `DirectNoise` by which they are chosen (None until it is measured).
+    `DirectNoise` by which they are chosen (None until it is measured); `path_seconds`: what one of
+    them takes; `cost`: what an iteration takes, over one without them.
     """
 
     def __init__(self, session):
         self.session, self.noise = session, None
+        self.path_seconds, self.cost = 0.0, 1.0
         self.mean_paths = self._paths = self._beside = None
         self._lists = None  # what `_listed` has made
         self._exponent = EXPONENTS[session.integrator.low_discrepancy]
@@ -86,11 +96,13 @@ class DirectLight:
         elif given:
             paths = np.full(pixels, given * gathering)
         else:
-            beside = self._beside or Beside(0.0, 1 / USUAL_PHOTONS, UNPLANNED_ITERATIONS)
-            wanted = paths_per_pixel(self.measured(), *beside, self._exponent)
+            usual = 0.0, 1 / USUAL_PHOTONS, UNPLANNED_ITERATIONS, COST, LARGEST
+            beside = self._beside or Beside(*usual)
+            wanted = paths_per_pixel(self.measured(), exponent=self._exponent, **beside._asdict())
             paths = np.maximum(np.rint(wanted).astype(int), gathering)
         self._paths, self._lists = paths, None
         self.mean_paths = float(np.mean(paths)) - gathering
+        self.cost = iteration_cost(self._cost_of_path(), paths / gathering)
 
     def beside(self, prediction, anew):
         """A `Prediction` made without knowing of these paths, with the noise that they leave; they
@@ -100,7 +112,9 @@ class DirectLight:
             if not self.session.integrator.direct_paths:
                 error = prediction.errors["relmse"]
                 error = error.variance + error.squared_bias * iterations
-                self._beside = Beside(light, float(error), float(iterations))
+                cost = self._cost_of_path()
+                most = min(self.session.most_cost, LARGEST)
+                self._beside = Beside(light, float(error), float(iterations), cost, most)
             self.choose_paths()
         found, errors = self.measured(), {}
         for name, weigh in MEASURES.items():
@@ -108,6 +122,15 @@ class DirectLight:
             left = direct_error(found, weights, self._paths, iterations, self._exponent)
             errors[name] = error._replace(variance=error.variance + left)
         return prediction._replace(errors=errors)
+
+    def _cost_of_path(self):
+        """Of a path, over that of one that gathers: by the clock in a render of a given time."""
+        gathering = self.session.gathering_seconds
+        if not math.isfinite(gathering):
+            return COST
+        self.measured()
+        seconds = self.path_seconds * film_sample_count(self.session.sensor)
+        return min(max(seconds / gathering, CHEAPEST), 1.0)
 
     def measured(self):
         """The `noise`, which is measured if need be."""
@@ -123,15 +146,15 @@ class DirectLight:
     def _trials(self, pixels):
         """Direct light of `TRIALS` independent paths through each of these pixels, mean over the
         channels: (trials, pixels)."""
-        counts = np.zeros(film_sample_count(self.session.sensor), int)
-        counts[pixels] = TRIALS
-        passes = self.session.recorded(self._grey)
-        spectral = self.session._spectral(PILOT_INDEX)
-        values = [
-            np.array(passes(*self._arguments(part, PILOT_INDEX, spectral)))
-            for part in self._split(counts)
-        ]
-        return np.concatenate(values)[: TRIALS * len(pixels)].reshape(-1, TRIALS).T
+        counts, half = np.zeros(film_sample_count(self.session.sensor), int), TRIALS // 2
+        counts[pixels] = half
+        passes, parts, found = self.session.recorded(self._grey), self._split(counts), []
+        for index in (PILOT_INDEX, PILOT_INDEX + 1):  # the second is recorded: it tells the time
+            spectral, start = self.session._spectral(index), now()
+            values = [np.array(passes(*self._arguments(part, index, spectral))) for part in parts]
+            self.path_seconds = (now() - start) / (half * len(pixels))
+            found.append(np.concatenate(values)[: half * len(pixels)].reshape(-1, half).T)
+        return np.concatenate(found)
 
     @property
     def beyond(self):

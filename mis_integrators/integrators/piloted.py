@@ -15,8 +15,6 @@ from ..pilot.setting import LIGHT_SHARES, pilot_pixels
 from .common import IterativeSession
 from .schedule import LARGEST_RADIUS, SMALLEST_RADIUS, shrunk
 
-LIKE_A_PILOT = 1.5
-"""Tuned: what an iteration takes, in seconds of one of the pilot, until it is measured."""
 TOO_SLOW = 1.5
 """Tuned: an iteration that takes so many times the guess is not believed to be typical."""
 
@@ -40,6 +38,8 @@ class PilotedSession(IterativeSession):
         self.prediction = None  # a `Prediction`, where a pilot has chosen
         self.iteration_seconds = math.inf  # what one takes, where that is measured
         self.expected_seconds = math.inf  # what one will take, by the pilot
+        self._end = math.inf  # on the clock, of the time for rendering
+        self.gathering_seconds = math.inf  # of that, what paths for direct light alone do not take
         self._untimed = None  # arguments of `_choose_by_clock`, until it is called
         self.kept = {}  # iterations that were rendered to measure their time, by number
 
@@ -124,18 +124,22 @@ class PilotedSession(IterativeSession):
     def predict(self):
         """Runs the pilot, if one is needed, and makes the first choice: enough for a `prediction`.
         `start` does this, too, and times an iteration where there is a time limit."""
-        begun = now()
+        self._end = now() + (math.inf if self.seconds is None else self.seconds)
         pilot = self._run_pilot()
         if pilot is None:
             self.radii = self.radii or {}
         elif self.seconds is None:
             self._take(pilot.choose(pilot.setting.planned_iterations))
         else:
-            guess = LIKE_A_PILOT * pilot.seconds * pilot.setting.light_paths
-            first = pilot.choose(self._left(begun, guess) / guess)
-            self.expected_seconds = guess * pilot.cost(first)
+            guess = pilot.seconds * pilot.setting.light_paths
+            first = pilot.choose(self._left(guess) / guess)
+            self.gathering_seconds = guess * pilot.cost(first)
             self._take(first)
-            self._untimed = pilot, first, guess, begun
+            self.expected_seconds = self.gathering_seconds * self.direct_cost()
+            if self.prediction is not None:
+                count = self.prediction.iterations / self.direct_cost()
+                self.prediction = self.prediction._replace(iterations=count)
+            self._untimed = pilot, first, guess
 
     @property
     def needs_pilot(self):
@@ -150,20 +154,22 @@ class PilotedSession(IterativeSession):
         pixels = pilot_pixels(setting)
         return run_pilot(setting, pixels, self.pilot_passes(setting, pixels), now)
 
-    def _left(self, begun, least):
-        """Seconds that are left of a render begun then, `least` at least."""
-        return max(begun + self.seconds - now(), least)
+    def _left(self, least):
+        """Seconds that are left of the render, `least` at least."""
+        return max(self._end - now(), least)
 
-    def _choose_by_clock(self, pilot, first, guess, begun):
+    def _choose_by_clock(self, pilot, first, guess):
         """Measures what an iteration takes with the `first` choice, which was made for a `guess` of
         that, and chooses again."""
         self._prepare()
-        left = self._left(begun, guess)
-        seconds, spent = self._time_first_iterations(guess, left)
+        left = self._left(guess)
+        seconds, spent = self._time_first_iterations(self.expected_seconds, left)
         count = max(left / seconds * pilot.cost(first), 1)
         second = pilot.choose(count, first, reluctance=min(spent / left, 1))
+        usual = seconds / self.direct_cost() / pilot.cost(first)
+        self.gathering_seconds = usual * pilot.cost(second)
         self._take(second)
-        self.iteration_seconds = seconds * pilot.cost(second) / pilot.cost(first)
+        self.iteration_seconds = self.gathering_seconds * self.direct_cost()
 
     def _take(self, choice: Choice):
         """Renders with this choice from now on. What was rendered with another is no longer
@@ -177,6 +183,18 @@ class PilotedSession(IterativeSession):
         self._use_light_share()
         if changed:
             self._record_camera_pass()
+
+    @property
+    def most_cost(self):
+        """What an iteration may take, in seconds of one without paths for direct light alone: at
+        least those, and all that is left."""
+        if self.seconds is None:
+            return math.inf
+        return max((self._end - now()) / self.gathering_seconds, 1.0)
+
+    def direct_cost(self):
+        """What an iteration takes, over one without paths for direct light alone."""
+        return 1.0
 
     def _prepare(self):
         """Finds what all iterations need, before the first is timed."""

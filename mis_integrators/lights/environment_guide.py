@@ -526,7 +526,7 @@ class EnvironmentGuide:
         left of `extra`."""
         first = self.row_of_emitter(index)
         if self.sampler.by_table:
-            turned, towards, sample = self.sampler.turn(sample, active)
+            turned, towards, sample = self.sampler.from_table(sample, active)
         ds, _ = emitter.sample_direction(it, sample, active)
         if self.sampler.by_table:
             ds.d = dr.select(turned, towards, ds.d)
@@ -572,7 +572,7 @@ class EnvironmentGuide:
             towards, good = self.portals.sample_direction(p, sample, turned)
         if self.sampler.by_table:
             counted, others = active, active & ~turned
-            by_table, by_radiance, sample = self.sampler.turn(sample, others)
+            by_table, by_radiance, sample = self.sampler.from_table(sample, others)
             towards = dr.select(by_table, by_radiance, towards)
             turned, good = turned | by_table, good | by_table
         return Turn(counted, turned, towards, good, sample)

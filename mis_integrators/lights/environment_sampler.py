@@ -105,7 +105,7 @@ class EnvironmentSampler:
         """Every evaluated array that the sampling routines read, for `dr.freeze` to track."""
         return [self._pmf, self._rows, self._in_row] if self.by_table else []
 
-    def turn(self, sample, active=True):
+    def from_table(self, sample, active=True):
         """Which of the directions that these pairs of uniform numbers stand for come from the
         table, these directions, and the pairs for both ways. Only where there is a table."""
         turned, left = split(sample.x, TABLE_SHARE)

@@ -37,9 +37,9 @@ that glass reflects, a pixel's trials and its neighbours' often meet none."""
 MOST_TRIED = 1 << 18
 """Pixels with trials, at most or about: larger films have them in every second, or third, ... row
 and column."""
-COST = 0.08
-"""Tuned: cost of a path for direct light, over that of one that gathers, photons included (0.03 to
-0.15 in eight rooms)."""
+COST = 0.15
+"""Tuned: cost of a path for direct light, over that of one that gathers, photons included, where no
+clock tells it (0.07 to 0.5 in twelve scenes)."""
 MOST_PATHS = 256
 """Of a pixel and iteration at most."""
 EXPONENTS = {True: 1.5, False: 1.0}
@@ -115,6 +115,8 @@ def paths_per_pixel(
     photon_error: float,
     iterations: float,
     exponent: float,
+    cost: float | None = None,
+    most_cost: float = math.inf,
 ) -> np.ndarray:
     """Paths that each pixel should send for direct light, at least one: (pixels,), real numbers.
 
@@ -128,7 +130,13 @@ def paths_per_pixel(
         Relative mean squared error of one iteration that direct light has no part in.
     iterations, exponent
         n and a.
+    cost
+        Of a path for direct light, over that of one that gathers, photons included; ``None``: the
+        usual one.
+    most_cost
+        What an iteration may cost, in units of one without more paths for direct light.
     """
+    cost = COST if cost is None else cost
     relative = relative_weights(found.mean + photon_light)
     noise = found.noise * max(iterations, 1) ** (1 - exponent)
     absolute_error = photon_error / max(float(np.median(relative)), 1e-30)
@@ -137,10 +145,16 @@ def paths_per_pixel(
         left = noise * paths**-exponent
         importance = relative / max(photon_error + np.mean(relative * left), 1e-30)
         importance += 1 / max(absolute_error + np.mean(left), 1e-30)
-        cost = 1 + COST * np.mean(paths - 1)
-        wanted = exponent * importance * noise * cost / (2 * COST)
+        wanted = exponent * importance * noise * iteration_cost(cost, paths) / (2 * cost)
         paths = np.clip(wanted ** (1 / (1 + exponent)), 1, MOST_PATHS)
-    return paths
+    there_is_time_for = (most_cost - 1) / max(iteration_cost(cost, paths) - 1, 1e-30)
+    return 1 + (paths - 1) * min(there_is_time_for, 1)
+
+
+def iteration_cost(cost: float, paths: np.ndarray) -> float:
+    """Of an iteration with so many `paths` a pixel, in units of one without more than one; `cost`:
+    as of `paths_per_pixel`."""
+    return 1 + cost * float(np.mean(paths - 1))
 
 
 def direct_error(

@@ -6,6 +6,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from ..paths.flakes import projected_area
 from ..paths.media import collision, point_in, section
 from .pivots import (
     IN_MEDIUM,
@@ -102,9 +103,8 @@ def arrival(pivot, surface, d, density, traits, active):
     if traits.has_flakes:
         within = active & (pivot["kind"] == IN_MEDIUM)
         medium = dr.select(within, pivot["medium"], dr.zeros(mi.MediumPtr))
-        here = point_in(medium, pivot["p"], pivot["time"], pivot["wavelengths"], d)
-        area = medium.phase_function().projected_area(here, within)
-        density = dr.select(within, density * area, density)
+        here = point_in(medium, pivot["p"], pivot["time"], pivot["wavelengths"])
+        density = dr.select(within, density * projected_area(here, d, within), density)
     stopping = mi.Float(1)
     if traits.has_null_vertices:
         seen = mi.SurfaceInteraction3f(surface)

@@ -115,6 +115,19 @@ def test_broken_samples_break_nothing():
     assert np.all(np.isfinite(paths)) and paths.max() > 3
 
 
+def test_an_iteration_takes_no_longer_than_there_is_time():
+    """Paths go where they went, in proportion, and the dearer a path, the fewer."""
+    given = found_in(samples_of()), 0.1, 0.05, 4, 1.5
+    free, bound, none = (
+        direct_paths.paths_per_pixel(*given, cost=0.2, most_cost=most) for most in (np.inf, 1.3, 1)
+    )
+    assert direct_paths.iteration_cost(0.2, free) > 1.5
+    assert direct_paths.iteration_cost(0.2, bound) == pytest.approx(1.3)
+    np.testing.assert_allclose((bound - 1) / np.mean(bound - 1), (free - 1) / np.mean(free - 1))
+    assert np.all(none == 1)
+    assert direct_paths.paths_per_pixel(*given, cost=0.4).mean() < 0.9 * free.mean()
+
+
 def test_noisy_photons_need_fewer_paths():
     few, many = (
         direct_paths.paths_per_pixel(found_in(samples_of()), 0.1, error, 16, 1.0).mean()
