@@ -29,7 +29,6 @@ from ..pilot.direct_paths import (
     DirectNoise,
     coarser,
     direct_error,
-    iteration_cost,
     measure,
     paths_per_pixel,
 )
@@ -102,7 +101,7 @@ class DirectLight:
             paths = np.maximum(np.rint(wanted).astype(int), gathering)
         self._paths, self._lists = paths, None
         self.mean_paths = float(np.mean(paths)) - gathering
-        self.cost = iteration_cost(self._cost_of_path(), paths / gathering)
+        self.cost = 1 + self._cost_of_path() * self.mean_paths
 
     def beside(self, prediction, anew):
         """A `Prediction` made without knowing of these paths, with the noise that they leave; they

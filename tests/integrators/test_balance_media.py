@@ -87,7 +87,7 @@ class JointPaths:
             bsdf = si.bsdf()
             choice, point = rng.next_float32(), next_2d(rng)
             bs, weight = bsdf.sample(mi.BSDFContext(), si, choice, point, ~inside)
-            bs, _ = sample_phase(self.medium, si, choice, point, bs, weight, inside)
+            bs, _ = sample_phase(self.traits, self.medium, si, choice, point, bs, weight, inside)
             self.valid &= bs.pdf > 0
             if number == len(kinds) - 1:
                 self.light, value, _ = self.lights.sample_direct(si, rng, self.valid)

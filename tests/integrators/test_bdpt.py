@@ -161,7 +161,9 @@ class JointPaths:
             choice, point = rng.next_float32(), next_2d(rng)
             bs, weight = bsdf.sample(mi.BSDFContext(), si, choice, point, self.valid & ~scatters)
             if self.traits.has_media:
-                bs, _ = sample_phase(medium, si, choice, point, bs, weight, self.valid & scatters)
+                bs, _ = sample_phase(
+                    self.traits, medium, si, choice, point, bs, weight, self.valid & scatters
+                )
                 onwards = medium_behind(si, medium, si.to_world(bs.wo), self.valid)
                 flight = [onwards, number_of_flight, scatters]
             delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)

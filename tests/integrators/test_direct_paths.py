@@ -1,11 +1,13 @@
 """Camera paths that see direct light alone: means stay, and the noise of direct light falls."""
 
+from mis_integrators.integrators.direct_light import CHEAPEST
+
 import mitsuba as mi
 import numpy as np
 import pytest
 from comparing import SessionBatches, assert_same, collect_until, in_one_thread
 from selection import extended
-from worlds import tray
+from worlds import SIZE, tray
 
 RADIUS = 0.3
 POWER = {"whole": 0.02, "block": 0.05}
@@ -114,6 +116,24 @@ def test_sessions_of_a_render_send_the_same_paths(rgb):
     for session in (one, other):
         session.iterate(3)
     np.testing.assert_allclose(one.image(), other.image(), rtol=1e-5)
+
+
+def test_none_where_there_is_no_time(rgb):
+    """Iterations take no longer for these paths than there is time left, and what one is expected
+    to take counts them."""
+    scene, means = tray("lambertian", "rectangle"), []
+    plugin = {"type": "bdpm", "bdd": 0, "max_depth": 4, "sampler": "independent"}
+    for seconds in (1e-6, 20.0):
+        session = mi.load_dict(plugin).session(scene, 0, 1, 0)
+        session.plan_time(seconds)
+        session.predict()
+        light = session.direct_light
+        means.append(light.mean_paths)
+        cost = light.path_seconds * SIZE**2 / session.gathering_seconds
+        assert light.cost == pytest.approx(1 + min(max(cost, CHEAPEST), 1) * light.mean_paths)
+        expected = session.gathering_seconds * light.cost
+        assert session.expected_seconds == pytest.approx(expected)
+    assert means[0] == 0 and means[1] > 0.05
 
 
 def test_purposes_differ():

@@ -22,7 +22,7 @@ def drawn(emitter, sampler):
     """Directions of the sampler, with their densities."""
     sample = next_2d(streams(dr.arange(mi.UInt32, COUNT), mi.UInt32(3)))
     it = point(mi.Point3f(0), mi.Float(0))
-    turned, towards, sample = sampler.turn(sample)
+    turned, towards, sample = sampler.from_table(sample)
     ds, _ = emitter.sample_direction(it, sample)
     ds.d = dr.select(turned, towards, ds.d)
     return ds.d, sampler.density(emitter.pdf_direction(it, ds), ds.d)

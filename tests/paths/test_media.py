@@ -15,7 +15,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from comparing import Estimate, assert_frequencies, differences
-from foggy import container, grid, pockets
+from foggy import PLAIN, container, grid, pockets
 from test_bdpt_media import FOG, ball, coloured, fog_scene, homogeneous
 from worlds import T, diffuse
 
@@ -201,6 +201,7 @@ def test_directions_stay_unit_vectors(rgb):
         si = interaction_at(hit, mi.Ray3f(mi.Point3f(0), direction), everywhere, everywhere)
         point = mi.Point2f(rng.next_float32(), rng.next_float32())
         sample, _ = sample_phase(
+            PLAIN,
             mi.MediumPtr(medium),
             si,
             rng.next_float32(),
