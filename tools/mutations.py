@@ -924,7 +924,7 @@ MUTATIONS = [
     ),
     Mutation(
         "photons/beams.py",
-        "return value * adjoint_factor(*where, -self.d, towards, active), pdf",
+        "return value * adjoint, pdf",
         "return value, pdf",
         "photons in media of flakes scatter as camera paths do",
         "tests/integrators/test_flakes_media.py::test_furnace",

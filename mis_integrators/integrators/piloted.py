@@ -190,7 +190,7 @@ class PilotedSession(IterativeSession):
         least those, and all that is left."""
         if self.seconds is None:
             return math.inf
-        return max((self._end - now()) / self.gathering_seconds, 1.0)
+        return self._left(self.gathering_seconds) / self.gathering_seconds
 
     def direct_cost(self):
         """What an iteration takes, over one without paths for direct light alone."""

@@ -459,12 +459,12 @@ def medium_behind(si, medium, wo, active):
 # --- Vertices ---------------------------------------------------------------------------------
 
 
-def phase_f_and_pdf(sides, to_camera, to_light, active):
-    """The phase function [1/sr] at vertices in media (`vertex.Sides`), and the density with which a
-    camera path goes on to the light's side."""
-    medium = dr.select(active, sides.above, dr.zeros(mi.MediumPtr))
+def phase_f_and_pdf(medium, p, wavelengths, to_camera, to_light, active):
+    """The phase function [1/sr] of camera paths at points in media, and the density with which they
+    go on to the light's side."""
+    medium = dr.select(active, medium, dr.zeros(mi.MediumPtr))
     phase, context = medium.phase_function(), mi.PhaseFunctionContext(None)
-    mei = point_in(medium, sides.p, mi.Float(0), sides.wavelengths, to_camera)
+    mei = point_in(medium, p, mi.Float(0), wavelengths, to_camera)
     return phase.eval_pdf(context, mei, to_light, active)
 
 
@@ -476,6 +476,12 @@ def adjoint_factor(traits, medium, p, wavelengths, to_camera, to_light, active):
     medium = dr.select(active, medium, dr.zeros(mi.MediumPtr))
     here = point_in(medium, p, mi.Float(0), wavelengths)
     return flakes.adjoint_factor(here, to_camera, to_light, active)
+
+
+def phase_of_photons(traits, *where):
+    """`(value, pdf, adjoint)`: those of `phase_f_and_pdf`, and the `adjoint_factor` by which value
+    and density of light sub-paths are larger; `where`: as of both."""
+    return *phase_f_and_pdf(*where), adjoint_factor(traits, *where)
 
 
 def scattered_share(medium, p, wavelengths, active, towards=None):

@@ -92,8 +92,8 @@ class PhaseOrBSDF:
         return at.bsdf if at.scatters is None else cls(at.bsdf, at.medium, at.scatters)
 
     def _phase(self, si, wo, inside):
-        sides = Sides(self.medium, self.medium, si.p, si.wavelengths)
-        return phase_f_and_pdf(sides, si.to_world(si.wi), si.to_world(wo), inside)
+        sides = si.to_world(si.wi), si.to_world(wo)
+        return phase_f_and_pdf(self.medium, si.p, si.wavelengths, *sides, inside)
 
     def eval_pdf(self, context, si, wo, active=True):
         """Value (on surfaces times the cosine) and density per solid angle."""
@@ -208,10 +208,12 @@ class VertexBSDF:
         p_camera, p_light = p_camera * per_light, dr.select(agreed, p_light * per_camera, 0)
         if traits.has_media:
             inside = active & in_medium(self.n)
-            phase, pdf = phase_f_and_pdf(self.sides, to_camera, to_light, inside)
+            sides = self.sides
+            where = sides.above, sides.p, sides.wavelengths, to_camera, to_light, inside
+            phase, pdf = phase_f_and_pdf(*where)
             value = dr.select(inside, phase, value)
             p_camera = dr.select(inside, pdf, p_camera)
-            p_light = dr.select(inside, pdf * self.adjoint(to_camera, to_light, inside), p_light)
+            p_light = dr.select(inside, pdf * adjoint_factor(traits, *where), p_light)
         return value, p_camera, p_light
 
     def adjoint(self, to_camera, to_light, active=True):

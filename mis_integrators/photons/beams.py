@@ -25,7 +25,7 @@ from ..core.packing import unpack_direction
 from ..core.recording import lanes
 from ..core.records import Layout
 from ..core.traits import MediaTraits
-from ..paths.media import adjoint_factor, point_in
+from ..paths.media import phase_of_photons, point_in
 from .grid import Query, visit_hits
 from .kernel_sums import KernelSums, disk_area
 from .volume import number_of_medium, read_place
@@ -145,12 +145,9 @@ class Beams:
     def phase(self, p, towards, active):
         """The phase function [1/sr] at points `p`, for light sub-paths from `towards` that go on to
         the camera, and the density with which camera paths go there."""
-        medium = dr.select(active, self.medium, dr.zeros(mi.MediumPtr))
-        mei = point_in(medium, p, mi.Float(0), self.wavelengths, -self.d)
-        context = mi.PhaseFunctionContext(None)
-        value, pdf = medium.phase_function().eval_pdf(context, mei, towards, active)
-        where = self.traits, medium, p, self.wavelengths
-        return value * adjoint_factor(*where, -self.d, towards, active), pdf
+        where = self.medium, p, self.wavelengths, -self.d, towards, active
+        value, pdf, adjoint = phase_of_photons(self.traits, *where)
+        return value * adjoint, pdf
 
 
 def _side(normal, d, distance, radius):

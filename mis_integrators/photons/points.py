@@ -18,7 +18,7 @@ import mitsuba as mi
 from ..core.recording import lanes
 from ..core.records import Layout
 from ..core.traits import MediaTraits
-from ..paths.media import adjoint_factor, point_in, scattered_share
+from ..paths.media import phase_of_photons, scattered_share
 from .grid import DiskQuery, visit_hits
 from .kernel_sums import KernelSums, ball_volume
 from .scattering import Scattering
@@ -110,14 +110,8 @@ class Points:
 
     def phase(self, towards, active):
         """`Scattering` of light sub-paths from `towards` (a unit vector): there are no cosines."""
-        medium = dr.select(active, self.medium, dr.zeros(mi.MediumPtr))
-        mei = point_in(medium, self.p, mi.Float(0), self.wavelengths, -self.d)
-        value, pdf = medium.phase_function().eval_pdf(
-            mi.PhaseFunctionContext(None), mei, towards, active
-        )
-        adjoint = adjoint_factor(
-            self.traits, medium, self.p, self.wavelengths, -self.d, towards, active
-        )
+        where = self.medium, self.p, self.wavelengths, -self.d, towards, active
+        value, pdf, adjoint = phase_of_photons(self.traits, *where)
         f = value * self.albedo
         value = mi.Spectrum(value) * adjoint
         return Scattering(towards, mi.Float(1), value, f, pdf, lambda: pdf * adjoint)

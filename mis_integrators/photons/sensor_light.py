@@ -15,7 +15,7 @@ import mitsuba as mi
 from ..core.packing import read_mark
 from ..core.random import next_2d, vertex_streams
 from ..core.recording import lanes
-from ..paths.media import adjoint_factor, phase_f_and_pdf, transmitted
+from ..paths.media import phase_of_photons, transmitted
 from ..paths.vertex import Sides
 from .photon import read_power
 from .volume import landing_of, medium_of, read_places
@@ -68,9 +68,9 @@ def join_photons(world, limits, lens, zone, photons, seed, wavelengths, marked):
         flux, delta_at_light = read_mark(flux)
     medium = medium_of(dr.select(active, landing.medium, 0))
     sides = Sides(medium, medium, landing.p, wavelengths)
-    towards = dr.normalize(towards)
-    phase, _ = phase_f_and_pdf(sides, d, towards, active)
-    phase *= adjoint_factor(world.traits, medium, landing.p, wavelengths, d, towards, active)
+    where = medium, landing.p, wavelengths, d, dr.normalize(towards), active
+    phase, _, adjoint = phase_of_photons(world.traits, *where)
+    phase *= adjoint
     active &= dr.max(phase) > 0
     way = landing.p, mi.Normal3f(0), sides, d, distance, wavelengths
     kept = transmitted(world.scene, world.traits, *way, rng, active, limits.hide_emitters)

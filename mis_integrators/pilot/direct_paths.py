@@ -145,13 +145,13 @@ def paths_per_pixel(
         left = noise * paths**-exponent
         importance = relative / max(photon_error + np.mean(relative * left), 1e-30)
         importance += 1 / max(absolute_error + np.mean(left), 1e-30)
-        wanted = exponent * importance * noise * iteration_cost(cost, paths) / (2 * cost)
+        wanted = exponent * importance * noise * cost_of_all(cost, paths) / (2 * cost)
         paths = np.clip(wanted ** (1 / (1 + exponent)), 1, MOST_PATHS)
-    there_is_time_for = (most_cost - 1) / max(iteration_cost(cost, paths) - 1, 1e-30)
+    there_is_time_for = (most_cost - 1) / max(cost_of_all(cost, paths) - 1, 1e-30)
     return 1 + (paths - 1) * min(there_is_time_for, 1)
 
 
-def iteration_cost(cost: float, paths: np.ndarray) -> float:
+def cost_of_all(cost: float, paths: np.ndarray) -> float:
     """Of an iteration with so many `paths` a pixel, in units of one without more than one; `cost`:
     as of `paths_per_pixel`."""
     return 1 + cost * float(np.mean(paths - 1))

@@ -121,8 +121,8 @@ def test_an_iteration_takes_no_longer_than_there_is_time():
     free, bound, none = (
         direct_paths.paths_per_pixel(*given, cost=0.2, most_cost=most) for most in (np.inf, 1.3, 1)
     )
-    assert direct_paths.iteration_cost(0.2, free) > 1.5
-    assert direct_paths.iteration_cost(0.2, bound) == pytest.approx(1.3)
+    assert direct_paths.cost_of_all(0.2, free) > 1.5
+    assert direct_paths.cost_of_all(0.2, bound) == pytest.approx(1.3)
     np.testing.assert_allclose((bound - 1) / np.mean(bound - 1), (free - 1) / np.mean(free - 1))
     assert np.all(none == 1)
     assert direct_paths.paths_per_pixel(*given, cost=0.4).mean() < 0.9 * free.mean()
