@@ -936,4 +936,25 @@ MUTATIONS = [
         "views share what flakes scatter as if all saw them alike",
         "tests/integrators/test_flakes_media.py::test_views_agree_with_bdpt",
     ),
+    Mutation(
+        "photons/gather.py",
+        "hit &= same_side(landing, vertices.n, towards)",
+        "hit &= True",
+        "light that grazes the inside of a lampshade shines through it",
+        "tests/integrators/test_bdpm.py::test_no_light_through_curved_sheets",
+    ),
+    Mutation(
+        "photons/pairs.py",
+        "active = active & same_side(landing, vertices.n, towards)",
+        "active = active & True",
+        "pairs of published weights let light through a lampshade",
+        "tests/integrators/test_bdpm.py::test_no_light_through_curved_sheets",
+    ),
+    Mutation(
+        "photons/curvature.py",
+        "(uu * v - uv * u) * dn_dv",
+        "(uu * v - uv * u) * dn_du",
+        "probes of covered disks look beside surfaces that are bent one way only",
+        "tests/photons/test_coverage.py",
+    ),
 ]

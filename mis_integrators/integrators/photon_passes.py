@@ -10,7 +10,6 @@ import mitsuba as mi
 
 from ..core.film import splat_light, splat_samples
 from ..core.packing import with_reserve
-from ..core.traits import lookup
 from ..mis.chance import ChanceWeights, StartDensity, second_moment
 from ..paths.light_classes import LightClasses, by_class_of_photons
 from ..paths.sensor import Lens
@@ -310,18 +309,12 @@ class PhotonPasses(PilotedSession):
         return self.covered(scene, read_queries(vertices), radius, seed)
 
     def covered(self, scene, record, radius, seed):
-        """Share of each vertex' merge disk that holds surface; one where the surface is not
-        Lambertian: in a highlight the noise of dividing by an estimate would outweigh what it
-        mends. `record` as of `read_queries`."""
+        """Share of each vertex' merge disk that holds surface. `record` as of `read_queries`."""
         probed = dr.max(record["throughput"]) > 0
         ray = mi.Ray3f(record["ray_o"], record["ray_d"])
-        flags = FLAGS if self._bounds_disks else mi.RayFlags.Minimal
-        si = record["hit"].compute_surface_interaction(ray, flags, probed)
+        si = record["hit"].compute_surface_interaction(ray, FLAGS, probed)
         if self._bounds_disks:
             radius = bounded(si, radius)
-        if self.traits.has_rough:
-            bsdf = record["hit"].shape.bsdf()
-            probed &= lookup(self.traits.lambertian, bsdf, mi.Bool, probed)
         return dr.select(probed, covered_share(scene, record, si, radius, seed, probed), 1)
 
     def _records(self, vertices, kind):

@@ -12,6 +12,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.random import vertex_streams
+from .curvature import bend
 from .gather import SAME_SURFACE_COSINE, SAME_SURFACE_OFFSET
 
 PROBES = 8
@@ -28,10 +29,11 @@ OWN_STREAM = 0x70726F62
 @dr.syntax
 def covered_share(scene, vertices, si, radius, seed, active):
     """Estimated share, in [0.4, 1], of the disk of `radius` around each vertex that lies on surface
-    seen from just above the vertex and like its own (same tests as for photons). `vertices` as of
-    `read_queries`, `si` their surface interactions; width as theirs."""
+    seen from just above the vertex and like its own (same tests as for photons). Where the
+    surface is curved, so is the disk. `vertices` as of `read_queries`, `si` their surface
+    interactions, found with `gather.FLAGS`; width as theirs."""
     normal = mi.Vector3f(dr.mulsign(si.n, -dr.dot(si.n, vertices["ray_d"])))
-    frame = mi.Frame3f(normal)
+    bent = bend(si, mi.Frame3f(normal))
     rng = vertex_streams(vertices["path"], vertices["depth"], seed ^ OWN_STREAM)
     turn, shift = rng.next_float32() * dr.two_pi, rng.next_float32()
     above = mi.Ray3f(si.spawn_ray(normal))
@@ -49,7 +51,7 @@ def covered_share(scene, vertices, si, radius, seed, active):
         sine, cosine = dr.sincos(
             turn + dr.two_pi / outer * (mi.Float(probe) + dr.select(probe < outer, 0, 0.5))
         )
-        towards = distance * (cosine * frame.s + sine * frame.t) - height * normal
+        towards = bent.along(cosine, sine, distance) - height * normal
         hit = scene.ray_intersect(
             mi.Ray3f(start, dr.normalize(towards)),
             mi.RayFlags.Minimal,

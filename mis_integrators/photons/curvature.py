@@ -8,14 +8,19 @@ radius of a disk is bounded by the surface's radius of curvature.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import drjit as dr
+import mitsuba as mi
 
 from .gather import SAME_SURFACE_COSINE
 
 LEAST_LEFT = 0.25
 """Tuned: share of its radius that a disk keeps, however bent the surface is: smaller ones would
 find hardly a photon."""
+BENEATH = 1.1
+"""Times as far below the tangent plane as the circle is, so that rays from above meet the surface
+where it is no circle."""
 
 
 def most_bent():
@@ -24,15 +29,75 @@ def most_bent():
     return math.sqrt(2 * (1 - SAME_SURFACE_COSINE))
 
 
+def derivatives(si):
+    """Of position and normal, pairs, by each of two parameters of the surface.
+
+    The normals of Mitsuba's meshes are derived by barycentric coordinates, as if they were not
+    flipped, and their positions by coordinates of textures: here these are edges of the triangle,
+    too. An instance of a mesh counts as flat, for its edges are not known in the world.
+    """
+    mesh = si.shape.is_mesh() & si.is_valid()
+    here = mesh & (si.instance == dr.zeros(mi.ShapePtr))
+    triangle = mi.MeshPtr(si.shape)
+    corners = [
+        triangle.vertex_position(index, here)
+        for index in triangle.face_indices(si.prim_index, here)
+    ]
+    edges = [corner - corners[0] for corner in corners[1:]]
+    flipped = here & (dr.dot(dr.cross(*edges), si.n) < 0)
+    sign = dr.select(flipped, -1, dr.select(mesh & ~here, 0, 1))
+    given = ((si.dp_du, si.dn_du), (si.dp_dv, si.dn_dv))
+    return [(dr.select(here, edge, dp), sign * dn) for edge, (dp, dn) in zip(edges, given)]
+
+
 def bounded(si, radius):
     """The radius of a merge disk around surface interactions that know how their normals turn
     (`gather.FLAGS`): no more than `most_bent` radii of curvature, the least of those along the
     surface's parameters."""
     bent = [
         dr.squared_norm(dn) * dr.rcp(dr.maximum(dr.squared_norm(dp), 1e-30))
-        for dn, dp in ((si.dn_du, si.dp_du), (si.dn_dv, si.dp_dv))
+        for dp, dn in derivatives(si)
     ]
     curvature = dr.sqrt(dr.maximum(*bent))
     most = most_bent()
     share = most * dr.rcp(dr.maximum(curvature * radius, most))
     return radius * dr.maximum(share, LEAST_LEFT)
+
+
+class Bend(NamedTuple):
+    """How a surface is bent: the second fundamental form in a `frame` whose normal is `n`, up to
+    sign. k(a) = ss cos^2 a + 2 st cos a sin a + tt sin^2 a is the normal curvature along frame.s
+    cos a + frame.t sin a, positive on a ball's outside."""
+
+    n: mi.Vector3f
+    frame: mi.Frame3f
+    ss: mi.Float
+    st: mi.Float
+    tt: mi.Float
+
+    def along(self, cosine, sine, distance):
+        """Vectors from the surface's point to where it is so far away in the direction a: on a
+        circle of curvature k(a), a chord of length d ends k d^2 / 2 below the tangent plane. They
+        end `BENEATH` that."""
+        k = dr.square(cosine) * self.ss + 2 * cosine * sine * self.st + dr.square(sine) * self.tt
+        below = dr.clip((0.5 * BENEATH) * k * distance, -1, 1)
+        tangent = cosine * self.frame.s + sine * self.frame.t
+        return distance * (dr.safe_sqrt(1 - dr.square(below)) * tangent - below * self.n)
+
+
+def bend(si, frame):
+    """The `Bend` at surface interactions as of `bounded` (do Carmo, Differential Geometry of Curves
+    and Surfaces, sections 3.2 and 3.3)."""
+    (dp_du, dn_du), (dp_dv, dn_dv) = derivatives(si)
+    uu, uv, vv = dr.squared_norm(dp_du), dr.dot(dp_du, dp_dv), dr.squared_norm(dp_dv)
+    determinant = uu * vv - dr.square(uv)
+    scale = dr.select(determinant > 0, dr.rcp(determinant), 0)
+
+    def turn(tangent):
+        u, v = dr.dot(tangent, dp_du), dr.dot(tangent, dp_dv)
+        return ((vv * u - uv * v) * dn_du + (uu * v - uv * u) * dn_dv) * scale
+
+    by_s, by_t = turn(frame.s), turn(frame.t)
+    st = 0.5 * (dr.dot(frame.s, by_t) + dr.dot(frame.t, by_s))
+    n = dr.mulsign(si.n, dr.dot(si.n, si.sh_frame.n))  # that whose derivatives are known
+    return Bend(n, frame, dr.dot(frame.s, by_s), st, dr.dot(frame.t, by_t))

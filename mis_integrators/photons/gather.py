@@ -126,6 +126,13 @@ def same_surface(landing, n):
     return (alike > 0) & (dr.square(alike) > SAME_SURFACE_COSINE**2 * dr.squared_norm(landing.n))
 
 
+def same_side(landing, n, towards):
+    """Whether light from `towards` comes to the same side of the surface where it landed as at
+    vertices with normals `n`. Else it grazes the inside of a thin curved sheet, as of a lampshade,
+    and would shine through it."""
+    return dr.dot(landing.n, towards) * dr.dot(n, towards) > 0
+
+
 def within_disk(offset, distance_squared, n, radius, height=None):
     """Whether photons, `offset` from vertices, lie within a radius and close to their plane:
     relative to the radius `height` (None: the same)."""
@@ -192,6 +199,7 @@ def gather_photons(
         if max_depth > 0:
             hit &= landing.depth + vertices.depth <= max_depth
         flux, delta_at_light, towards = sums.read(photon_map, index, hit)
+        hit &= same_side(landing, vertices.n, towards)
         value, weights = _contribution(flux, towards, vertices, index, landing, weigh, hit)
         # The largest radius is tested again, too: without, kernels are slower by some per cent.
         inside = [hit & within_disk(offset, distance_squared, vertices.n, r, height) for r in radii]

@@ -13,7 +13,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.spectra import channel_mean
-from .gather import Scattering, landing_cosine, same_surface, within_disk
+from .gather import Scattering, landing_cosine, same_side, same_surface, within_disk
 from .grid import for_each_photon
 from .photon import read_landing, read_power
 
@@ -65,6 +65,7 @@ class Meeting:
 def meet(photon_map, vertices, index, landing, active):
     """The `Meeting` of photons `index` with vertices (a `QueryVertices`)."""
     flux, towards = read_power(photon_map.power, index, active)
+    active = active & same_side(landing, vertices.n, towards)
     scattering = vertices.scatter(towards, True, active)
     cosines = scattering.shading * dr.rcp(landing_cosine(landing.n, scattering, vertices.plane))
     lit = active & (dr.max(scattering.value) > 0)

@@ -19,13 +19,14 @@ def scene_with(**shapes):
     return mi.load_dict({"type": "scene", "floor": {"type": "rectangle"}, **shapes})
 
 
-def share_at(scene, x, height=0.5):
+def share_at(scene, x, height=0.5, radius=RADIUS):
     """Covered shares of `COUNT` disks around the floor's point (x, 0, 0), seen from so high above
     it."""
     from mis_integrators.photons.coverage import covered_share  # of the active variant
+    from mis_integrators.photons.gather import FLAGS
 
     ray = mi.Ray3f(mi.Point3f(dr.full(mi.Float, x, COUNT), 0, height), mi.Vector3f(0, 0, -1))
-    si = scene.ray_intersect_preliminary(ray).compute_surface_interaction(ray)
+    si = scene.ray_intersect_preliminary(ray).compute_surface_interaction(ray, FLAGS)
     vertices = {
         "ray_d": ray.d,
         "path": dr.arange(mi.UInt32, COUNT),
@@ -33,7 +34,7 @@ def share_at(scene, x, height=0.5):
     }
     return np.array(
         covered_share(
-            scene, vertices, si, dr.opaque(mi.Float, RADIUS), dr.opaque(mi.UInt32, 7), mi.Bool(True)
+            scene, vertices, si, dr.opaque(mi.Float, radius), dr.opaque(mi.UInt32, 7), mi.Bool(True)
         )
     )
 
@@ -84,3 +85,30 @@ def test_under_a_solid(rgb, gap):
         "to_world": mi.ScalarTransform4f().translate([0, 0, gap * RADIUS + 0.5]).scale(0.5),
     }
     assert np.all(share_at(scene_with(block=block), 0.0, 0.5 * gap * RADIUS) == 1)
+
+
+BENT = 0.15
+"""Radius of curved surfaces: disks of `RADIUS` around their points reach as far as those of
+`curvature.bounded` may."""
+
+
+@pytest.mark.parametrize(
+    "shape",
+    [
+        {"type": "sphere", "radius": BENT},
+        {"type": "cylinder", "p0": [-1, 0, 0], "p1": [1, 0, 0], "radius": BENT},
+    ],
+)
+@pytest.mark.parametrize("height", [0.5, 0.0])
+def test_curved_surfaces_are_covered(rgb, shape, height):
+    """From outside and from within: photons around lie on them all the same."""
+    assert np.all(share_at(mi.load_dict({"type": "scene", "shape": shape}), 0.01, height) == 1)
+
+
+@pytest.mark.parametrize("u", EDGES)
+def test_where_a_cylinder_ends(rgb, u):
+    """It can be unrolled: as where a floor ends, but for chords that are shorter than arcs (2 % at
+    most)."""
+    shape = {"type": "cylinder", "p0": [-1, 0, 0], "p1": [1, 0, 0], "radius": 0.2}
+    shares = share_at(mi.load_dict({"type": "scene", "shape": shape}), 1 - u * RADIUS)
+    assert abs(1 - shares.mean() - lost_share(u)) < 0.02
