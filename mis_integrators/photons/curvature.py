@@ -65,11 +65,10 @@ def bounded(si, radius):
 
 
 class Bend(NamedTuple):
-    """How a surface is bent: the second fundamental form in a `frame` whose normal is `n`, up to
-    sign. k(a) = ss cos^2 a + 2 st cos a sin a + tt sin^2 a is the normal curvature along frame.s
-    cos a + frame.t sin a, positive on a ball's outside."""
+    """How a surface is bent: its second fundamental form in a `frame`. k(a) = ss cos^2 a +
+    2 st cos a sin a + tt sin^2 a is the normal curvature along frame.s cos a + frame.t sin a,
+    positive where the surface bends away from the side that frame.n points to."""
 
-    n: mi.Vector3f
     frame: mi.Frame3f
     ss: mi.Float
     st: mi.Float
@@ -82,12 +81,12 @@ class Bend(NamedTuple):
         k = dr.square(cosine) * self.ss + 2 * cosine * sine * self.st + dr.square(sine) * self.tt
         below = dr.clip((0.5 * BENEATH) * k * distance, -1, 1)
         tangent = cosine * self.frame.s + sine * self.frame.t
-        return distance * (dr.safe_sqrt(1 - dr.square(below)) * tangent - below * self.n)
+        return distance * (dr.safe_sqrt(1 - dr.square(below)) * tangent - below * self.frame.n)
 
 
 def bend(si, frame):
-    """The `Bend` at surface interactions as of `bounded` (do Carmo, Differential Geometry of Curves
-    and Surfaces, sections 3.2 and 3.3)."""
+    """The `Bend` at surface interactions as of `bounded`, whose normal that of the `frame` is, or
+    its opposite (do Carmo, Differential Geometry of Curves and Surfaces, sections 3.2 and 3.3)."""
     (dp_du, dn_du), (dp_dv, dn_dv) = derivatives(si)
     uu, uv, vv = dr.squared_norm(dp_du), dr.dot(dp_du, dp_dv), dr.squared_norm(dp_dv)
     determinant = uu * vv - dr.square(uv)
@@ -98,6 +97,10 @@ def bend(si, frame):
         return ((vv * u - uv * v) * dn_du + (uu * v - uv * u) * dn_dv) * scale
 
     by_s, by_t = turn(frame.s), turn(frame.t)
-    st = 0.5 * (dr.dot(frame.s, by_t) + dr.dot(frame.t, by_s))
-    n = dr.mulsign(si.n, dr.dot(si.n, si.sh_frame.n))  # that whose derivatives are known
-    return Bend(n, frame, dr.dot(frame.s, by_s), st, dr.dot(frame.t, by_t))
+    forms = (
+        dr.dot(frame.s, by_s),
+        0.5 * (dr.dot(frame.s, by_t) + dr.dot(frame.t, by_s)),
+        dr.dot(frame.t, by_t),
+    )
+    side = dr.dot(frame.n, si.sh_frame.n)  # derivatives are those of the shading normal
+    return Bend(frame, *(dr.mulsign(form, side) for form in forms))

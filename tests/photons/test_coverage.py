@@ -19,7 +19,7 @@ def scene_with(**shapes):
     return mi.load_dict({"type": "scene", "floor": {"type": "rectangle"}, **shapes})
 
 
-def share_at(scene, x, height=0.5, radius=RADIUS):
+def share_at(scene, x, height=0.5):
     """Covered shares of `COUNT` disks around the floor's point (x, 0, 0), seen from so high above
     it."""
     from mis_integrators.photons.coverage import covered_share  # of the active variant
@@ -34,7 +34,7 @@ def share_at(scene, x, height=0.5, radius=RADIUS):
     }
     return np.array(
         covered_share(
-            scene, vertices, si, dr.opaque(mi.Float, radius), dr.opaque(mi.UInt32, 7), mi.Bool(True)
+            scene, vertices, si, dr.opaque(mi.Float, RADIUS), dr.opaque(mi.UInt32, 7), mi.Bool(True)
         )
     )
 
