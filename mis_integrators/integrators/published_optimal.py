@@ -24,7 +24,7 @@ from ..photons.chains import NONE, PhotonChains, trace_camera_chains, trace_phot
 from ..photons.grid import build_photon_map
 from ..photons.pairs import meeting_of, parts, photon_pairs, take
 from ..photons.photon import surface_layout
-from ..photons.queries import LAST_VERTEX
+from ..photons.queries import DEPTH
 from .bdpm import BDPMSession
 from .purposes import CAMERA, FROZEN, LIGHT
 
@@ -297,7 +297,7 @@ class LightOfIteration:
         vertices = session.frozen.vertices(record)
         values = dr.zeros(mi.Spectrum, dr.width(vertices.p))
         vertex, photon = photon_pairs(photon_map, vertices, radius, -1)
-        depth, max_depth = record["depth"] & (LAST_VERTEX - 1), session.limits.max_depth
+        depth, max_depth = record["depth"] & DEPTH, session.limits.max_depth
         for some in parts(dr.width(vertex)):
             index, mine = (dr.gather(mi.UInt32, x, some) for x in (photon, vertex))
             there = session.frozen.vertices({name: take(x, mine) for name, x in record.items()})

@@ -1,5 +1,9 @@
 """Whether photons that arrive at a surface are of use there: how narrow the lobes of its BSDF are,
-and whether it is a curve, narrower itself than the disks in which photons are merged."""
+and whether it is a curve, narrower itself than the disks in which photons are merged.
+
+Of a BSDF with a narrow lobe and an even part, as plastic has, photons bring the light of the even
+part, and paths go on for that of the lobe.
+"""
 
 from __future__ import annotations
 
@@ -20,20 +24,30 @@ COSINES = 0.25, 0.5, 0.75, 1.0
 """Of the angles under which BSDFs are looked at."""
 SAMPLES = 64
 """Directions sampled of each BSDF under each angle."""
+PARTED = 1 << len(COSINES)
+"""Bit of a BSDF whose even part can be evaluated by itself."""
+EVEN = int(mi.BSDFFlags.DiffuseReflection | mi.BSDFFlags.DiffuseTransmission)
+"""Types of what scatters evenly."""
+ROUNDING = 1e-4
+"""Of a BSDF's parts, relative to its largest value."""
 
 
 @dataclass(frozen=True)
 class NarrowSurfaces:
     """Surfaces at which photons are of no use: the registry tables `narrow_bsdfs` and, of each
-    shape, whether it is a curve; each may be ``None`` where there is none."""
+    shape, whether it is a curve; each may be ``None`` where there is none. `parted`: whether there
+    are BSDFs with an even part, of which photons bring the light."""
 
     bsdfs: Any
     curves: Any
+    parted: bool
 
     @classmethod
     def of(cls, scene):
         """Those of a scene; ``None`` where there are none."""
-        found = cls(narrow_bsdfs(scene), curves(scene))
+        bsdfs = narrow_bsdfs(scene)
+        parted = bsdfs is not None and bool(np.any(np.array(bsdfs) & PARTED))
+        found = cls(bsdfs, curves(scene), parted)
         return found if found.tables() else None
 
     def tables(self):
@@ -53,6 +67,15 @@ class NarrowSurfaces:
             narrow |= lookup(self.curves, si.shape, mi.Bool, active & si.is_valid())
         return narrow
 
+    def has_even_part(self, bsdf, active):
+        """Of BSDFs whether photons bring the light of their even part, where they are narrow."""
+        return (lookup(self.bsdfs, bsdf, mi.UInt32, active) & PARTED) != 0
+
+
+def even_part(mode=None):
+    """The `mi.BSDFContext` of what a BSDF scatters evenly."""
+    return mi.BSDFContext(mi.TransportMode.Radiance if mode is None else mode, EVEN)
+
 
 def curves(scene):
     """A registry table: of each shape of the scene, whether it is a curve. None where none is."""
@@ -63,19 +86,23 @@ def curves(scene):
 
 def narrow_bsdfs(scene):
     """A registry table: of each BSDF of the scene a bit for each of the `COSINES`, whether its
-    `concentration` is above `NARROW` there. None where there is no such BSDF."""
+    `concentration` is above `NARROW` there; and where it is so, whether it is one of the `parted`
+    ones. None where there is no narrow BSDF."""
     bsdfs = used_bsdfs(scene)  # all have a place in the table: any may be asked for
     smooth = [b for b in bsdfs if mi.has_flag(b.flags(), mi.BSDFFlags.Smooth)]
-    rough = [b for b in smooth if int(b.flags()) & ~_EVEN]
+    rough = [b for b in smooth if int(b.flags()) & ~_WITHOUT_LOBES]
     if not rough:
         return None
     narrow = concentration(rough) > NARROW
     bits = dict(zip((b.ptr for b in rough), narrow @ (1 << np.arange(len(COSINES)))))
+    both = [b for b in rough if bits[b.ptr] and int(b.flags()) & EVEN]
+    for bsdf, can_be in zip(both, parted(both) if both else []):
+        bits[bsdf.ptr] |= PARTED if can_be else 0
     values = [bits.get(b.ptr, 0) for b in bsdfs]
     return registry_table(bsdfs, mi.BSDFPtr, values, mi.UInt32) if narrow.any() else None
 
 
-_EVEN = int(
+_WITHOUT_LOBES = int(
     mi.BSDFFlags.DiffuseReflection
     | mi.BSDFFlags.DiffuseTransmission
     | mi.BSDFFlags.FrontSide
@@ -94,6 +121,28 @@ def concentration(bsdfs):
 
     which is 1 for a diffuse BSDF. So many photons tell as much as one at a diffuse surface. By
     samples of the BSDF, with p their density and w = f |cos| / p: I[f] = E[w], I[f^2] = E[w f]."""
+    value, weight, cosine = _looked_at(bsdfs, [int(mi.BSDFFlags.Smooth)])
+    f = value[0] / np.maximum(cosine, 0.05)
+    first, second = (x.mean(axis=2) for x in (weight, weight * f))
+    return np.pi * second / np.maximum(first, 1e-12) ** 2
+
+
+def parted(bsdfs):
+    """Which of the BSDFs are the sum of two that can be evaluated apart, an even part and lobes:
+    a list. (Some of Mitsuba's evaluate all of themselves, whatever part is asked for.)"""
+    smooth = int(mi.BSDFFlags.Smooth)
+    (value, even, lobes), *_ = _looked_at(bsdfs, [smooth, EVEN, smooth & ~EVEN])
+    error = np.abs(even + lobes - value).max(axis=(1, 2))
+    return [
+        bool(wrong <= ROUNDING * largest and bright > 0)
+        for wrong, largest, bright in zip(error, value.max(axis=(1, 2)), even.max(axis=(1, 2)))
+    ]
+
+
+def _looked_at(bsdfs, parts):
+    """What samples of the smooth part of each BSDF find, arrays (BSDFs, angles, samples): a list
+    with the value (mean over the channels) of each of the `parts` of its types, the weight of the
+    sample, and its cosine."""
     count = len(bsdfs) * len(COSINES) * SAMPLES
     index = dr.arange(mi.UInt32, count)
     bsdf = dr.gather(mi.BSDFPtr, mi.BSDFPtr(bsdfs), index // (len(COSINES) * SAMPLES))
@@ -108,13 +157,12 @@ def concentration(bsdfs):
         si.wavelengths = mi.sample_rgb_spectrum(mi.sample_shifted(mi.Float(0.5)))[0]
     choice, u, v, s, t = *sobol(index, mi.UInt32(1), 3), *sobol(index, mi.UInt32(2), 2)
     si.uv = mi.Point2f(s, t)
-    context = mi.BSDFContext(mi.TransportMode.Radiance, int(mi.BSDFFlags.Smooth))
+    mode = mi.TransportMode.Radiance
+    context = mi.BSDFContext(mode, int(mi.BSDFFlags.Smooth))
     bs, weight = bsdf.sample(context, si, choice, mi.Point2f(u, v))
-    value = channel_mean(bsdf.eval(context, si, bs.wo))
-    weight, f = channel_mean(weight), value / dr.maximum(dr.abs(bs.wo.z), 0.05)
-    dr.eval(weight, f)
-    first, second = (
-        np.array(x, np.float64).reshape(len(bsdfs), len(COSINES), SAMPLES).mean(axis=2)
-        for x in (weight, weight * f)
-    )
-    return np.pi * second / np.maximum(first, 1e-12) ** 2
+    found = [channel_mean(bsdf.eval(mi.BSDFContext(mode, part), si, bs.wo)) for part in parts]
+    found += [channel_mean(weight), dr.abs(bs.wo.z)]
+    dr.eval(found)
+    shape = len(bsdfs), len(COSINES), SAMPLES
+    *values, weight, cosine = (np.array(x, np.float64).reshape(shape) for x in found)
+    return values, weight, cosine

@@ -11,11 +11,12 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.traits import lookup
+from ..paths.lobes import even_part
 from ..paths.subpaths import vertex_bsdf_of
 from ..paths.vertex import SMALLEST_COSINE, per_projected, upright
 from .grid import for_each_photon
 from .kernel_sums import KernelSums, disk_area
-from .queries import LAST_VERTEX
+from .queries import DEPTH, EVEN_PART
 from .scattering import Scattering
 
 SAME_SURFACE_COSINE = 0.7
@@ -39,20 +40,21 @@ class QueryVertices:
     and in scenes that have no others none is evaluated for a photon.
 
     `takes`: which of them take photons; `scale` (a spectrum): a weight that all photons of a vertex
-    have.
+    have; `parted`: the even part of the BSDF scatters alone, where the vertices say so.
     """
 
-    def __init__(self, traits, record, wavelengths, takes=True, scale=1):
+    def __init__(self, traits, record, wavelengths, takes=True, scale=1, parted=False):
         throughput, depth = record["throughput"], record["depth"]
         active = (dr.max(throughput) > 0) & takes
         ray = mi.Ray3f(record["ray_o"], record["ray_d"], 0, wavelengths)
         si = record["hit"].compute_surface_interaction(ray, FLAGS, active)
         self.traits, self.si, self.bsdf, self.active = traits, si, si.bsdf(), active
-        self.p, self.n, self.plane, self.depth = si.p, si.n, si.n, depth & (LAST_VERTEX - 1)
+        self.p, self.n, self.plane, self.depth = si.p, si.n, si.n, depth & DEPTH
         self.facing = mi.Frame3f.cos_theta(si.wi)
         self.side = dr.dot(si.n, -ray.d)
         self.first = record.get("first")
         self.factor = mi.Spectrum(throughput) * scale
+        self.even = (depth & EVEN_PART) != 0 if parted else None
         self.lambertian, self.f, self.pdf = mi.Bool(True), mi.Spectrum(0), mi.Float(0)
         if traits.has_rough:
             self.lambertian = lookup(traits.lambertian, self.bsdf, mi.Bool, active)
@@ -80,8 +82,11 @@ class QueryVertices:
                 scale = per_projected(wo.z)
                 f = dr.select(self.lambertian, f, rough_value * scale)
                 p = dr.select(self.lambertian, p, pdf * scale)
-            else:
+            elif self.even is None:
                 rough_value = self.bsdf.eval(mi.BSDFContext(), self.si, wo, rough)
+            else:
+                rough_value = self.bsdf.eval(mi.BSDFContext(), self.si, wo, rough & ~self.even)
+                rough_value += self.bsdf.eval(even_part(), self.si, wo, rough & self.even)
             value = dr.select(self.lambertian, value, rough_value)
         return Scattering(
             towards, dr.abs(wo.z), value, f, p, lambda: self._density_back(wo, active)

@@ -17,6 +17,7 @@ from ..core.records import Layout
 from ..core.spectra import channel_mean
 from ..paths.camera import trace_camera, whole_or_nothing
 from ..paths.light_classes import class_of, scattered_history, start_of_camera_path
+from ..paths.lobes import EVEN, even_part
 from ..paths.media import direct_light, next_hit_either, next_hit_straight_on
 from ..paths.setting import CameraPass, Limits, World
 from ..paths.subpaths import selected, smooth_at
@@ -27,6 +28,10 @@ from .points import new_points, point_layout
 
 LAST_VERTEX = 1 << 31
 """Bit of a vertex' depth that says that all photons are wanted there, else only caustic ones."""
+EVEN_PART = 1 << 30
+"""Bit that says that only the even part of the BSDF scatters those that are not caustic."""
+DEPTH = EVEN_PART - 1
+"""What a vertex' depth has besides."""
 PIXEL_DISK = 0.35
 """Tuned: radius of a `pixel_disk` over the width of a pixel. (With 0.5 the denoised walls of a room
 lit through glass have a texture.)"""
@@ -45,7 +50,7 @@ STATE = ("weights.0", "weights.1", "weights.2")
 def query_layout():
     """Fields of a camera vertex that waits for photons: the ray that led to it and what it met,
     from which the surface interaction is made again; the path's throughput up to it, its path's
-    number, and its depth in segments (with `LAST_VERTEX`)."""
+    number, and its depth in segments (with `LAST_VERTEX` and `EVEN_PART`)."""
     return Layout(
         {
             "ray_o": mi.Point3f,
@@ -58,16 +63,18 @@ def query_layout():
     )
 
 
-def query_at(at, last):
+def query_at(at, last, even=False):
     """The record of `query_layout` of where a camera path has arrived (a `CameraArrival`); `last`:
-    whether all photons are wanted there."""
+    whether all photons are wanted there; `even`: all of these for the even part of the BSDF."""
+    bits = dr.select(last, mi.UInt32(LAST_VERTEX), 0)
+    bits |= dr.select(even, mi.UInt32(LAST_VERTEX | EVEN_PART), 0)
     return {
         "ray_o": at.ray.o,
         "ray_d": at.ray.d,
         "hit": at.hit,
         "throughput": at.throughput,
         "path": at.path,
-        "depth": at.depth | dr.select(last, mi.UInt32(LAST_VERTEX), mi.UInt32(0)),
+        "depth": at.depth | bits,
     }
 
 
@@ -137,8 +144,8 @@ class Queries:
     for (under weights, in each section); `has_caustics`, `has_indirect`: kinds of photons that
     there are; `one_vertex`: no path asks twice, and each owns the place of its number; `beams`: how
     many beams of each kind there is room for (0: none are kept); `narrow`: the `NarrowSurfaces` at
-    which none but caustic photons are gathered, and which the `bdd` does not count (None: there are
-    none); `points`: in media, too, photons are asked for at vertices (under weights);
+    which none but caustic photons are gathered, but for the even part of their BSDF if it has one,
+    and which the `bdd` does not count (None: there are none); `points`: in media, too, photons are asked for at vertices (under weights);
     `cones` (`RayCones`, or None): they tell how wide pixels are at vertices that the camera sees;
     `near_zone` (a `NearZone`, or None): volume photons beyond it are joined with the sensor. Then
     photons bring all light of media on the way to the first smooth surface: all segments before it
@@ -172,10 +179,11 @@ class QueryVisitor:
     `times`, how many times light counts that is found there; `sums`, the state of `weights`;
     `history`, what `classes` carry along; `cone`, with the queries' `cones` the path's; `left`,
     where paths meet lights by chance, the place of the last smooth vertex, the cosine at which they
-    left it, and the mean throughput with which they did; `clear`, in scenes with media, the share
+    left it, and the mean throughput with which they did; `rest`, where BSDFs are parted, the share
+    of light that photons have not brought at the last smooth vertex; `clear`, in scenes with media, the share
     of light that has got through these without being scattered; and `wall`, where beams are kept,
     the normal of the surface that the path has left last, zero after a vertex in a medium. The last
-    six are lists.
+    seven are lists.
 
     In media, paths scatter until they have left `bdd` smooth vertices behind, and go straight on
     from there; where photons are asked for at points, until they have left one more behind. Where
@@ -186,6 +194,7 @@ class QueryVisitor:
         self.scene, self.lights, self.traits = world.scene, world.lights, world.traits
         self.hide_emitters, self.queries, self.weights = limits.hide_emitters, queries, weights
         self.bdd, self.classes = queries.bdd, classes
+        self.parts = queries.narrow is not None and queries.narrow.parted
         self.first, self.beyond = first, beyond
         self.sections = 1 if weights is None else self.bdd + 1
         self.by_light = weights is not None and weights.weighs_points_of_lights
@@ -238,15 +247,16 @@ class QueryVisitor:
             "history": [] if self.classes is None else start_of_camera_path(),
             "cone": [] if self.queries.cones is None else self.queries.cones.begin(),
             "left": [mi.UInt32(0), one, one] if self.queries.meets_lights else [],
+            "rest": [mi.Spectrum(1)] if self.parts else [],
             "clear": [mi.Spectrum(1)] if self.traits.has_media else [],
             "wall": [mi.Normal3f(0)] if self.queries.beams else [],
         }
 
     def travel(self, state, ray, flight, numbers, throughput, path, depth, active, unseen):
-        brought = throughput
+        brought = throughput * state["rest"][0] if self.parts else throughput
         if self.queries.near_zone is not None:
             kept = numbers.at(BEAM + depth).next_float32() < BEAMS_KEPT
-            brought = dr.select(depth == 0, throughput, dr.select(kept, throughput / BEAMS_KEPT, 0))
+            brought = dr.select(depth == 0, brought, dr.select(kept, brought / BEAMS_KEPT, 0))
         begun = mi.Point3f(ray.o)
         wall = state["wall"][0] if state["wall"] else None
         keep = self._keep_beams(state, brought, path, depth + 1, LONG)
@@ -390,8 +400,15 @@ class QueryVisitor:
         if self.passes_masks or self.queries.meets_lights:
             smooth &= vertex <= self.bdd
         at.ends = vertex >= self.bdd  # the path's last smooth vertex
+        at.even = mi.Bool(False)
         if self.queries.narrow is not None:
             at.narrow = self.queries.narrow.at(bsdf, at.si, smooth)
+            if self.parts:
+                at.parted = at.narrow & self.queries.narrow.has_even_part(bsdf, smooth)
+                at.even = at.parted & at.ends
+                at.rest = dr.select(smooth, state["rest"][0], 1)
+                at.throughput = at.throughput * at.rest
+                smooth &= dr.max(at.rest) > 0
             at.ends &= ~at.narrow
         if self.beyond is not None:
             # Other paths go straight through media.
@@ -475,7 +492,7 @@ class QueryVisitor:
         if self.flies:
             wants &= ~at.scatters
         if not queries.has_caustics:
-            wants &= last & queries.has_indirect
+            wants &= (last | at.even) & queries.has_indirect
         slot = mi.UInt32(at.path)
         if not queries.one_vertex:
             section = mi.UInt32(0)
@@ -486,7 +503,8 @@ class QueryVisitor:
             slot += section * store.room
         if not queries.capacity:
             return slot
-        query_layout().write(store.vertices["words"], query_at(at, last), slot, wants)
+        query = query_at(at, last, at.even)
+        query_layout().write(store.vertices["words"], query, slot, wants)
         if weights is not None:
             weight_layout().write(store.vertices["weights"], self._stored(state), slot, wants)
         if self.classes is not None:
@@ -521,7 +539,15 @@ class QueryVisitor:
             state["history"] = scattered_history(state["history"], delta, active)
         beyond = dr.select(at.ends, mi.UInt32(self.bdd), vertex) + 1
         if self.queries.narrow is not None:
-            beyond = dr.select(at.narrow & ~at.ends, vertex, beyond)
+            passed = at.narrow & ~at.ends
+            if self.parts:
+                evenly = (bs.sampled_type & EVEN) != 0
+                passed &= ~(at.parted & ~at.even & evenly)
+                rest = self._rest(at, rng, bs, weight, scattered)
+                state["rest"] = selected(scattered, [rest], state["rest"])
+                weight = weight * at.rest
+                active &= dr.max(at.rest) > 0
+            beyond = dr.select(passed, vertex, beyond)
         state |= {
             "vertex": dr.select(scattered, beyond, vertex),
             "met": state["met"] | scattered,
@@ -530,6 +556,19 @@ class QueryVisitor:
             "origin": dr.select(scattered, mi.Interaction3f(at.si), state["origin"]),
         }
         return state, weight, active
+
+    def _rest(self, at, rng, bs, weight, active):
+        """The share of the light from where paths go on that photons do not bring, those gathered
+        for the even part of the BSDF. By roulette, so that few paths go on for little: it is none,
+        or its largest channel one."""
+        active = active & at.even
+        even = at.bsdf.eval(even_part(), at.si, bs.wo, active)
+        whole = weight * bs.pdf
+        share = dr.select(whole > 0, even * dr.rcp(dr.maximum(whole, 1e-30)), 1)
+        rest = 1 - dr.clip(share, 0, 1)
+        largest = dr.max(rest)
+        rest = dr.select(rng.next_float32() < largest, rest * dr.rcp(largest), 0)
+        return dr.select(active, rest, 1)
 
     def cross(self, before, after, crosses):
         passed = {"cone": after["cone"], "wall": after["wall"]}
@@ -558,7 +597,10 @@ def trace_camera_paths(
     Light that reaches a smooth vertex through delta surfaces belongs to caustic photons and is left
     out; where `queries` say that paths meet lights, that which they have met there is kept with the
     vertex. Delta vertices do not count; a BSDF with both parts is a smooth vertex whose delta part
-    goes on. At `queries.narrow` vertices there is direct light, but they do not count, either.
+    goes on. At `queries.narrow` vertices there is direct light, but they do not count, either. Where
+    such a vertex would be the last one, and its BSDF has an even part, photons are gathered for
+    that, and what the path meets beyond the next smooth vertex counts for the rest of the BSDF.
+    Where it would not, it counts if it scatters evenly.
 
     Returns `(radiance, alpha, splat position, vertices, count)`: the vertices at which photons are
     to be gathered, as made by `new_vertex_buffer`, and how many wanted a place in it (width one).
