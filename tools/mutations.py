@@ -957,4 +957,25 @@ MUTATIONS = [
         "probes of covered disks look beside surfaces that are bent one way only",
         "tests/photons/test_coverage.py",
     ),
+    Mutation(
+        "photons/frozen.py",
+        "hit &= dr.dot(photon.normal, facing) > SAME_SURFACE_COSINE",
+        "hit &= dr.abs(dr.dot(photon.normal, facing)) > SAME_SURFACE_COSINE",
+        "cached irradiance has light of the other side of a bent sheet",
+        "tests/photons/test_frozen.py",
+    ),
+    Mutation(
+        "photons/queries.py",
+        "return dr.select(active, rest, 1)",
+        "return dr.select(active, 1, rest)",
+        "what photons bring by the even part of plastic counts once more on the path that goes on",
+        "tests/integrators/test_narrow_lobes.py::test_means",
+    ),
+    Mutation(
+        "photons/queries.py",
+        """brought = throughput * state["rest"][0] if self.parts else throughput""",
+        "brought = throughput",
+        "photons in fog shine on the even part of a coated surface twice",
+        "tests/integrators/test_bdpm_media.py::test_narrow_lobes_are_passed",
+    ),
 ]

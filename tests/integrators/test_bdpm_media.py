@@ -131,13 +131,20 @@ def test_depth_is_that_of_volpath(rgb, max_depth, bdd):
     agree_with_volpath(scene, max_depth, whole=0.02, block=0.05, bdd=bdd)
 
 
-@pytest.mark.parametrize("bdd", extended(0, 1))
-def test_narrow_lobes_are_passed(rgb, bdd):
-    """Smooth metal in fog: paths go on, straight or not, and what is between it and the next vertex
-    counts once."""
-    metal = {"type": "roughconductor", "material": "Al", "alpha": 0.08}
-    scene = fog_scene(homogeneous(0.7), ball=ball(metal, 0.7, exterior=FOG))
-    assert bdpm(bdd=bdd).session(scene, spp=0).narrow is not None
+METAL = {"type": "roughconductor", "material": "Al", "alpha": 0.08}
+MATT = {"type": "diffuse", "reflectance": 0.7}
+COATED = {"type": "blendbsdf", "weight": 0.7, "a": MATT, "b": {**METAL, "alpha": 0.05}}
+
+
+@pytest.mark.parametrize(
+    "surface, bdd", [(COATED, 0), *extended((METAL, 0), (METAL, 1), (COATED, 1))]
+)
+def test_narrow_lobes_are_passed(rgb, surface, bdd):
+    """Smooth metal in fog, or a matt ball with a smooth coat: paths go on, straight or not, and
+    what is between it and the next vertex counts once, or for the coat only where photons bring the
+    rest."""
+    scene = fog_scene(homogeneous(0.7), ball=ball(surface, 0.7, exterior=FOG))
+    assert bdpm(bdd=bdd).session(scene, spp=0).narrow.parted == (surface is COATED)
     agree_with_volpath(scene, bdd=bdd, direct_paths=3)
 
 
