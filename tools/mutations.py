@@ -272,8 +272,8 @@ MUTATIONS = [
     ),
     Mutation(
         "photons/queries.py",
-        "beyond = dr.select(at.narrow & ~at.ends, vertex, beyond)",
-        "beyond = dr.select(at.narrow & ~at.ends, beyond, beyond)",
+        "passed = at.narrow & ~at.ends",
+        "passed = mi.Bool(False)",
         "paths end behind narrow lobes that they pass",
         LOBES,
     ),
@@ -693,8 +693,8 @@ MUTATIONS = [
     ),
     Mutation(
         "photons/queries.py",
-        "throughput / BEAMS_KEPT, 0)",
-        "throughput, 0)",
+        "brought / BEAMS_KEPT, 0)",
+        "brought, 0)",
         "beams that are kept do not count for those that are not",
         f"{SENSOR_LIGHT}::test_agrees_with_volpath",
     ),

@@ -142,11 +142,13 @@ class Queries:
 
     `bdd`: the last smooth camera vertex, counted from 0; `capacity`: vertices that there is room
     for (under weights, in each section); `has_caustics`, `has_indirect`: kinds of photons that
-    there are; `one_vertex`: no path asks twice, and each owns the place of its number; `beams`: how
-    many beams of each kind there is room for (0: none are kept); `narrow`: the `NarrowSurfaces` at
-    which none but caustic photons are gathered, but for the even part of their BSDF if it has one,
-    and which the `bdd` does not count (None: there are none); `points`: in media, too, photons are asked for at vertices (under weights);
-    `cones` (`RayCones`, or None): they tell how wide pixels are at vertices that the camera sees;
+    there are; `one_vertex`: no path asks twice (without weights, the first vertex of each has the
+    place of its number, further ones have places beyond these); `beams`: how many beams of each
+    kind there is room for (0: none are kept); `narrow`: the `NarrowSurfaces` at which none but
+    caustic photons are gathered, but for the even part of their BSDF if it has one, and which the
+    `bdd` does not count (None: there are none); `points`: in media, too, photons are asked for at
+    vertices (under weights); `cones` (`RayCones`, or None): they tell how wide pixels are at
+    vertices that the camera sees;
     `near_zone` (a `NearZone`, or None): volume photons beyond it are joined with the sensor. Then
     photons bring all light of media on the way to the first smooth surface: all segments before it
     have long beams, the first one those within the zone. `meets_lights`: lights that paths meet
@@ -180,10 +182,10 @@ class QueryVisitor:
     `history`, what `classes` carry along; `cone`, with the queries' `cones` the path's; `left`,
     where paths meet lights by chance, the place of the last smooth vertex, the cosine at which they
     left it, and the mean throughput with which they did; `rest`, where BSDFs are parted, the share
-    of light that photons have not brought at the last smooth vertex; `clear`, in scenes with media, the share
-    of light that has got through these without being scattered; and `wall`, where beams are kept,
-    the normal of the surface that the path has left last, zero after a vertex in a medium. The last
-    seven are lists.
+    of light that photons have not brought at the last smooth vertex; `asked`, where paths may do so
+    again, whether they have; `clear`, in scenes with media, the share of light that has got through
+    these without being scattered; and `wall`, where beams are kept, the normal of the surface that
+    the path has left last, zero after a vertex in a medium. The last eight are lists.
 
     In media, paths scatter until they have left `bdd` smooth vertices behind, and go straight on
     from there; where photons are asked for at points, until they have left one more behind. Where
@@ -197,6 +199,7 @@ class QueryVisitor:
         self.parts = queries.narrow is not None and queries.narrow.parted
         self.first, self.beyond = first, beyond
         self.sections = 1 if weights is None else self.bdd + 1
+        self.asks_again = weights is None and not queries.one_vertex
         self.by_light = weights is not None and weights.weighs_points_of_lights
         self.store = Store(
             vertices=new_vertex_buffer(
@@ -235,6 +238,8 @@ class QueryVisitor:
 
     def begin(self, n_paths, splat, aperture):
         one = mi.Float(1)
+        if self.asks_again:  # each path's first vertex has the place of its number
+            self.store.count = dr.full(mi.UInt32, n_paths, 1)
         return {
             "vertex": mi.UInt32(0),
             "met": mi.Bool(False),
@@ -248,6 +253,7 @@ class QueryVisitor:
             "cone": [] if self.queries.cones is None else self.queries.cones.begin(),
             "left": [mi.UInt32(0), one, one] if self.queries.meets_lights else [],
             "rest": [mi.Spectrum(1)] if self.parts else [],
+            "asked": [mi.Bool(False)] if self.asks_again else [],
             "clear": [mi.Spectrum(1)] if self.traits.has_media else [],
             "wall": [mi.Normal3f(0)] if self.queries.beams else [],
         }
@@ -494,13 +500,17 @@ class QueryVisitor:
         if not queries.has_caustics:
             wants &= (last | at.even) & queries.has_indirect
         slot = mi.UInt32(at.path)
-        if not queries.one_vertex:
-            section = mi.UInt32(0)
-            if weights is not None:
-                section = dr.select(at.ends, mi.UInt32(self.bdd), state["vertex"])
+        if weights is not None:
+            section = dr.select(at.ends, mi.UInt32(self.bdd), state["vertex"])
             slot = dr.scatter_inc(store.count, section, wants)
             wants &= slot < store.room
             slot += section * store.room
+        elif state["asked"]:
+            asked = state["asked"][0]
+            further = dr.scatter_inc(store.count, mi.UInt32(0), wants & asked)
+            slot = dr.select(asked, further, slot)
+            state["asked"] = [asked | wants]
+            wants &= slot < store.room
         if not queries.capacity:
             return slot
         query = query_at(at, last, at.even)
@@ -597,10 +607,10 @@ def trace_camera_paths(
     Light that reaches a smooth vertex through delta surfaces belongs to caustic photons and is left
     out; where `queries` say that paths meet lights, that which they have met there is kept with the
     vertex. Delta vertices do not count; a BSDF with both parts is a smooth vertex whose delta part
-    goes on. At `queries.narrow` vertices there is direct light, but they do not count, either. Where
-    such a vertex would be the last one, and its BSDF has an even part, photons are gathered for
-    that, and what the path meets beyond the next smooth vertex counts for the rest of the BSDF.
-    Where it would not, it counts if it scatters evenly.
+    goes on. At `queries.narrow` vertices there is direct light, but they do not count, either.
+    Where such a vertex would be the last one, and its BSDF has an even part, photons are gathered
+    for that, and what the path finds from the next smooth vertex on counts for the rest of the
+    BSDF. Where it would not, it counts if it scatters the path evenly.
 
     Returns `(radiance, alpha, splat position, vertices, count)`: the vertices at which photons are
     to be gathered, as made by `new_vertex_buffer`, and how many wanted a place in it (width one).
