@@ -274,7 +274,8 @@ class LightOfIteration:
         session = self.session
         if not session.corrected[kind]:
             return 1
-        return dr.rcp(session.covered(session.scene, record, radius, self.seed))
+        share, _ = session.covered(session.scene, record, radius, self.seed)
+        return dr.rcp(share)
 
     def _add(self, kind, number, weight):
         """Photons of a kind at vertices with a number, all of a vertex under one weight."""
