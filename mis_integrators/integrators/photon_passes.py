@@ -14,7 +14,7 @@ from ..mis.chance import ChanceWeights, StartDensity, second_moment
 from ..paths.light_classes import LightClasses, by_class_of_photons
 from ..paths.sensor import Lens
 from ..photons.beams import Beams, gather_along, mean_count_along, read_beams
-from ..photons.coverage import HALVINGS, covered_share
+from ..photons.coverage import covered_share
 from ..photons.curvature import bounded
 from ..photons.gather import FLAGS, QueryVertices, gather_photons, mean_photon_count
 from ..photons.grid import PhotonMap, build_photon_map
@@ -306,21 +306,17 @@ class PhotonPasses(PilotedSession):
         return LEFT_TO_DENOISER if self.cones is not None else 0
 
     def _covered(self, scene, tables, vertices, radius, seed):
-        """`covered` of the vertices of a buffer (recorded: `tables` are what it reads), whose disks
-        may have a part of the radius."""
-        return self.covered(scene, read_queries(vertices), radius, seed, HALVINGS)
+        """`covered` of the vertices of a buffer (recorded: `tables` are what it reads)."""
+        return self.covered(scene, read_queries(vertices), radius, seed)
 
-    def covered(self, scene, record, radius, seed, most=0):
-        """Share of each vertex' merge disk that holds surface, and how often its radius is halved,
-        `most` times or less. `record` as of `read_queries`."""
+    def covered(self, scene, record, radius, seed):
+        """Share of each vertex' merge disk that holds surface. `record` as of `read_queries`."""
         probed = dr.max(record["throughput"]) > 0
         ray = mi.Ray3f(record["ray_o"], record["ray_d"])
         si = record["hit"].compute_surface_interaction(ray, FLAGS, probed)
-        radii = [radius * 0.5**halvings for halvings in range(most + 1)]
         if self._bounds_disks:
-            radii = [bounded(si, radius) for radius in radii]
-        share, halvings = covered_share(scene, record, si, radii, seed, probed)
-        return dr.select(probed, share, 1), dr.select(probed, halvings, 0)
+            radius = bounded(si, radius)
+        return dr.select(probed, covered_share(scene, record, si, radius, seed, probed), 1)
 
     def _records(self, vertices, kind):
         """What gathers photons of a kind, a dictionary of fields: vertices, or beams."""
@@ -409,14 +405,13 @@ class PhotonPasses(PilotedSession):
             camera_pass, self.vertex_capacity, spectral, 1.0, beyond, self.beam_capacity
         )
         for kind, radius in radii.items():
-            photon_map, correction = self._map_again(maps[kind], kind, radius), 1
-            if self.corrected[kind]:
-                share, halvings = self._covered(
-                    scene, tables, vertices, radius, sequence.own_seed()
-                )
-                radius, correction = radius * dr.exp2(-mi.Float(halvings)), dr.rcp(share)
+            photon_map = self._map_again(maps[kind], kind, radius)
             parts = self._gather(photon_map, vertices, kind, [radius], spectral)
-            parts = [gathered * correction for gathered in parts]
+            if self.corrected[kind]:
+                correction = dr.rcp(
+                    self._covered(scene, tables, vertices, radius, sequence.own_seed())
+                )
+                parts = [gathered * correction for gathered in parts]
             for number, gathered in enumerate(parts):
                 gathered = self._per_path(gathered, vertices, kind, self.chunk)
                 gathered = gathered if beyond is None else gathered * beyond

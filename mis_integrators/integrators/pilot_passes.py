@@ -14,7 +14,6 @@ from ..core.recording import lanes
 from ..core.spectra import channel_mean
 from ..paths.camera import film_sample_count, pixel_at
 from ..paths.setting import CameraPass
-from ..photons.coverage import HALVINGS
 from ..photons.queries import read_queries
 from ..pilot.radius import middle_index
 
@@ -127,8 +126,11 @@ class SubsetPasses:
             for corrected in self.setting.corrections(kind):
                 if corrected:
                     values = [
-                        self._corrected(values[: number + 1], vertices, radius, seed)
-                        for number, radius in enumerate(radii[kind])
+                        value
+                        * dr.rcp(
+                            self._covered(session.scene, session._tables, vertices, radius, seed)
+                        )
+                        for value, radius in zip(values, radii[kind])
                     ]
                 estimates[kind, corrected] = np.array(
                     [
@@ -137,16 +139,6 @@ class SubsetPasses:
                     ]
                 )
         return estimates, moment
-
-    def _corrected(self, values, vertices, radius, seed):
-        """The last of the `values`, at radii that double up to `radius`, corrected at edges; where
-        disks are halved for that, the one of the radius that they have then."""
-        session = self.session
-        share, halvings = self._covered(session.scene, session._tables, vertices, radius, seed)
-        value = values[-1]
-        for number, smaller in enumerate(values[-2 : -2 - HALVINGS : -1], 1):
-            value = dr.select(halvings >= number, smaller, value)
-        return value * dr.rcp(share)
 
     def mean_photon_count(self, photons, vertices, kind, radius, spectral):
         """As of `BDPMSession.mean_count`; `spectral`: that of the vertices' paths."""

@@ -274,8 +274,7 @@ class LightOfIteration:
         session = self.session
         if not session.corrected[kind]:
             return 1
-        share, _ = session.covered(session.scene, record, radius, self.seed)
-        return dr.rcp(share)
+        return dr.rcp(session.covered(session.scene, record, radius, self.seed))
 
     def _add(self, kind, number, weight):
         """Photons of a kind at vertices with a number, all of a vertex under one weight."""

@@ -3,9 +3,7 @@
 Near a wall, or where a floor ends, part of the disk around a vertex holds no surface on which
 photons could land, and density estimation over the whole disk comes out dark: a bias that falls
 only in proportion to the radius, while that of curvature falls with its square. A few short probe
-rays estimate the covered share of the disk, by which the estimate is divided. A disk of which they
-find little covered is made smaller first: the faces of boards, legs and frames are narrower than
-disks that suit the room.
+rays estimate the covered share of the disk, by which the estimate is divided.
 """
 
 from __future__ import annotations
@@ -24,21 +22,16 @@ HEIGHT = 0.25
 SMALLEST_SHARE = 0.4
 """Tuned: right at a wall half of the disk is left. Smaller estimates come from clutter that the
 probes meet as often as from corners, and would brighten more than they mend."""
-HALVINGS = 2
-"""Of the radius of a disk that is covered less than that: once, and twice where one probe or none
-has found surface."""
 OWN_STREAM = 0x70726F62
 """Keeps the probes' random numbers apart from those of the camera paths, which share their seed."""
 
 
 @dr.syntax
-def covered_share(scene, vertices, si, radii, seed, active):
-    """Estimated share, in [0.4, 1], of the disk around each vertex that lies on surface seen from
-    just above the vertex and like its own (same tests as for photons), and the number of the disk's
-    radius among the `radii`: that of the first, or halved as often where little of that is covered.
-    Where the surface is curved, so is the disk. `vertices` as of `read_queries`, `si` their surface
+def covered_share(scene, vertices, si, radius, seed, active):
+    """Estimated share, in [0.4, 1], of the disk of `radius` around each vertex that lies on surface
+    seen from just above the vertex and like its own (same tests as for photons). Where the
+    surface is curved, so is the disk. `vertices` as of `read_queries`, `si` their surface
     interactions, found with `gather.FLAGS`; width as theirs."""
-    radius, halvings = mi.Float(radii[0]), mi.UInt32(0)
     normal = mi.Vector3f(dr.mulsign(si.n, -dr.dot(si.n, vertices["ray_d"])))
     bent = bend(si, mi.Frame3f(normal))
     rng = vertex_streams(vertices["path"], vertices["depth"], seed ^ OWN_STREAM)
@@ -53,7 +46,6 @@ def covered_share(scene, vertices, si, radii, seed, active):
     # surface there is no edge, and the others are not made.
     outer = PROBES // 2
     covered, probe = mi.UInt32(0), mi.UInt32(0)
-    most = len(radii) - 1
     while dr.hint(active & (probe < PROBES), label="coverage probes"):
         distance = radius * dr.sqrt((mi.Float(PROBES - 1 - probe) + shift) * (1 / PROBES))
         sine, cosine = dr.sincos(
@@ -79,13 +71,4 @@ def covered_share(scene, vertices, si, radii, seed, active):
         if (probe == outer) & (covered == outer):
             covered = mi.UInt32(PROBES)
             probe = mi.UInt32(PROBES)
-        if dr.hint(most > 0, mode="scalar"):
-            if (probe == PROBES) & (halvings == 0) & (covered < SMALLEST_SHARE * PROBES):
-                halvings = dr.select(covered > 1, mi.UInt32(1), mi.UInt32(most))
-                radius = dr.select(halvings == 1, radii[1], radii[most])
-                turn, shift = rng.next_float32() * dr.two_pi, rng.next_float32()
-                height = dr.minimum(height, HEIGHT * radius)
-                start = si.p + normal * height
-                covered = mi.UInt32(0)
-                probe = mi.UInt32(0)
-    return dr.maximum(mi.Float(covered) * (1 / PROBES), SMALLEST_SHARE), halvings
+    return dr.maximum(mi.Float(covered) * (1 / PROBES), SMALLEST_SHARE)
