@@ -250,9 +250,9 @@ class BDPMSession(PhotonPasses):
             and self.traits.has_light_surfaces
             and meets_one_light(self.scene)
         )
-        parted = self.narrow is not None and self.narrow.parted
+        self.parted = self.narrow is not None and self.narrow.parted
         self.one_vertex = not self.traits.has_mixed and (
-            (integrator.bdd == 0 and self.narrow is None) or not (self.has_caustics or parted)
+            (integrator.bdd == 0 and self.narrow is None) or not (self.has_caustics or self.parted)
         )
 
     @property

@@ -248,7 +248,7 @@ class PhotonPasses(PilotedSession):
     def _merge(self, photon_map, record, kind, radii, spectral, grey=False, weigh=None, scale=1):
         """`gather_photons` of one kind at vertices as of `read_queries`."""
         takes = takes_photons(record, kind)
-        parted = kind == "indirect" and self.narrow is not None and self.narrow.parted
+        parted = kind == "indirect" and self.parted
         vertices = QueryVertices(self.traits, record, spectral["wavelengths"], takes, scale, parted)
         if kind == "seen_caustic":
             radii = [dr.minimum(radius, pixel_disk(record)) for radius in radii]

@@ -8,7 +8,7 @@ part, and paths go on for that of the lobe.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -72,9 +72,13 @@ class NarrowSurfaces:
         return (lookup(self.bsdfs, bsdf, mi.UInt32, active) & PARTED) != 0
 
 
-def even_part(mode=None):
+def even_part():
     """The `mi.BSDFContext` of what a BSDF scatters evenly."""
-    return mi.BSDFContext(mi.TransportMode.Radiance if mode is None else mode, EVEN)
+    return _of_types(EVEN)
+
+
+def _of_types(types):
+    return mi.BSDFContext(mi.TransportMode.Radiance, types)
 
 
 def curves(scene):
@@ -93,19 +97,17 @@ def narrow_bsdfs(scene):
     rough = [b for b in smooth if int(b.flags()) & ~_WITHOUT_LOBES]
     if not rough:
         return None
-    narrow = concentration(rough) > NARROW
-    bits = dict(zip((b.ptr for b in rough), narrow @ (1 << np.arange(len(COSINES)))))
-    both = [b for b in rough if bits[b.ptr] and int(b.flags()) & EVEN]
-    for bsdf, can_be in zip(both, parted(both) if both else []):
-        bits[bsdf.ptr] |= PARTED if can_be else 0
+    looks = look_at(rough)
+    narrow = concentration(looks) > NARROW
+    seen = narrow @ (1 << np.arange(len(COSINES)))
+    seen |= np.where(narrow.any(axis=1) & parted(looks), PARTED, 0)
+    bits = dict(zip((b.ptr for b in rough), seen))
     values = [bits.get(b.ptr, 0) for b in bsdfs]
     return registry_table(bsdfs, mi.BSDFPtr, values, mi.UInt32) if narrow.any() else None
 
 
-_WITHOUT_LOBES = int(
-    mi.BSDFFlags.DiffuseReflection
-    | mi.BSDFFlags.DiffuseTransmission
-    | mi.BSDFFlags.FrontSide
+_WITHOUT_LOBES = EVEN | int(
+    mi.BSDFFlags.FrontSide
     | mi.BSDFFlags.BackSide
     | mi.BSDFFlags.SpatiallyVarying
     | mi.BSDFFlags.Null
@@ -113,36 +115,47 @@ _WITHOUT_LOBES = int(
 """Flags of BSDFs without lobes."""
 
 
-def concentration(bsdfs):
+class Looks(NamedTuple):
+    """What samples of the smooth part of BSDFs find: arrays (BSDFs, angles, samples)."""
+
+    value: np.ndarray
+    """Of the BSDF with its cosine, mean over the channels."""
+    even: np.ndarray
+    """That of its even part, as Mitsuba evaluates it."""
+    lobes: np.ndarray
+    """That of the rest."""
+    weight: np.ndarray
+    """Of the sample."""
+    cosine: np.ndarray
+
+
+def concentration(looks):
     """How unevenly each of the BSDFs f weighs photons that arrive from everywhere alike, at some
     points of its textures: an array (BSDFs, angles) of
 
         pi I[f^2] / I[f]^2,    I[g] = integral of g |cos| over directions,
 
     which is 1 for a diffuse BSDF. So many photons tell as much as one at a diffuse surface. By
-    samples of the BSDF, with p their density and w = f |cos| / p: I[f] = E[w], I[f^2] = E[w f]."""
-    value, weight, cosine = _looked_at(bsdfs, [int(mi.BSDFFlags.Smooth)])
-    f = value[0] / np.maximum(cosine, 0.05)
-    first, second = (x.mean(axis=2) for x in (weight, weight * f))
+    samples of the BSDF (`Looks`), with p their density and w = f |cos| / p: I[f] = E[w], I[f^2] =
+    E[w f]."""
+    f = looks.value / np.maximum(looks.cosine, 0.05)
+    first, second = (x.mean(axis=2) for x in (looks.weight, looks.weight * f))
     return np.pi * second / np.maximum(first, 1e-12) ** 2
 
 
-def parted(bsdfs):
-    """Which of the BSDFs are the sum of two that can be evaluated apart, an even part and lobes:
-    a list. (Some of Mitsuba's evaluate all of themselves, whatever part is asked for.)"""
-    smooth = int(mi.BSDFFlags.Smooth)
-    (value, even, lobes), *_ = _looked_at(bsdfs, [smooth, EVEN, smooth & ~EVEN])
-    error = np.abs(even + lobes - value).max(axis=(1, 2))
-    return [
-        bool(wrong <= ROUNDING * largest and bright > 0)
-        for wrong, largest, bright in zip(error, value.max(axis=(1, 2)), even.max(axis=(1, 2)))
-    ]
+def parted(looks):
+    """Which of the BSDFs are the sum of two that can be evaluated apart, an even part and lobes: an
+    array. (Some of Mitsuba's evaluate all of themselves, whatever part is asked for.)"""
+    error = np.abs(looks.even + looks.lobes - looks.value)
+    largest_error, largest, brightest = (
+        x.max(axis=(1, 2)) for x in (error, looks.value, looks.even)
+    )
+    return (largest_error <= ROUNDING * largest) & (brightest > 0)
 
 
-def _looked_at(bsdfs, parts):
-    """What samples of the smooth part of each BSDF find, arrays (BSDFs, angles, samples): a list
-    with the value (mean over the channels) of each of the `parts` of its types, the weight of the
-    sample, and its cosine."""
+def look_at(bsdfs):
+    """The `Looks` at BSDFs under the angles of the `COSINES`, at some points of their textures. One
+    kernel, for with many BSDFs it takes long to compile."""
     count = len(bsdfs) * len(COSINES) * SAMPLES
     index = dr.arange(mi.UInt32, count)
     bsdf = dr.gather(mi.BSDFPtr, mi.BSDFPtr(bsdfs), index // (len(COSINES) * SAMPLES))
@@ -157,12 +170,15 @@ def _looked_at(bsdfs, parts):
         si.wavelengths = mi.sample_rgb_spectrum(mi.sample_shifted(mi.Float(0.5)))[0]
     choice, u, v, s, t = *sobol(index, mi.UInt32(1), 3), *sobol(index, mi.UInt32(2), 2)
     si.uv = mi.Point2f(s, t)
-    mode = mi.TransportMode.Radiance
-    context = mi.BSDFContext(mode, int(mi.BSDFFlags.Smooth))
-    bs, weight = bsdf.sample(context, si, choice, mi.Point2f(u, v))
-    found = [channel_mean(bsdf.eval(mi.BSDFContext(mode, part), si, bs.wo)) for part in parts]
-    found += [channel_mean(weight), dr.abs(bs.wo.z)]
+    smooth, lobes = int(mi.BSDFFlags.Smooth), int(mi.BSDFFlags.Glossy)
+    bs, weight = bsdf.sample(_of_types(smooth), si, choice, mi.Point2f(u, v))
+    value = channel_mean(bsdf.eval(_of_types(smooth), si, bs.wo))
+    even, others = mi.Float(0), value
+    if any(int(b.flags()) & EVEN for b in bsdfs):
+        even, others = (
+            channel_mean(bsdf.eval(_of_types(types), si, bs.wo)) for types in (EVEN, lobes)
+        )
+    found = [value, even, others, channel_mean(weight), dr.abs(bs.wo.z)]
     dr.eval(found)
     shape = len(bsdfs), len(COSINES), SAMPLES
-    *values, weight, cosine = (np.array(x, np.float64).reshape(shape) for x in found)
-    return values, weight, cosine
+    return Looks(*(np.broadcast_to(np.array(x, np.float64), count).reshape(shape) for x in found))

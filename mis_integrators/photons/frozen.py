@@ -92,7 +92,7 @@ class SurfacePhotons:
         def visit_landing(index, landing, offset, distance_squared, hit, totals):
             photon = self._photon(photon_map.power, index, landing, hit)
             hit &= dr.dot(photon.towards, facing) > 0
-            hit &= dr.dot(photon.normal, facing) > SAME_SURFACE_COSINE
+            hit &= dr.dot(photon.normal, facing) > SAME_SURFACE_COSINE  # both on the lit side
             return visit(photon, hit, totals)
 
         return for_each_photon(photon_map, center, radius, mi.Bool(True), visit_landing, totals)

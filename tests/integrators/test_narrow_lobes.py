@@ -8,16 +8,20 @@ import numpy as np
 import pytest
 from comparing import agree, in_one_thread
 from selection import extended
-from worlds import path
+from worlds import T, diffuse, film, look, path
 
 METAL = {"type": "roughconductor", "material": "Al"}
 FROSTED = {"type": "roughdielectric", "alpha": 0.2}
 
 
+def concentration(bsdfs):
+    return lobes.concentration(lobes.look_at(bsdfs))
+
+
 def test_concentration_of_diffuse_surfaces(variant):
     one = mi.load_dict({"type": "diffuse"})
     both = {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": 0.3}}
-    np.testing.assert_allclose(lobes.concentration([one, mi.load_dict(both)]), 1, rtol=1e-3)
+    np.testing.assert_allclose(concentration([one, mi.load_dict(both)]), 1, rtol=1e-3)
 
 
 def test_concentration_is_an_integral(rgb):
@@ -35,7 +39,7 @@ def test_concentration_is_an_integral(rgb):
         f = np.array(bsdf.eval(mi.BSDFContext(), si, wo)).mean(axis=0) / np.cos(np.array(theta))
         weight = np.sin(np.array(theta)) * np.cos(np.array(theta)) * (dr.pi / 2 / n) * 2 * np.pi
         expected = np.pi * (f * f * weight).sum() / (f * weight).sum() ** 2
-        assert lobes.concentration([bsdf])[0, -1] == pytest.approx(expected, rel=0.15)
+        assert concentration([bsdf])[0, -1] == pytest.approx(expected, rel=0.15)
 
 
 def box(**bsdfs):
@@ -90,11 +94,10 @@ def test_even_parts(variant):
         ({"type": "blendbsdf", "weight": 0.5, "a": matt, "b": smooth}, True),
         ({"type": "principled", "roughness": 0.3, "specular": 0.5}, False),
         (smooth, False),
-        (matt, False),
+        (matt, True),  # the sum of itself and of no lobe
     ]
-    found = lobes.parted([mi.load_dict(bsdf) for bsdf, _ in expected])
-    # A BSDF that is even altogether is the sum of itself and of no lobe.
-    assert found == [even or bsdf is matt for bsdf, even in expected]
+    found = lobes.parted(lobes.look_at([mi.load_dict(bsdf) for bsdf, _ in expected]))
+    assert list(found) == [even for _, even in expected]
 
 
 def test_the_table_has_all_surfaces(rgb):
@@ -182,49 +185,50 @@ def test_means(rgb, bdd, more):
     agree(integrator, path(**settings), scene, block=0.08)
 
 
+def variance(scene, **parameters):
+    """Of the pixels by `bdpm` with `bdd` 0, mean over the image."""
+    integrator = mi.load_dict({"type": "bdpm", "bdd": 0, **parameters})
+    images = [
+        np.array(mi.render(scene, integrator=integrator, spp=4, seed=seed)) for seed in range(8)
+    ]
+    return np.var(images, axis=0, ddof=1).mean()
+
+
 @in_one_thread
 def test_no_noise_of_even_parts(rgb, monkeypatch):
     """A coated floor seen at a grazing angle, below a ceiling that one small spot lights: photons
     bring what the floor scatters evenly. A twentieth of the variance, at the most, of paths that go
     on for all of it. (The seeds are fixed.)"""
-    T = mi.ScalarTransform4f
-    scene = {
-        "type": "scene",
-        "floor": {
-            "type": "rectangle",
-            "to_world": T().scale(4),
-            "bsdf": {"type": "roughplastic", "alpha": 0.1, "diffuse_reflectance": 0.5},
-        },
-        "ceiling": {
-            "type": "rectangle",
-            "to_world": T().translate([0, 0, 1]).rotate([1, 0, 0], 180).scale(4),
-            "bsdf": {"type": "diffuse", "reflectance": 0.8},
-        },
-        "lamp": {
-            "type": "spot",
-            "to_world": T().look_at([0, 0, 0.1], [0, 0, 1], [0, 1, 0]),
-            "cutoff_angle": 8.0,
-            "intensity": 10.0,
-        },
-        "sensor": {
-            "type": "perspective",
-            "fov": 10,
-            "to_world": T().look_at([0, -3, 0.9], [0, 0, 0], [0, 0, 1]),
-            "film": {"type": "hdrfilm", "width": 24, "height": 24, "rfilter": {"type": "box"}},
-        },
-    }
-    scene = mi.load_dict(scene)
-
-    def variance():
-        integrator = mi.load_dict({"type": "bdpm", "bdd": 0, "initial_radius": 0.1})
-        images = [
-            np.array(mi.render(scene, integrator=integrator, spp=4, seed=seed)) for seed in range(8)
-        ]
-        return np.var(images, axis=0, ddof=1).mean()
-
-    less = variance()
-    monkeypatch.setattr(lobes, "parted", lambda bsdfs: [False] * len(bsdfs))
-    assert less < 0.05 * variance()
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "floor": {
+                "type": "rectangle",
+                "to_world": T().scale(4),
+                "bsdf": {"type": "roughplastic", "alpha": 0.1, "diffuse_reflectance": 0.5},
+            },
+            "ceiling": {
+                "type": "rectangle",
+                "to_world": T().translate([0, 0, 1]).rotate([1, 0, 0], 180).scale(4),
+                "bsdf": diffuse(0.8),
+            },
+            "lamp": {
+                "type": "spot",
+                "to_world": look((0, 0, 0.1), (0, 0, 1)),
+                "cutoff_angle": 8.0,
+                "intensity": 10.0,
+            },
+            "sensor": {
+                "type": "perspective",
+                "fov": 10,
+                "to_world": look((0, -3, 0.9), (0, 0, 0), (0, 0, 1)),
+                "film": film(24),
+            },
+        }
+    )
+    less = variance(scene, initial_radius=0.1)
+    monkeypatch.setattr(lobes, "parted", lambda looks: np.zeros(len(looks.value), bool))
+    assert less < 0.05 * variance(scene, initial_radius=0.1)
 
 
 @in_one_thread
@@ -236,12 +240,5 @@ def test_no_dots_on_smooth_metal(rgb):
     scene["sensor"]["fov"] = 15
     scene["sensor"]["film"] = {"type": "hdrfilm", "width": 24, "height": 24}
     scene = mi.load_dict({k: v for k, v in scene.items() if k not in ("small-box", "large-box")})
-
-    def variance(**parameters):
-        integrator = mi.load_dict({"type": "bdpm", "bdd": 0, "initial_radius": 0.05, **parameters})
-        images = [
-            np.array(mi.render(scene, integrator=integrator, spp=4, seed=seed)) for seed in range(8)
-        ]
-        return np.var(images, axis=0, ddof=1).mean()
-
-    assert variance() < 0.2 * variance(pass_narrow=False)
+    passed = variance(scene, initial_radius=0.05)
+    assert passed < 0.2 * variance(scene, initial_radius=0.05, pass_narrow=False)
