@@ -133,7 +133,7 @@ def test_depth_is_that_of_volpath(rgb, max_depth, bdd):
 
 METAL = {"type": "roughconductor", "material": "Al", "alpha": 0.08}
 MATT = {"type": "diffuse", "reflectance": 0.7}
-COATED = {"type": "blendbsdf", "weight": 0.7, "a": MATT, "b": {**METAL, "alpha": 0.05}}
+COATED = {"type": "blendbsdf", "weight": 0.3, "a": MATT, "b": {**METAL, "alpha": 0.03}}
 
 
 @pytest.mark.parametrize(
