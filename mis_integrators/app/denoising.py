@@ -24,6 +24,8 @@ AROUND = 25
 """Tuned: width in pixels of the windows whose mean the variance of a pixel is not below."""
 HIGHLIGHTS = 25
 """Tuned: width in pixels of the windows whose brightest pixel no denoised one is above."""
+LUMINANCE = np.array([0.212671, 0.715160, 0.072169], dtype=np.float32)
+"""Of linear sRGB (ITU-R BT.709), as in images of the format `luminance`."""
 MISSING = "denoising needs mitsuba-oidn: pip install 'mis-integrators[denoise]'"
 
 
@@ -105,8 +107,9 @@ def denoise(
     Parameters
     ----------
     image : (height, width) or (height, width, channels), array or tensor
-        Linear radiance. Three channels or more: the first three are the colour; fewer: the first
-        one is. All others stay as they are. Values that are negative or not finite count as zero.
+        Linear radiance. The colour is what the `channels` name so; without names, of three channels
+        or more the first three, of fewer the first one. All others stay as they are. Values that
+        are negative or not finite count as zero.
     scene, sensor
         What the image shows: albedo and normals of what the camera sees are then made from it, and
         keep edges and textures sharp. `sensor`: one of the scene's, or its number.
@@ -128,7 +131,7 @@ def denoise(
         Without the package ``mitsuba-oidn``.
     ValueError
         If the image has another shape, another size than the sensor's film, or another number of
-        channels than are named.
+        channels than are named, or the scene has no such sensor.
     """
     require()  # before anything is traced
     pixels = np.array(image, dtype=np.float32)
@@ -138,7 +141,13 @@ def denoise(
         raise ValueError(f"{len(channels)} names of channels for an image of shape {pixels.shape}")
     guides: Sequence[np.ndarray] = ()
     if scene is not None:
-        sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+        if isinstance(sensor, int):
+            sensors = scene.sensors()
+            if not 0 <= sensor < len(sensors):
+                raise ValueError(
+                    f"the scene has {len(sensors)} sensors, and none of number {sensor}"
+                )
+            sensor = sensors[sensor]
         size = tuple(int(edge) for edge in sensor.film().crop_size())
         if size != pixels.shape[1::-1]:
             raise ValueError(
@@ -147,19 +156,25 @@ def denoise(
             )
         guides = albedo_and_normal(scene, sensor, hide_emitters=hide_emitters)
     planes = pixels[..., None] if pixels.ndim == 2 else pixels
-    colours = planes[..., : 3 if planes.shape[2] >= 3 else 1]
+    first = list(range(3 if planes.shape[2] >= 3 else 1))
+    names = picture_channels(channels) if channels else None
+    where = [channels.index(name) for name in names] if names else first
+    colours = planes[..., where]
     finite = np.maximum(np.nan_to_num(colours, nan=0, posinf=0, neginf=0), 0)
     split = planes[..., :0]
     if set(direct_channels()) <= set(channels):
         split = planes[..., [channels.index(name) for name in direct_channels()]]
     if split.any():  # `volpath_multiview` has these channels, and nothing in them
         *direct, variance = np.moveaxis(split, -1, 0)
-        light = np.clip(np.stack(direct[: colours.shape[2]], axis=-1), 0, finite)
+        seen = np.stack(direct, axis=-1)
+        if len(where) == 1:
+            seen = seen @ LUMINANCE[:, None]
+        light = np.clip(seen, 0, finite)
         found = shrunk(light, without_noise(light, guides), variance)
         found += without_noise(finite - light, guides, all_edges=True)
-        colours[...] = np.maximum(no_brighter(found, finite), 0)
+        planes[..., where] = np.maximum(no_brighter(found, finite), 0)
     else:
-        colours[...] = no_brighter(without_noise(finite, guides), finite)
+        planes[..., where] = no_brighter(without_noise(finite, guides), finite)
     return pixels
 
 

@@ -38,7 +38,7 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     where they are wrong."""
     parser = argparse.ArgumentParser(
         prog="mis-render",
-        description="Render a Mitsuba scene to an EXR file, and a tone-mapped PNG beside it.",
+        description="Render a Mitsuba scene to an EXR file, and a PNG beside it (sRGB, cut at 1).",
         epilog=_EXIT_CODES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )

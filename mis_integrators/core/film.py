@@ -206,18 +206,13 @@ class Accumulator:
         self,
         film,
         with_variance,
-        technique_channels=0,
         stratified=False,
         class_channels=0,
         denoised=False,
     ):
-        self.film, self.with_variance, self.technique_channels, self.stratified = (
-            film,
-            with_variance,
-            technique_channels,
-            stratified,
-        )
+        self.film, self.with_variance, self.stratified = film, with_variance, stratified
         self.class_channels, self.denoised = class_channels, denoised
+        self.technique_channels = 0
         self.sums = Sums(mi.TensorXd)
 
     @property

@@ -16,24 +16,26 @@ class UnsupportedScene(ValueError):
     """A scene that an integrator cannot render; the message names the integrator and the reason."""
 
 
+def children(parent, kind):
+    """Objects of a class that `parent` holds itself, in its order."""
+
+    class Collector(mi.TraversalCallback):  # of the active variant
+        def put(self, name, value, *flags):
+            if isinstance(value, kind):
+                found.append(value)
+
+    found: list = []
+    parent.traverse(Collector())
+    return found
+
+
 def scene_objects(root):
     """Every Mitsuba object below `root` (shapes, nested BSDFs, emitters, media, films, ...), each
     once."""
 
-    class Collector(mi.TraversalCallback):
-        def __init__(self):
-            super().__init__()
-            self.found = []
-
-        def put(self, name, value, *flags):
-            if isinstance(value, mi.Object):
-                self.found.append(value)
-
     pending, seen = [root], {}
     while pending:
-        collector = Collector()
-        pending.pop().traverse(collector)
-        for child in collector.found:
+        for child in children(pending.pop(), mi.Object):
             if child.ptr not in seen:
                 seen[child.ptr] = child
                 pending.append(child)

@@ -45,13 +45,14 @@ class BDPM(IterativeIntegrator):
          (Default: 1)
      * - pass_narrow
        - |bool|
-       - Whether paths pass surfaces with narrow lobes, as of smooth metal or frosted glass, and
-         curves, without gathering photons there, but for caustic ones; ``bdd`` does not count them
-         then. (Default: yes, i.e. |true|)
+       - Whether camera paths go on through surfaces with narrow lobes, as of smooth metal or
+         frosted glass, and curves. Only caustic photons are gathered there, and ``bdd`` does not
+         count these vertices. Of a coat on a diffuse base, photons make the base's light.
+         (Default: yes, i.e. |true|)
      * - photon_count
        - |int|
-       - Light sub-paths an iteration; 0 stands for as many as the cropped film has pixels, or with
-         an automatic radius for that share of them which pays. (Default: 0)
+       - Light sub-paths an iteration; 0 stands for as many as the cropped film has pixels. With an
+         automatic radius the pilot may choose fewer, down to a thirty-second. (Default: 0)
      * - initial_radius
        - |float|
        - Merge radius of the first iteration, in scene units; 0 balances noise against blur in a
@@ -64,9 +65,9 @@ class BDPM(IterativeIntegrator):
          (i + 1)^(alpha - 1). 1 keeps the radius. (Default: 1)
      * - direct_paths
        - |int|
-       - Camera paths per pixel and iteration that see emission and direct light at their first
-         smooth vertex, those that gather photons among them. 0 sends more of them through pixels
-         where such light is noisy, as a few trials tell. (Default: 0)
+       - Camera paths that see emission and direct light at their first smooth vertex, for each of
+         the ``camera_paths`` of a pixel, which are among them; from 0 to 256. 0 chooses the number
+         for each pixel by the noise of such light, from a few trials. (Default: 0)
      * - denoised
        - |bool|
        - Whether the image will be denoised: what is chosen automatically then minimises the error
@@ -118,9 +119,10 @@ class BDPM(IterativeIntegrator):
     each for one pixel, but for those very close to it. Camera paths go straight through media to
     the first smooth surface then.
 
-    The estimate is consistent: its bias vanishes with the radius (but for that of photons very
-    close to the sensor). Polarised variants, gradients, the film ``specfilm``, media of flakes and
-    the BSDF ``hair`` are refused by name.
+    The bias vanishes with the radius (but for that of photons very close to the sensor): with
+    ``alpha`` below 1 the estimate is consistent; with the default the radius stays as it is.
+    Polarised variants, gradients, the film ``specfilm``, the BSDF ``hair`` and the phase function
+    ``sggx`` as part of another one are refused by name.
 
     .. tabs::
         .. code-tab:: xml

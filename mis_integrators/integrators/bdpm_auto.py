@@ -26,16 +26,18 @@ class BDPMAuto(IterativeIntegrator):
 
      * - camera_paths
        - |int|
-       - As of :monosp:`bdpm`; 0 stands for one, for ``path`` and in media for as many as keep the
-         machine busy. (Default: 0)
+       - As of :monosp:`bdpm`; 0 stands for one. Without a number of samples (``--time``), ``path``
+         and, in media, ``volpath_multiview`` take as many as keep the machine busy. (Default: 0)
      * - denoised, variance, aovs, max_depth, rr_depth, hide_emitters, sampler
        -
        - As of :monosp:`bdpm`.
 
     Chooses between ``path`` and a photon mapper: ``bdpm`` with ``bdd`` 0, or 1 in renders that will
     be denoised. The photon mapper runs its pilot; a few samples of ``path`` on the same pixels tell
-    what that would bring in the same time. What an iteration costs is counted (segments, photons)
-    and priced, not clocked. Where ``path`` cannot see all the light of the scene, it is not tried.
+    what that would bring in the same time. In a render of a given time, the clock tells what an
+    iteration costs; of a given number of samples, counted events (segments, photons) do, so that
+    the choice is the same on all machines. Where ``path`` cannot see all the light of the scene, it
+    is not tried.
     In scenes with media the two are ``volpath_multiview``, with one view, and ``bdpm`` with the
     same ``bdd``. Photons are not tried there where light sub-paths leave few of them, nor in media
     of grids.

@@ -45,7 +45,8 @@ class BDPMOpt(WeightedBDPM):
      * - strategies
        - |int|
        - How many strategies are mixed: photons are merged at the camera vertices ``first_vertex``,
-         ``first_vertex`` + 1, ... (vertices that scatter smoothly, counted from 0). (Default: 3)
+         ``first_vertex`` + 1, ... (vertices that scatter smoothly, counted from 0). From 1 to 6;
+         ``bdpm_opt2`` and ``bdpm_opt3`` have 2 and 3. (Default: 3)
      * - first_vertex
        - |int|
        - The first camera vertex at which photons are merged, from 0 to 16. (Default: 0)
@@ -60,7 +61,7 @@ class BDPMOpt(WeightedBDPM):
        - Whether strategies go on beyond vertices that scatter as Lambertians do; else a path's
          first Lambertian vertex is its last strategy. It makes iterations less noisy and
          longer. Images that will be ``denoised`` have it unless it is given, and published weights
-         know nothing else. (Default: no, i.e. |false|)
+         always have it. (Default: no, i.e. |false|)
      * - frozen_photons
        - |int|
        - Light sub-paths of the pass from which the weights learn where light is; they do not

@@ -94,8 +94,8 @@ class BDPT(IterativeIntegrator):
 
     Unbiased, without any parameter to choose. In participating media all techniques work as on
     surfaces, and boundaries with the BSDF ``null`` do not count as segments, as in ``volpath``.
-    Media of flakes, the BSDF ``hair``, polarised variants, gradients and the film ``specfilm`` are
-    refused by name.
+    The phase function ``sggx`` as part of another one, the BSDF ``hair``, polarised variants,
+    gradients and the film ``specfilm`` are refused by name.
 
     .. tabs::
         .. code-tab:: xml

@@ -72,7 +72,7 @@ class BDPTRIS(ResampledIntegrator):
      * - weights
        - |string|
        - ``bounded``: pmfs that also hold light which a cache point does not see, and an estimate of
-         each connection's weight; weights that take a draw for one to two connections.
+         each connection's weight; weights that count each draw as one to two connections.
          ``published``: pmfs and weights as Nabata et al. have them, without any bound. (Default:
          ``bounded``)
      * - light_tracing
@@ -135,9 +135,10 @@ class BDPTRIS(ResampledIntegrator):
     connections were resampled (Nabata, Iwasaki and Dobashi 2020). Unbiased, but for the bias of
     ``merging``, which vanishes with the radius.
 
-    In participating media vertices are drawn, joined and merged as on surfaces; media of flakes and
-    the value ``published`` of ``weights`` are refused there. The BSDF ``hair``, polarised variants,
-    gradients and the film ``specfilm`` are refused by name.
+    In participating media vertices are drawn, joined and merged as on surfaces; the value
+    ``published`` of ``weights`` is refused there, and so is the phase function ``sggx`` as part of
+    another one. The BSDF ``hair``, polarised variants, gradients and the film ``specfilm`` are
+    refused by name.
 
     .. tabs::
         .. code-tab:: xml

@@ -193,6 +193,17 @@ class IterativeIntegrator(mi.AdjointIntegrator):
             )
         return iterations
 
+    def samples_wanted(self, spp, sensors):
+        """`spp`, or where that is 0 the most samples per pixel that the samplers of these sensors
+        ask for. Raises `ValueError` for none, or fewer."""
+        wanted = spp or max((sensor.sampler().sample_count() for sensor in sensors), default=1)
+        if wanted < 1:
+            raise ValueError(
+                f"{self.plugin}: {wanted} samples per pixel are not possible; give spp, or the "
+                'sampler a "sample_count", of at least 1'
+            )
+        return wanted
+
     def say_rounded(self, session, spp):
         """Warns where a session of `spp` samples per pixel makes more of them."""
         iterations, camera_paths = session.iterations_planned, session.camera_paths
@@ -246,7 +257,7 @@ class IterativeIntegrator(mi.AdjointIntegrator):
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
         with dr.suspend_grad():
             sensor = self._sensor(scene, sensor)
-            spp = spp or sensor.sampler().sample_count()
+            spp = self.samples_wanted(spp, [sensor])
             session = self.session(scene, sensor, seed, spp)
             self.say_rounded(session, spp)
             self.say_sampler([sensor])

@@ -13,6 +13,7 @@ import numpy as np
 from ..core.clock import now
 from ..core.film import splat_samples
 from ..core.packing import from_numpy
+from ..core.recording import lanes
 from ..core.sequences import SampleSequence
 from ..core.spectra import channel_mean
 from ..paths.camera import film_sample_count, film_size
@@ -113,7 +114,7 @@ class DirectLight:
                 error = error.variance + error.squared_bias * iterations
                 cost = self._cost_of_path()
                 most = min(self.session.most_cost, LARGEST)
-                self._beside = Beside(light, float(error), float(iterations), cost, most)
+                self._beside = Beside(max(light, 0.0), float(error), float(iterations), cost, most)
             self.choose_paths()
         found, errors = self.measured(), {}
         for name, weigh in MEASURES.items():
@@ -184,24 +185,24 @@ class DirectLight:
         return self._lists
 
     def _split(self, counts):
-        """The paths in parts of equal size: pixel of each, its number there, and the pixel's count.
-        The last part is filled up with paths of no pixel."""
-        total = int(counts.sum())
-        pixel = np.repeat(np.arange(len(counts), dtype=np.uint32), counts)
-        first = np.cumsum(counts) - counts
-        number = np.arange(total) - first[pixel]
+        """The paths, by pixels, in parts of equal size: the pixel of each path and the part's place
+        among all, and of each pixel its first path and its count. The last part is filled up with
+        paths of no pixel."""
+        ends = np.cumsum(counts)
+        total, first = int(ends[-1]), ends - counts
         parts = -(-total // LARGEST_PART)
         size = -(-total // parts)
-        missing = parts * size - total
-        pixel = np.pad(pixel, (0, missing), constant_values=len(counts))
-        number, of_pixel = (np.pad(x, (0, missing)) for x in (number, counts[pixel[:total]]))
-        return [
-            tuple(
-                from_numpy(mi.UInt32, x[k * size : (k + 1) * size].astype(np.uint32))
-                for x in (pixel, number, of_pixel)
-            )
-            for k in range(parts)
-        ]
+        tables = [from_numpy(mi.UInt32, x.astype(np.uint32)) for x in (first, counts)]
+        found = []
+        for start in range(0, parts * size, size):
+            stop = min(start + size, total)
+            low = int(np.searchsorted(ends, start, "right"))
+            high = int(np.searchsorted(ends, stop - 1, "right")) + 1
+            here = np.minimum(ends[low:high], stop) - np.maximum(first[low:high], start)
+            pixel = np.repeat(np.arange(low, high, dtype=np.uint32), here)
+            pixel = np.pad(pixel, (0, size - len(pixel)), constant_values=len(counts))
+            found.append((from_numpy(mi.UInt32, pixel), dr.opaque(mi.UInt32, start), *tables))
+        return found
 
     def _arguments(self, part, iteration, spectral):
         session = self.session
@@ -219,8 +220,11 @@ class DirectLight:
     def _trace(self, sensor, sequence, done, part, spectral):
         """Radiance, alpha, position for splatting, and whether there is a path. Light that is not
         finite counts as none: the paths that gather meet its cause, too, and tell of it."""
-        pixel, number, of_pixel = part
+        pixel, place, first, counts = part
         session = self.session
+        there = pixel < film_sample_count(sensor)
+        number = lanes(dr.width(pixel)) + place - dr.gather(mi.UInt32, first, pixel, there)
+        of_pixel = dr.gather(mi.UInt32, counts, pixel, there)
         camera_pass = CameraPass(
             sensor,
             session.integrator,
@@ -237,7 +241,7 @@ class DirectLight:
             shown &= alpha > 0
         radiance = dr.select(shown, radiance, 0)
         dr.eval(radiance, alpha, position)  # the same kernel for `noise` and for images
-        return radiance, alpha, position, pixel < film_sample_count(sensor)
+        return radiance, alpha, position, there
 
     def _grey(self, scene, sensor, tables, sequence, done, part, spectral):
         radiance, _, _, there = self._trace(sensor, sequence, done, part, spectral)

@@ -100,8 +100,12 @@ def with_merged(radiance, entries, parts, z, active, paths: int):
     dr.scatter_reduce(dr.ReduceOp.Add, total, sum(others, merged), z["path"], active)
     if others:
         names = [f"merged.{name}" for name in CLASSES]
-        classes = LightClasses(paths, entries, names)
+        classes = LightClasses(paths, None, names)
         for number, (name, part) in enumerate(zip(names, parts)):
             classes.add(name, z["path"], mi.UInt32(number), part, active)
-        entries = classes.entries
+        before = entries or {}
+        entries = before | {
+            name: before[name] + entry if name in before else entry
+            for name, entry in classes.entries.items()
+        }
     return total, entries

@@ -51,9 +51,10 @@ class VCM(BDPT):
     by Veach's heuristic, with the density of merges as Georgiev et al. 2012 have it, which takes
     each light sub-path for a sample of its own.
 
-    Consistent: the bias of merging vanishes with the radius. In participating media vertices are
-    joined and merged as on surfaces, within balls of four times the radius. Media of flakes, the
-    BSDF ``hair``, polarised variants, gradients and the film ``specfilm`` are refused by name.
+    The bias of merging vanishes with the radius: consistent where ``alpha`` is below 1. In
+    participating media vertices are joined and merged as on surfaces, within balls of four times
+    the radius. The phase function ``sggx`` as part of another one, the BSDF ``hair``, polarised
+    variants, gradients and the film ``specfilm`` are refused by name.
 
     .. tabs::
         .. code-tab:: xml

@@ -93,9 +93,9 @@ class VolpathMultiview(IterativeIntegrator):
        - Hide directly visible emitters. (Default: no, i.e. |false|)
      * - sampler
        - |string|
-       - Random numbers of sub-paths: ``sobol``, scrambled Sobol' sequences, one a pixel over all
-         iterations; or ``independent``. The scene's ``<sampler>`` is not used but for its sample
-         count. (Default: ``sobol``)
+       - Random numbers of sub-paths: ``sobol``, scrambled Sobol' sequences, two a pixel, one over
+         all even and one over all odd iterations; or ``independent``. The scene's ``<sampler>`` is
+         not used but for its sample count. (Default: ``sobol``)
 
     The views are the children of a ``batch`` sensor, side by side on its film, or one sensor, or
     any list of sensors through ``mis_integrators.render_views``. Each view's camera paths are
@@ -543,7 +543,8 @@ def render_views(scene, integrator=None, spp=0, seed=0):
     `integrator` is a `volpath_multiview` (default: the scene's own if it is one, else one with its
     default parameters), `spp` the samples per pixel (0: the most that a sensor's sampler asks for).
     Returns a list of tensors (height, width, channels), one a view, as each view's film develops
-    it; films may differ in size. Raises `UnsupportedScene` for what cannot be rendered.
+    it; films may differ in size. Raises `UnsupportedScene` for what cannot be rendered, and
+    `ValueError` for a negative `spp`.
     """
     if integrator is None:
         own = scene.integrator()
@@ -556,7 +557,7 @@ def render_views(scene, integrator=None, spp=0, seed=0):
             f"{integrator.class_name()}"
         )
     with dr.suspend_grad():
-        spp = spp or max((sensor.sampler().sample_count() for sensor in scene.sensors()), default=1)
+        spp = integrator.samples_wanted(spp, scene.sensors())
         session = integrator.views_session(scene, seed, spp)
         integrator.say_rounded(session, spp)
         integrator.say_sampler(session.views.groups)

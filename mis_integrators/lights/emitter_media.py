@@ -102,7 +102,9 @@ def media_at_emitters(lights, beyond, plugin):
         if shape is not None and shape.is_medium_transition():
             numbers.append(number_of(shape.exterior_medium()))
             continue
-        rng = streams(dr.arange(mi.UInt32, WALKS), mi.UInt32(index))
+        rng = streams(
+            dr.arange(mi.UInt32, WALKS), dr.opaque(mi.UInt32, index)
+        )  # one kernel for all
         ray, _ = emitter.sample_ray(0, 0.5, next_2d(rng), next_2d(rng))
         ray = mi.Ray3f(ray)
         dr.eval(ray)

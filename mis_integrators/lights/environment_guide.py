@@ -54,6 +54,9 @@ AIMED_SHARE = 0.5
 """Tuned: share of the directions of direct light that are aimed at the entrances, if any are."""
 WORTH_AIMING = 0.9
 """Tuned: none are if that leaves more than this of the noise."""
+JUMP = -1.37e-4
+"""Third coordinate of the directions where the axes across them jump, see `_across`: few lights have
+just that."""
 FOCUS_TAIL = 0.01
 """Tuned: share of the records' weight that may lie outside the focus, at each end of each axis."""
 
@@ -84,6 +87,18 @@ def cell_direction(cell, sample):
     sin_phi, cos_phi = dr.sincos(phi)
     radius = dr.safe_sqrt(1 - z * z)
     return mi.Vector3f(radius * cos_phi, radius * sin_phi, z)
+
+
+def _across(towards):
+    """Two unit vectors across a direction and each other (Duff et al. 2017, Building an orthonormal
+    basis, revisited). As `mi.Frame3f`, but that jumps where z changes its sign, and strategies
+    round the direction of a sun, of which a coordinate often is zero, to either side."""
+    x, y, z = towards
+    sign = dr.select(z > JUMP, mi.Float(1), -1)
+    a = -dr.rcp(sign + z)
+    b = x * y * a
+    s = mi.Vector3f(1 + sign * dr.square(x) * a, sign * b, -sign * x)
+    return s, mi.Vector3f(b, sign + dr.square(y) * a, -y)
 
 
 def _weighted_box(points, weights, tail):
@@ -198,7 +213,7 @@ class EnvironmentGuide:
     def __init__(self, scene, sensor):
         box = scene_bounds(scene)
         low, high = np.array(box.min).ravel(), np.array(box.max).ravel()
-        self._set_sphere((low + high) / 2, max(np.linalg.norm(high - low) / 2, 1e-3))
+        self._set_sphere((low + high) / 2, np.linalg.norm(high - low) / 2 or 1.0)
         self.scene = scene
         self.infinite = infinite_emitters(scene)
         first_rows, row = np.zeros(len(scene.emitters()), dtype=np.uint32), 0
@@ -459,9 +474,9 @@ class EnvironmentGuide:
     def _position_cell(self, towards, p):
         """Cell of the focus grid that a line along `towards` through `p` crosses, and whether it
         crosses the grid."""
-        frame = mi.Frame3f(towards)
+        s, t = _across(towards)
         offset = (p - self.focus_center) * (1 / self.focus_radius)
-        u, v = dr.dot(offset, frame.s), dr.dot(offset, frame.t)
+        u, v = dr.dot(offset, s), dr.dot(offset, t)
         return square_cell(0.5 * (u + 1), 0.5 * (v + 1), POSITION_CELLS), (dr.abs(u) <= 1) & (
             dr.abs(v) <= 1
         )
@@ -498,7 +513,7 @@ class EnvironmentGuide:
         second pair of uniform numbers, or None) places the origin inside its cell, else `sample`'s
         own leftover digits do.
         """
-        frame = mi.Frame3f(towards)
+        s, t = _across(towards)
         guided = dr.gather(mi.Float, self._guided, row, active)
         use_grid = extra < guided
         cells = POSITION_CELLS**2
@@ -506,11 +521,9 @@ class EnvironmentGuide:
         u, v = in_square_cell(
             cell, mi.Point2f(leftover, sample.y) if jitter is None else jitter, POSITION_CELLS
         )
-        on_grid = self.focus_center + self.focus_radius * (
-            (2 * u - 1) * frame.s + (2 * v - 1) * frame.t
-        )
+        on_grid = self.focus_center + self.focus_radius * ((2 * u - 1) * s + (2 * v - 1) * t)
         disk = mi.warp.square_to_uniform_disk_concentric(sample)
-        on_disk = self.center + self.radius * (disk.x * frame.s + disk.y * frame.t)
+        on_disk = self.center + self.radius * (disk.x * s + disk.y * t)
         if self.portals is not None:
             enters = ~use_grid & (extra < guided + self._entering_share(towards, row, active))
             on_disk = dr.select(

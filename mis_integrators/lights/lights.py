@@ -48,10 +48,9 @@ class Lights:
         self.scene = scene
         # Mitsuba loads a scene's objects in parallel, in no fixed order; random numbers must not
         # depend on it.
-        order = sorted(
-            range(len(scene.emitters())), key=lambda i: _invariant_key(scene.emitters()[i])
-        )
-        self.emitters = [scene.emitters()[i] for i in order]
+        emitters = list(scene.emitters())
+        order = sorted(range(len(emitters)), key=lambda i: _invariant_key(emitters[i]))
+        self.emitters = [emitters[i] for i in order]
         self.order = mi.UInt32(order)
         self.guide = guide
         self.has_textured = any(is_textured_area(e) for e in self.emitters)

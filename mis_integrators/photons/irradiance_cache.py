@@ -38,6 +38,8 @@ LARGEST_SHARE = 0.2
 INDEX_BITS = 23
 MOST_LIGHTS = 64
 """Tuned: emitters tried as the strongest of a cell."""
+MOST_EMITTERS = 127 << 7
+"""Numbers of emitters that `_pack_light` has room for."""
 DIRECT_SAMPLES = 32
 """Tuned: samples of next-event estimation at a cell, by which its noise is estimated."""
 UNSEEN_NOISE = 200.0
@@ -244,15 +246,16 @@ class IrradianceCache:
         near = [
             i
             for i, kind in enumerate(lights.kinds)
-            if kind in ("point", "spot", "area", "directional")
+            if kind in ("point", "spot", "area", "directional") and i < MOST_EMITTERS
         ]
         si = self._facing_surface(self.center, self.facing)
         near.sort(key=lambda index: -lights.choice.pmf[index])
         for index in near[:MOST_LIGHTS]:
-            ds, value = lights.unoccluded(si, mi.UInt32(index), mi.Bool(True))
+            number = dr.opaque(mi.UInt32, index)  # one kernel for all
+            ds, value = lights.unoccluded(si, number, mi.Bool(True))
             value *= _cosine(ds.d, self.facing)
             value *= self._let_through(scene, si.spawn_ray_to(ds.p), value > 0)
-            light = dr.select(value > best, mi.UInt32(index), light)
+            light = dr.select(value > best, number, light)
             best = dr.maximum(best, value)
             dr.eval(best, light)
         return light, dr.select(best > 0, dr.minimum(direct / dr.maximum(best, 1e-30), 2), 0)
@@ -351,7 +354,8 @@ def _typical(flux):
 
 
 def _pack_light(light, visible_share):
-    """An emitter's number (14 bits) and a number in [0, 2] in the bits of an ordinary float32."""
+    """An emitter's number (below `MOST_EMITTERS`) and a number in [0, 2] in the bits of an ordinary
+    float32."""
     return bits_float(
         mi.UInt32(1 << 30) | (light << 16) | mi.UInt32(dr.round(visible_share * 32767))
     )

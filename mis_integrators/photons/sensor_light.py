@@ -12,9 +12,10 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from ..core.packing import read_mark
-from ..core.random import next_2d, vertex_streams
+from ..core.packing import float_bits, read_mark
+from ..core.random import next_2d, streams
 from ..core.recording import lanes
+from ..core.sequences import hash_bits
 from ..paths.media import phase_of_photons, transmitted
 from ..paths.vertex import Sides
 from .photon import read_power
@@ -58,7 +59,10 @@ def join_photons(world, limits, lens, zone, photons, seed, wavelengths, marked):
     landing = landing_of(record)
     active &= ~zone.holds(landing.p)
     index = lanes(dr.width(record["word"]))
-    rng = vertex_streams(index, mi.UInt32(0), seed)
+    own = mi.UInt32(0)  # not by its place in the buffer, which chance decides
+    for coordinate in landing.p:
+        own = hash_bits(own + float_bits(coordinate))
+    rng = streams(own, seed)
     aperture = next_2d(rng) if lens.sensor.needs_aperture_sample() else mi.Point2f(0.5)
     time = mi.Float(lens.sensor.shutter_open())
     d, distance, film, density, active = lens.connect(landing.p, time, aperture, active)

@@ -7,18 +7,16 @@ estimates the light that is scattered there: fluence times the scattering coeffi
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
 from ..core.packing import DEPTH_BITS, MAX_DEPTH, pack_direction, with_mark
+from ..core.recording import lanes
 from ..core.records import Layout
-from .grid import Grid, Table, sort_by_cell
+from .grid import Grid, Table, places_before, sort_by_cell
 from .light_cells import flux_of
 from .photon import power_layout
-
-Array = Any
 
 CELL = 2.0
 """Tuned: edge of a cell of the grid, in radii; at least."""
@@ -88,7 +86,7 @@ def landing_of(record):
 
 def read_places(place, count):
     """The records of all photons of a buffer, and which of them are photons."""
-    index = dr.arange(mi.UInt32, place_layout().capacity(place))
+    index = lanes(place_layout().capacity(place))
     active = index < dr.gather(mi.UInt32, count, 0)
     return place_layout().read(place, index, active), active
 
@@ -183,8 +181,7 @@ def build_volume_map(place, power, count, radius, capacity: int, mis_words=None,
     sorted_power = power_layout().move(power, index, target, active)
     number = None
     if mis_words is not None:
-        number = dr.empty(mi.UInt32, capacity)
-        dr.scatter(number, index, target, active)
+        number = places_before(target, active)
     dr.eval(sorted_place, sorted_power, number)
     return VolumeMap(box, grid, start, sorted_place, sorted_power, mis_words, number)
 

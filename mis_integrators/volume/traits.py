@@ -18,9 +18,9 @@ from ..lights.environment_guide import infinite_emitters
 
 
 class VolumeTraits(MediaTraits):
-    """Attributes: those of `MediaTraits`, `has_infinite_lights`, `has_delta` (specular reflection
-    or refraction), `has_mixed` (smooth and specular parts in one BSDF), `has_masks` (BSDFs that
-    ignore the component mask), `shares` (see `density_share`, by the media's registry numbers)."""
+    """Attributes: those of `MediaTraits`, `has_infinite_lights`, `has_mixed` (smooth and specular
+    parts in one BSDF), `has_masks` (BSDFs that ignore the component mask), `shares` (see
+    `density_share`, by the media's registry numbers)."""
 
     def __init__(self, scene, sensors):
         super().__init__(scene, sensors)
@@ -28,7 +28,6 @@ class VolumeTraits(MediaTraits):
         bsdfs = used_bsdfs(scene)
         flags = [int(b.flags()) for b in bsdfs]
         specular = int(flag.DeltaReflection) | int(flag.DeltaTransmission)
-        self.has_delta = any(f & specular for f in flags)
         self.has_mixed = any(f & specular and f & int(flag.Smooth) for f in flags)
         self.has_masks = any(b.class_name() == "MaskBSDF" for b in bsdfs)
         self.has_infinite_lights = bool(infinite_emitters(scene))
@@ -57,8 +56,11 @@ def _mean_over_majorant(medium):
         ),
         None,
     )
-    values = np.abs(np.array(parameters[name], dtype=np.float64)) if name else np.zeros(1)
-    return float(values.mean() / values.max()) if values.max() > 0 else 0.0
+    if name is None:
+        return 0.0
+    values = dr.abs(mi.Float(dr.ravel(parameters[name])))  # on the device: a grid may be large
+    mean, most = float(dr.mean(values)[0]), float(dr.max(values)[0])
+    return mean / most if most > 0 else 0.0
 
 
 def check_volume_scene(scene, sensors, plugin):

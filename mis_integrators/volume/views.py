@@ -11,7 +11,7 @@ import numpy as np
 
 from ..core.packing import from_numpy
 from ..core.random import next_2d
-from ..core.traits import UnsupportedScene, check_bands
+from ..core.traits import UnsupportedScene, check_bands, children
 from ..paths.layers import written
 
 PARALLEL = "OrthographicCamera"
@@ -23,27 +23,10 @@ SENSORS = {
 MAX_VIEWS = 1024
 
 
-def _children(parent, kind):
-    """Objects of a class that `parent` holds itself, in its order."""
-
-    class Collector(mi.TraversalCallback):
-        def __init__(self):
-            super().__init__()
-            self.found = []
-
-        def put(self, name, value, *flags):
-            if isinstance(value, kind):
-                self.found.append(value)
-
-    collector = Collector()
-    parent.traverse(collector)
-    return collector.found
-
-
 def views_of(sensor):
     """The sensors that make a view each: the children of a `batch`, in its order, or the sensor
     itself."""
-    return _children(sensor, mi.Sensor) if sensor.class_name() == "BatchSensor" else [sensor]
+    return children(sensor, mi.Sensor) if sensor.class_name() == "BatchSensor" else [sensor]
 
 
 def _number(value):
@@ -258,7 +241,7 @@ class Views:
             raise UnsupportedScene(
                 f"{plugin}: the views' films must have the same reconstruction filter"
             )
-        responses = [[str(o) for o in _children(s, mi.Texture)] for s in self.sensors]
+        responses = [[str(o) for o in children(s, mi.Texture)] for s in self.sensors]
         if any(r != responses[0] for r in responses):
             raise UnsupportedScene(
                 f"{plugin}: the views must have the same sensor response function"

@@ -358,6 +358,32 @@ def test_names_of_another_number_of_channels_are_refused(rgb):
         mis_integrators.denoise(np.zeros((4, 4, 3)), channels=["R", "G"])
 
 
+def test_grey_images_beside_other_channels(rgb):
+    """The colour is what names say: one channel of grey; all others stay as they are. Direct light
+    is grey there, too."""
+    rng = np.random.default_rng(1)
+    grey = 0.5 + 0.1 * rng.random((32, 32, 1), dtype=np.float32)
+    direct = np.zeros((32, 32, 3), np.float32)
+    direct[:, 16:] = [0.5, 0.25, 0.1]
+    variance = np.full((32, 32, 1), 1e-6, np.float32)
+    image = np.concatenate([grey, direct, variance], axis=-1)
+    found = mis_integrators.denoise(image, channels=["Y", *direct_channels()])
+    assert same(found[..., 1:], image[..., 1:])
+    assert found[..., 0].std() < 0.3 * grey.std()
+    alone = mis_integrators.denoise(grey[..., 0])
+    assert abs(found[..., 0].mean() - alone.mean()) < 0.01
+    layers = np.concatenate([grey, direct[..., :2]], axis=-1)
+    found = mis_integrators.denoise(layers, channels=["Y", "uv.U", "uv.V"])
+    assert same(found[..., 1:], layers[..., 1:])
+
+
+def test_sensors_that_are_not_there(rgb):
+    scene = painted_wall()
+    for number in (1, -1):
+        with pytest.raises(ValueError, match="has 1 sensors"):
+            mis_integrators.denoise(np.zeros((4, 6, 3)), scene, sensor=number)
+
+
 # --- the command ---------------------------------------------------------------------------------
 
 

@@ -433,7 +433,7 @@ def test_light_that_leaves_through_glass(rgb, plugin):
     "plugin, module, size",
     [
         ("bdpm", "bdpm", "CAMERA_CHUNK"),
-        *extended(("bdpt_ris", "resampled", "CHUNK"), ("bdpt", "bdpt", "CHUNK")),
+        *extended(("bdpt_ris", "resampled_passes", "CHUNK"), ("bdpt", "bdpt", "CHUNK")),
     ],
 )
 def test_split_of_films_in_parts(rgb, monkeypatch, plugin, module, size):
@@ -445,6 +445,31 @@ def test_split_of_films_in_parts(rgb, monkeypatch, plugin, module, size):
     assert session.chunks > 2
     image = session.image()
     layers = image[..., -9:].reshape(24, 24, 3, 3).sum(axis=2)
+    np.testing.assert_allclose(layers, image[..., :3], rtol=1e-4, atol=1e-6)
+
+
+def test_split_of_merges_in_rounds(rgb, monkeypatch):
+    """Each round of light sub-paths brings light of its own to the layers."""
+    from mis_integrators.integrators import resampled_passes
+
+    monkeypatch.setattr(resampled_passes, "CHUNK", 200)
+    monkeypatch.setattr(resampled_passes, "KNOWN_PATHS", 50)
+    scene = tray("delta", "constant", size=12)
+    integrator = mi.load_dict(
+        {
+            "type": "bdpt_ris",
+            "aovs": SPLIT_ALL,
+            "merging": True,
+            "initial_radius": 0.2,
+            "light_paths": 50,
+            "light_tracing": 3,
+        }
+    )
+    session = integrator.session(scene, seed=3, spp=0)
+    session.iterate()
+    assert session.light_rounds > 1
+    image = session.image()
+    layers = image[..., -9:].reshape(12, 12, 3, 3).sum(axis=2)
     np.testing.assert_allclose(layers, image[..., :3], rtol=1e-4, atol=1e-6)
 
 

@@ -5,6 +5,7 @@ import dataclasses
 import gc
 import sys
 
+from mis_integrators import render_views
 from mis_integrators._plugins import PLUGINS
 from mis_integrators.pilot.noise import MEASURES, trimmed_mean
 from mis_integrators.pilot.result import PilotResult, PilotSamples, measure
@@ -1181,6 +1182,15 @@ def test_special_film():
         assert last_words(error.value).startswith(f"{plugin}: ") and "specfilm" in last_words(
             error.value
         )
+
+
+def test_fewer_samples_than_one_are_refused(rgb):
+    for plugin in ("bdpm", "bdpt", "volpath_multiview"):
+        integrator = mi.load_dict({"type": plugin, "max_depth": 2})
+        with pytest.raises(ValueError, match=f"{plugin}: -1 samples per pixel"):
+            integrator.render(box_scene(8), spp=-1)
+    with pytest.raises(ValueError, match="-1 samples per pixel"):
+        render_views(box_scene(8), spp=-1)
 
 
 def test_gradients_are_refused(rgb):

@@ -95,3 +95,22 @@ def test_trial_and_render_of_path_have_one_kernel(rgb, denoised):
     pixels = pilot_pixels(mi.load_dict({"type": "bdpm"}).session(glossy_box()).pilot_setting())
     of_trial = kernels_of(lambda: choice._samples(session, pixels, 0), LARGE)
     assert of_trial and of_trial == kernels_of(session.iterate, LARGE)
+
+
+def test_lamps_of_the_cache_have_one_kernel(rgb):
+    """The strongest light of a cell is looked for lamp by lamp: no lamp has kernels of its own."""
+    made = []
+    for count in (2, 6):
+        lamps = {
+            f"lamp{k}": {
+                "type": "point",
+                "position": [0.1 * k - 0.3, 0.5, 0.2],
+                "intensity": {"type": "rgb", "value": 0.1 + 0.01 * k},
+            }
+            for k in range(count)
+        }
+        session = mi.load_dict({"type": "bdpm_opt2", "initial_radius": 0.05}).session(
+            glossy_box(**lamps), seed=1, spp=2
+        )
+        made.append(len(kernels_of(session.start)))
+    assert made[0] == made[1]

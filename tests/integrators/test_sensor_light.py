@@ -137,6 +137,19 @@ def test_films_that_sample_their_border():
     assert abs(np.median(ratio) - 1) < 0.01 and 0.9 < np.quantile(ratio, 0.01)
 
 
+def test_random_numbers_are_those_of_the_photon():
+    """The same seed twice: photons lie in another order in their buffer, which chance decides, but
+    are joined with the same points of the lens."""
+    sensor = {**view((0, 0.7, 4.2)), "type": "thinlens", "aperture_radius": 0.2}
+    scene = fog_scene(homogeneous(), {**sensor, "focus_distance": 4.0})
+    images = []
+    for _ in range(2):
+        session = joined(scene)
+        session.iterate()
+        images.append(session.image()[..., :3])
+    np.testing.assert_allclose(images[1], images[0], rtol=1e-3, atol=1e-5)
+
+
 def test_what_the_zone_brings_is_what_joined_photons_bring():
     """Within fog all of the same photons are joined, or those of a wide zone gathered along beams:
     the image's mean is the same within 4.9 standard errors of the difference (a false alarm in a

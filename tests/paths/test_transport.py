@@ -645,6 +645,28 @@ def test_environment_directions(emitter):
     assert (5.3 + 1.65) * total_error < 0.02 * expected, "test too weak"
 
 
+@pytest.mark.parametrize(
+    "sun", [(1, -1, 0), (1, 0, 0), (-0.3, -1, 0), (0, 1, 0), (0, 0, 1), (0, 0, -1)]
+)
+def test_position_density_of_rounded_directions(sun):
+    """Strategies round the direction of a sun, each in its own way: to either side of zero in
+    scenes where it has no third coordinate. All mean the same cell."""
+    scene = tray("lambertian", "directional")
+    guide = EnvironmentGuide(scene, scene.sensors()[0])
+    rng = streams(dr.arange(mi.UInt32, 4096), mi.UInt32(7))
+    p = guide.focus_center + guide.focus_radius * (
+        2 * mi.Point3f(rng.next_float32(), rng.next_float32(), rng.next_float32()) - 1
+    )
+    exact = dr.normalize(mi.Vector3f(*map(float, sun)))
+    found = [
+        np.array(guide.position_density(exact + mi.Vector3f(shift), mi.UInt32(0), p))
+        for shift in (0.0, -0.0, 1e-8, -1e-8)
+    ]
+    assert len(np.unique(found[0])) > 10
+    for other in found[1:]:
+        assert np.mean(np.abs(other / found[0] - 1) > 0.01) < 1e-3  # at borders of cells
+
+
 @pytest.mark.parametrize("emitter", ["directional", "constant", "sunsky"])
 def test_position_density(emitter):
     """Over the plane across a direction it integrates to one, and it is that of the samples."""
