@@ -1,7 +1,7 @@
 # make render   set everything up, then render a bundled scene into out/
 # make test     set everything up, then run the tests (a quarter of an hour on two cores)
 # make test-all the same with all extended cases (an hour and a half)
-# make mutants  set everything up, then see how many of a hundred errors the tests find (twenty minutes)
+# make mutants  set everything up, then see how many of more than a hundred errors the tests find (twenty minutes)
 # make bench    set everything up, then compare all methods on all bundled scenes: out/bench/index.html (half an hour to three quarters)
 # make figures set everything up, then measure all figures of docs/results.md anew (two hours)
 # make lint     set everything up, then check style, layout and type hints
