@@ -38,6 +38,11 @@ FOR_DENOISERS = {PHOTONS: {"bdd": 1}}
 camera paths, which a denoiser takes away."""
 PATH_TRIALS = 16
 """Tuned: samples of `path` on each of the pilot's pixels; a power of two."""
+TOGETHER = 512
+"""Paths of a run that tells the time of all."""
+OVERRATED = 2.0
+"""Tuned: an iteration of photons may take so many times less than its pilot says (1.1 to 2.2 times
+in ten scenes)."""
 TRIAL_INDEX = 1 << 28
 """Iteration number of these samples: consecutive in the pixels' sequences."""
 MOST_INSTANCES = 64
@@ -139,13 +144,16 @@ def choose(integrator, scene, sensor, seed, iterations, seconds):
         values, cost = _clocked_samples(path, prediction.pixels)
     else:
         usual, cost = _counted_costs(path, photons)
-        values, _ = _samples(path, prediction.pixels, 0)
+        values = _samples(path, prediction.pixels, 0)
     budget = planned * usual
-    trials = [
-        _trial_of_path(path, values, prediction, budget, cost),
-        trial_of_photons(PHOTONS, photons, usual),
-    ]
-    return decide(trials, [], budget, usual)
+    alone = _trial_of_path(path, values, prediction, budget, cost)
+    if seconds and alone.product(budget) > trial_of_photons(
+        PHOTONS, photons, usual / OVERRATED
+    ).product(budget):
+        photons.start()  # its first iterations tell the time, and are kept
+        usual, budget = photons.iteration_seconds, photons.seconds_left
+        alone = _trial_of_path(path, values, prediction, budget, cost)
+    return decide([alone, trial_of_photons(PHOTONS, photons, usual)], [], budget, usual)
 
 
 def decide(trials, reasons, budget, usual):
@@ -250,32 +258,43 @@ def _counted_costs(path, photons):
 
 def _clocked_samples(path, pixels):
     """Samples of the pilot's pixels, as of `_samples`, and the seconds that one sample of each of
-    the film's takes: those of the second half, whose kernels are compiled."""
-    first, _ = _samples(path, pixels, 0)
-    second, seconds = _samples(path, pixels, PATH_TRIALS)
-    each = seconds / second.size
-    return np.concatenate([first, second]), each * film_sample_count(path.sensor)
+    the film's takes."""
+    halves = [_samples(path, pixels, first) for first in (0, PATH_TRIALS)]
+    return np.concatenate(halves), _seconds_of_sample(path, PATH_TRIALS * pixels.count)
+
+
+def _seconds_of_sample(path, count):
+    """Seconds that one sample of each of the film's pixels takes, by so many paths of an iteration.
+    They are some runs of near ones, as in a render: apart, paths take up to twice as long."""
+    total = film_sample_count(path.sensor) * path.camera_paths
+    lane = lanes(count)
+    run = lane // TOGETHER
+    number = (run * max(total * TOGETHER // count, 1) + lane - run * TOGETHER) % total
+    spectral = path._spectral(TRIAL_INDEX)
+    pixel, index = path.pixels_and_indices(number)
+    dr.eval(pixel, index)
+    start = now()
+    path.trace(TRIAL_INDEX, pixel, index, spectral)
+    dr.sync_thread()
+    return (now() - start) / count * film_sample_count(path.sensor)
 
 
 def _samples(path, pixels, first):
     """`PATH_TRIALS` samples of each of the pilot's pixels, from number `first` on: radiance, mean
-    over the channels, (samples, pixels); and the seconds that they take."""
+    over the channels, (samples, pixels)."""
     passes = (
         PATH_TRIALS if mi.is_spectral else 1
     )  # wavelengths are shared by all that is traced at once
     at_once = PATH_TRIALS // passes
     pixel, trial = pixels.places(lanes(at_once * pixels.count))
-    values, seconds = [], 0.0
+    values = []
     for number in range(first, first + passes):
         spectral = path._spectral(TRIAL_INDEX + number)
-        start = now()
         index = trial + dr.opaque(mi.UInt32, number)  # one kernel for all
         radiance, *_ = path.trace(TRIAL_INDEX, pixel, index, spectral)
-        dr.sync_thread()
-        seconds += now() - start
         value = channel_mean(radiance) + dr.zeros(mi.Float, dr.width(pixel))
         values.append(np.array(value).reshape(at_once, pixels.count))
-    return np.concatenate(values), seconds
+    return np.concatenate(values)
 
 
 def _trial_of_path(path, values, prediction, budget, cost):

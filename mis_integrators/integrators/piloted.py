@@ -10,7 +10,7 @@ import mitsuba as mi
 from ..core.clock import now
 from ..core.untrusted import Fields
 from ..pilot.result import Choice
-from ..pilot.run import run_pilot
+from ..pilot.run import PILOT_TIME_SHARE, run_pilot
 from ..pilot.setting import LIGHT_SHARES, pilot_pixels
 from .common import IterativeSession
 from .schedule import LARGEST_RADIUS, SMALLEST_RADIUS, shrunk
@@ -116,7 +116,8 @@ class PilotedSession(IterativeSession):
     # ------------------------------------------------------------------ choice
 
     def start(self):
-        self.predict()
+        if self.prediction is None:
+            self.predict()
         if self._untimed is not None:
             untimed, self._untimed = self._untimed, None
             self._choose_by_clock(*untimed)
@@ -157,6 +158,11 @@ class PilotedSession(IterativeSession):
     def _left(self, least):
         """Seconds that are left of the render, `least` at least."""
         return max(self._end - now(), least)
+
+    @property
+    def seconds_left(self):
+        """Seconds that are left of a render of a given time: of an iteration at least."""
+        return self._left(self.iteration_seconds)
 
     def _choose_by_clock(self, pilot, first, guess):
         """Measures what an iteration takes with the `first` choice, which was made for a `guess` of
@@ -200,9 +206,10 @@ class PilotedSession(IterativeSession):
         """Finds what all iterations need, before the first is timed."""
 
     def _time_first_iterations(self, guess, left):
-        """Renders the first iteration, and the second where the first took longer than it should
-        have (it may have had to be compiled) but not most of the seconds that are `left`; keeps
-        them. Returns the seconds of an iteration, and those of all."""
+        """Renders the first iteration, which is recorded, and the second unless the first took a
+        good share of the seconds that are `left`: for most of them, where it took longer than it
+        should have (it may have had to be compiled). Keeps both. Returns the seconds of the last
+        one, and those of all."""
         spent = 0.0
         for number in range(2):
             start = now()
@@ -212,7 +219,8 @@ class PilotedSession(IterativeSession):
             seconds = now() - start
             self.kept[number] = block
             spent += seconds
-            if seconds < TOO_SLOW * guess or spent > left / 2:
+            share = PILOT_TIME_SHARE if seconds < TOO_SLOW * guess else 0.5
+            if spent > share * left:
                 break
         return seconds, spent
 

@@ -55,7 +55,7 @@ AIMED_SHARE = 0.5
 WORTH_AIMING = 0.9
 """Tuned: none are if that leaves more than this of the noise."""
 JUMP = -1.37e-4
-"""Third coordinate of the directions where the axes across them jump, see `_across`: few lights have
+"""Third coordinate of the directions where the axes across them jump, see `_across`: no light has
 just that."""
 FOCUS_TAIL = 0.01
 """Tuned: share of the records' weight that may lie outside the focus, at each end of each axis."""
