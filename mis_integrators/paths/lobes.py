@@ -1,8 +1,9 @@
 """Whether photons that arrive at a surface are of use there: how narrow the lobes of its BSDF are,
 and whether it is a curve, narrower itself than the disks in which photons are merged.
 
-Of a BSDF with a narrow lobe and an even part, as plastic has, photons bring the light of the even
-part, and paths go on for that of the lobe.
+Of a BSDF with a narrow lobe that scatters evenly, too, as plastic does, photons bring the light of
+an even part, and paths go on for the rest: f = f_e + (f - f_e). The even part f_e is what f has in
+a direction off the lobe, but nowhere more than f.
 """
 
 from __future__ import annotations
@@ -25,11 +26,13 @@ COSINES = 0.25, 0.5, 0.75, 1.0
 SAMPLES = 64
 """Directions sampled of each BSDF under each angle."""
 PARTED = 1 << len(COSINES)
-"""Bit of a BSDF whose even part can be evaluated by itself."""
+"""Bit of a BSDF with an even part."""
+EVEN_SHARE = 0.15
+"""Tuned: of the light that a BSDF scatters, what its even part has at least."""
+OFF_LOBE = 0.7
+"""Cosine of the direction off the lobe."""
 EVEN = int(mi.BSDFFlags.DiffuseReflection | mi.BSDFFlags.DiffuseTransmission)
 """Types of what scatters evenly."""
-ROUNDING = 1e-4
-"""Of a BSDF's parts, relative to its largest value."""
 
 
 @dataclass(frozen=True)
@@ -72,13 +75,24 @@ class NarrowSurfaces:
         return (lookup(self.bsdfs, bsdf, mi.UInt32, active) & PARTED) != 0
 
 
-def even_part():
-    """The `mi.BSDFContext` of what a BSDF scatters evenly."""
-    return _of_types(EVEN)
+def even_bound(bsdf, si, active=True):
+    """What the BSDF f has per cosine in a direction off its lobe, at right angles to the plane of
+    `si.wi` and the normal: its even part f_e is nowhere more than that, nor than f. It need not be
+    all that scatters evenly, for paths go on for the rest."""
+    x, y, z = si.wi
+    aside = dr.sqrt((1 - OFF_LOBE**2) * dr.rcp(dr.maximum(x * x + y * y, 1e-12)))
+    level = dr.squared_norm(mi.Vector2f(x, y)) < 1e-12
+    wo = mi.Vector3f(
+        dr.select(level, (1 - OFF_LOBE**2) ** 0.5, -y * aside),
+        dr.select(level, 0, x * aside),
+        dr.mulsign(mi.Float(OFF_LOBE), z),
+    )
+    return bsdf.eval(mi.BSDFContext(), si, wo, active) * (1 / OFF_LOBE)
 
 
-def _of_types(types):
-    return mi.BSDFContext(mi.TransportMode.Radiance, types)
+def even_part(bound, value, wo):
+    """f_e |cos| towards `wo` (local), by its `even_bound` and the `value` f |cos| there."""
+    return dr.minimum(value, bound * dr.abs(wo.z))
 
 
 def curves(scene):
@@ -121,9 +135,7 @@ class Looks(NamedTuple):
     value: np.ndarray
     """Of the BSDF with its cosine, mean over the channels."""
     even: np.ndarray
-    """That of its even part, as Mitsuba evaluates it."""
-    lobes: np.ndarray
-    """That of the rest."""
+    """That of its even part."""
     weight: np.ndarray
     """Of the sample."""
     cosine: np.ndarray
@@ -144,13 +156,11 @@ def concentration(looks):
 
 
 def parted(looks):
-    """Which of the BSDFs are the sum of two that can be evaluated apart, an even part and lobes: an
-    array. (Some of Mitsuba's evaluate all of themselves, whatever part is asked for.)"""
-    error = np.abs(looks.even + looks.lobes - looks.value)
-    largest_error, largest, brightest = (
-        x.max(axis=(1, 2)) for x in (error, looks.value, looks.even)
-    )
-    return (largest_error <= ROUNDING * largest) & (brightest > 0)
+    """Which of the BSDFs have an even part that is worth gathering photons for, as seen under some
+    of the angles: an array."""
+    share = np.where(looks.value > 0, looks.even / np.maximum(looks.value, 1e-30), 0)
+    evenly = (looks.weight * share).mean(axis=2)
+    return np.any(evenly > EVEN_SHARE * looks.weight.mean(axis=2), axis=1)
 
 
 def look_at(bsdfs):
@@ -170,15 +180,11 @@ def look_at(bsdfs):
         si.wavelengths = mi.sample_rgb_spectrum(mi.sample_shifted(mi.Float(0.5)))[0]
     choice, u, v, s, t = *sobol(index, mi.UInt32(1), 3), *sobol(index, mi.UInt32(2), 2)
     si.uv = mi.Point2f(s, t)
-    smooth, lobes = int(mi.BSDFFlags.Smooth), int(mi.BSDFFlags.Glossy)
-    bs, weight = bsdf.sample(_of_types(smooth), si, choice, mi.Point2f(u, v))
-    value = channel_mean(bsdf.eval(_of_types(smooth), si, bs.wo))
-    even, others = mi.Float(0), value
-    if any(int(b.flags()) & EVEN for b in bsdfs):
-        even, others = (
-            channel_mean(bsdf.eval(_of_types(types), si, bs.wo)) for types in (EVEN, lobes)
-        )
-    found = [value, even, others, channel_mean(weight), dr.abs(bs.wo.z)]
+    of_smooth = mi.BSDFContext(mi.TransportMode.Radiance, int(mi.BSDFFlags.Smooth))
+    bs, weight = bsdf.sample(of_smooth, si, choice, mi.Point2f(u, v))
+    value = bsdf.eval(of_smooth, si, bs.wo)
+    even = even_part(even_bound(bsdf, si), value, bs.wo)
+    found = [*map(channel_mean, (value, even, weight)), dr.abs(bs.wo.z)]
     dr.eval(found)
     shape = len(bsdfs), len(COSINES), SAMPLES
     return Looks(*(np.broadcast_to(np.array(x, np.float64), count).reshape(shape) for x in found))

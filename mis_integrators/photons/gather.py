@@ -11,7 +11,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.traits import lookup
-from ..paths.lobes import even_part
+from ..paths.lobes import even_bound, even_part
 from ..paths.subpaths import vertex_bsdf_of
 from ..paths.vertex import SMALLEST_COSINE, per_projected, upright
 from .grid import for_each_photon
@@ -54,7 +54,10 @@ class QueryVertices:
         self.side = dr.dot(si.n, -ray.d)
         self.first = record.get("first")
         self.factor = mi.Spectrum(throughput) * scale
-        self.even = (depth & EVEN_PART) != 0 if parted else None
+        self.even = self.even_bound = None
+        if parted:
+            self.even = (depth & EVEN_PART) != 0
+            self.even_bound = even_bound(self.bsdf, si, active & self.even)
         self.lambertian, self.f, self.pdf = mi.Bool(True), mi.Spectrum(0), mi.Float(0)
         if traits.has_rough:
             self.lambertian = lookup(traits.lambertian, self.bsdf, mi.Bool, active)
@@ -82,11 +85,11 @@ class QueryVertices:
                 scale = per_projected(wo.z)
                 f = dr.select(self.lambertian, f, rough_value * scale)
                 p = dr.select(self.lambertian, p, pdf * scale)
-            elif self.even is None:
-                rough_value = self.bsdf.eval(mi.BSDFContext(), self.si, wo, rough)
             else:
-                rough_value = self.bsdf.eval(mi.BSDFContext(), self.si, wo, rough & ~self.even)
-                rough_value += self.bsdf.eval(even_part(), self.si, wo, rough & self.even)
+                rough_value = self.bsdf.eval(mi.BSDFContext(), self.si, wo, rough)
+            if self.even is not None:
+                even = even_part(self.even_bound, rough_value, wo)
+                rough_value = dr.select(self.even, even, rough_value)
             value = dr.select(self.lambertian, value, rough_value)
         return Scattering(
             towards, dr.abs(wo.z), value, f, p, lambda: self._density_back(wo, active)

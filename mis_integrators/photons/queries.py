@@ -17,7 +17,7 @@ from ..core.records import Layout
 from ..core.spectra import channel_mean
 from ..paths.camera import trace_camera, whole_or_nothing
 from ..paths.light_classes import class_of, scattered_history, start_of_camera_path
-from ..paths.lobes import EVEN, even_part
+from ..paths.lobes import EVEN, even_bound, even_part
 from ..paths.media import direct_light, next_hit_either, next_hit_straight_on
 from ..paths.setting import CameraPass, Limits, World
 from ..paths.subpaths import selected, smooth_at
@@ -572,8 +572,8 @@ class QueryVisitor:
         for the even part of the BSDF. By roulette, so that few paths go on for little: it is none,
         or its largest channel one."""
         active = active & at.even
-        even = at.bsdf.eval(even_part(), at.si, bs.wo, active)
         whole = weight * bs.pdf
+        even = even_part(even_bound(at.bsdf, at.si, active), whole, bs.wo)
         share = dr.select(whole > 0, even * dr.rcp(dr.maximum(whole, 1e-30)), 1)
         rest = 1 - dr.clip(share, 0, 1)
         largest = dr.max(rest)

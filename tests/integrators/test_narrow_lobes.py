@@ -83,8 +83,7 @@ def test_which_surfaces_are_narrow(rgb):
 
 
 def test_even_parts(variant):
-    """Of which BSDFs photons bring the light of an even part: those that Mitsuba evaluates part by
-    part."""
+    """Of which BSDFs photons bring the light of an even part."""
     matt = {"type": "diffuse", "reflectance": 0.5}
     coat = {"type": "roughplastic", "alpha": 0.1}
     smooth = {**METAL, "alpha": 0.05}
@@ -92,9 +91,10 @@ def test_even_parts(variant):
         (coat, True),
         ({"type": "twosided", "bsdf": coat}, True),
         ({"type": "blendbsdf", "weight": 0.5, "a": matt, "b": smooth}, True),
-        ({"type": "principled", "roughness": 0.3, "specular": 0.5}, False),
+        ({"type": "principled", "roughness": 0.3, "specular": 0.5}, True),
+        ({"type": "principled", "roughness": 0.1, "metallic": 1.0}, False),
         (smooth, False),
-        (matt, True),  # the sum of itself and of no lobe
+        (matt, True),
     ]
     found = lobes.parted(lobes.look_at([mi.load_dict(bsdf) for bsdf, _ in expected]))
     assert list(found) == [even for _, even in expected]
