@@ -978,4 +978,25 @@ MUTATIONS = [
         "photons in fog shine on the even part of a coated surface twice",
         "tests/integrators/test_bdpm_media.py::test_narrow_lobes_are_passed",
     ),
+    Mutation(
+        "paths/lobes.py",
+        "return dr.minimum(value, bound * dr.abs(wo.z))",
+        "return bound",
+        "photons bring the even part of a coat without its cosine",
+        "tests/integrators/test_narrow_lobes.py::test_means",
+    ),
+    Mutation(
+        "lights/environment_guide.py",
+        "JUMP = -1.37e-4",
+        "JUMP = 0.0",
+        "strategies take the same sun for two where a coordinate of its direction is zero",
+        TRANSPORT,
+    ),
+    Mutation(
+        "integrators/merging.py",
+        "name: before[name] + entry if name in before else entry",
+        "name: entry",
+        "layers lack the merged light of all rounds but the last",
+        "tests/integrators/test_aovs.py::test_split_of_merges_in_rounds",
+    ),
 ]

@@ -165,19 +165,30 @@ def test_no_photons_are_gathered_on_curves(rgb, tmp_path, bdd):
     agree(made, path(max_depth=5), scene, blocks=1, whole=0.01, block=0.01)
 
 
-def narrow_box():
-    """Of lobes that are narrow from everywhere, and of a coat that is so at grazing angles."""
-    coat = {"type": "roughplastic", "alpha": 0.1}
+COATS = {
+    "plastic": {"type": "roughplastic", "alpha": 0.1, "diffuse_reflectance": 0.5},
+    "principled": {"type": "principled", "roughness": 0.15, "specular": 0.5, "sheen": 0.5},
+}
+"""Lobes that are narrow at grazing angles, above what scatters evenly."""
+
+
+def narrow_box(coat):
+    """Of lobes that are narrow from everywhere, and of a coat."""
     return box(**{"small-box": FROSTED, "large-box": {**METAL, "alpha": 0.05}}, floor=coat)
 
 
 @pytest.mark.parametrize(
-    "bdd, more", [(0, {"direct_paths": 3}), *extended((1, {"camera_paths": 2}))]
+    "coat, bdd, more",
+    [
+        ("plastic", 0, {"direct_paths": 3}),
+        ("principled", 0, {"camera_paths": 4}),
+        *extended(("plastic", 1, {"camera_paths": 2}), ("principled", 1, {})),
+    ],
 )
-def test_means(rgb, bdd, more):
+def test_means(rgb, coat, bdd, more):
     """As of `path`, with false alarms of 1e-6 each: no light is lost or counted twice where paths
     go on, whatever sees direct light besides."""
-    settings, scene = {"max_depth": 6, "rr_depth": 50}, narrow_box()
+    settings, scene = {"max_depth": 6, "rr_depth": 50}, narrow_box(COATS[coat])
     assert mi.load_dict({"type": "bdpm"}).session(scene).narrow is not None
     integrator = mi.load_dict(
         {"type": "bdpm", "bdd": bdd, "initial_radius": 0.03, **settings, **more}
@@ -194,8 +205,9 @@ def variance(scene, **parameters):
     return np.var(images, axis=0, ddof=1).mean()
 
 
+@pytest.mark.parametrize("coat", COATS)
 @in_one_thread
-def test_no_noise_of_even_parts(rgb, monkeypatch):
+def test_no_noise_of_even_parts(rgb, monkeypatch, coat):
     """A coated floor seen at a grazing angle, below a ceiling that one small spot lights: photons
     bring what the floor scatters evenly. A twentieth of the variance, at the most, of paths that go
     on for all of it. (The seeds are fixed.)"""
@@ -205,7 +217,7 @@ def test_no_noise_of_even_parts(rgb, monkeypatch):
             "floor": {
                 "type": "rectangle",
                 "to_world": T().scale(4),
-                "bsdf": {"type": "roughplastic", "alpha": 0.1, "diffuse_reflectance": 0.5},
+                "bsdf": COATS[coat],
             },
             "ceiling": {
                 "type": "rectangle",
