@@ -20,13 +20,17 @@ def children(parent, kind):
     """Objects of a class that `parent` holds itself, in its order."""
 
     class Collector(mi.TraversalCallback):  # of the active variant
+        def __init__(self):
+            super().__init__()
+            self.found = []  # not of the class, which lives on until garbage is collected
+
         def put(self, name, value, *flags):
             if isinstance(value, kind):
-                found.append(value)
+                self.found.append(value)
 
-    found: list = []
-    parent.traverse(Collector())
-    return found
+    collector = Collector()
+    parent.traverse(collector)
+    return collector.found
 
 
 def scene_objects(root):

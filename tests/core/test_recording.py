@@ -1,7 +1,10 @@
 """Recorded passes: the second and all later calls, which launch the recording's kernels, do all
 that the first one did."""
 
-from mis_integrators.core.recording import frozen, lanes
+import gc
+
+from mis_integrators.core.recording import frozen, lanes, no_garbage_collection
+from mis_integrators.core.traits import children
 
 import drjit as dr
 import mitsuba as mi
@@ -67,3 +70,13 @@ def test_lanes_count(rgb):
     for scale in (2, 3):
         assert np.array_equal(np.array(recorded(dr.opaque(mi.UInt32, scale))), scale * np.arange(7))
     assert np.array_equal(np.array(lanes(5)), np.arange(5))  # nothing of the recording is left
+
+
+def test_lists_of_objects_keep_none_alive(rgb):
+    """Objects of a scene that is gone must not wait for the garbage collector, which may come while
+    their kind is being called."""
+    scene = mi.load_dict({"type": "scene", "lamp": {"type": "point"}})
+    with no_garbage_collection():
+        found = children(scene, mi.Object)
+        holders = [type(holder).__name__ for holder in gc.get_referrers(found)]
+    assert len(found) == 1 and not {"cell", "dict"} & set(holders)
