@@ -993,9 +993,9 @@ MUTATIONS = [
         TRANSPORT,
     ),
     Mutation(
-        "integrators/merging.py",
-        "name: before[name] + entry if name in before else entry",
-        "name: entry",
+        "paths/light_classes.py",
+        "self.entries = {**zeros, **(entries or {})}",
+        "self.entries = {**(entries or {}), **zeros}",
         "layers lack the merged light of all rounds but the last",
         "tests/integrators/test_aovs.py::test_split_of_merges_in_rounds",
     ),

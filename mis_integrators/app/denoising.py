@@ -156,9 +156,8 @@ def denoise(
             )
         guides = albedo_and_normal(scene, sensor, hide_emitters=hide_emitters)
     planes = pixels[..., None] if pixels.ndim == 2 else pixels
-    first = list(range(3 if planes.shape[2] >= 3 else 1))
-    names = picture_channels(channels) if channels else None
-    where = [channels.index(name) for name in names] if names else first
+    where = [channels.index(name) for name in picture_channels(channels) or ()]
+    where = where or list(range(3 if planes.shape[2] >= 3 else 1))
     colours = planes[..., where]
     finite = np.maximum(np.nan_to_num(colours, nan=0, posinf=0, neginf=0), 0)
     split = planes[..., :0]

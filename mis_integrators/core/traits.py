@@ -36,7 +36,6 @@ def children(parent, kind):
 def scene_objects(root):
     """Every Mitsuba object below `root` (shapes, nested BSDFs, emitters, media, films, ...), each
     once."""
-
     pending, seen = [root], {}
     while pending:
         for child in children(pending.pop(), mi.Object):

@@ -268,8 +268,8 @@ def _seconds_of_sample(path, count):
     They are some runs of near ones, as in a render: apart, paths take up to twice as long."""
     total = film_sample_count(path.sensor) * path.camera_paths
     lane = lanes(count)
-    run = lane // TOGETHER
-    number = (run * max(total * TOGETHER // count, 1) + lane - run * TOGETHER) % total
+    apart = max(total * TOGETHER // count, 1)
+    number = (lane // TOGETHER * apart + lane % TOGETHER) % total
     spectral = path._spectral(TRIAL_INDEX)
     pixel, index = path.pixels_and_indices(number)
     dr.eval(pixel, index)

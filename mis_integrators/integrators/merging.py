@@ -100,12 +100,8 @@ def with_merged(radiance, entries, parts, z, active, paths: int):
     dr.scatter_reduce(dr.ReduceOp.Add, total, sum(others, merged), z["path"], active)
     if others:
         names = [f"merged.{name}" for name in CLASSES]
-        classes = LightClasses(paths, None, names)
+        classes = LightClasses(paths, entries, names)
         for number, (name, part) in enumerate(zip(names, parts)):
             classes.add(name, z["path"], mi.UInt32(number), part, active)
-        before = entries or {}
-        entries = before | {
-            name: before[name] + entry if name in before else entry
-            for name, entry in classes.entries.items()
-        }
+        entries = classes.entries
     return total, entries

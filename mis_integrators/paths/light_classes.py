@@ -53,13 +53,13 @@ def scattered_history(history, delta, active):
 
 class LightClasses:
     """Radiance of `paths` camera paths by class: `entries`, an array of the spectra of each path's
-    classes, path by path, by the name of what finds it. `new`: names of entries that are yet to be
-    filled. (A plain object, as `core.packing.Store`.)"""
+    classes, path by path, by the name of what finds it. `new`: names of entries that are to be
+    filled, empty unless they are there. (A plain object, as `core.packing.Store`.)"""
 
     def __init__(self, paths, entries, new=()):
         self.paths = paths
         zeros = {name: dr.zeros(mi.Spectrum, len(CLASSES) * paths) for name in map(_key, new)}
-        self.entries = {**(entries or {}), **zeros}
+        self.entries = {**zeros, **(entries or {})}
 
     def add(self, name, path, number, value, mask):
         """Adds to the radiance of paths; `number` as of `class_of`."""
