@@ -826,10 +826,24 @@ MUTATIONS = [
     ),
     Mutation(
         "integrators/choice.py",
-        "share_left(path.integrator.denoised)",
-        "1",
+        "noise_left(path.integrator, path.sensor) / path.camera_paths",
+        "1 / path.camera_paths",
         "all noise of path counts where a denoiser leaves little of it",
         "tests/integrators/test_denoised.py::test_of_the_noise_of_path_a_denoiser_leaves_its_share",
+    ),
+    Mutation(
+        "integrators/common.py",
+        "share_left(integrator.denoised) * filter_share(sensor.film().rfilter())",
+        "share_left(integrator.denoised)",
+        "all noise of path counts where the film's reconstruction filter leaves little of it",
+        f"{AUTO}::test_noise_of_path_is_what_its_renders_have",
+    ),
+    Mutation(
+        "core/stratified_variance.py",
+        "power += STEEP_SHARE",
+        "power += 2 * STEEP_SHARE",
+        "variance is taken to fall for ever as it does between few samples",
+        "tests/core/test_stratified_variance.py",
     ),
     Mutation(
         "integrators/unidirectional.py",

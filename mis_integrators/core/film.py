@@ -55,6 +55,20 @@ def colour_channels(radiance, matrix):
     return radiance
 
 
+def filter_share(rfilter):
+    """What a film's reconstruction filter leaves of the variance of noise that is independent from
+    pixel to pixel: the integral of its square, one for a box of a pixel. (In a corridor `path` has
+    with a tent 0.52, with Gaussian weights 0.37 of the variance that it has with a box: 0.44 and
+    0.32 here.)"""
+    if rfilter.is_box_filter():
+        return 1.0
+    radius, steps = float(rfilter.radius()), 1024
+    x = ((np.arange(steps) + 0.5) / steps * 2 - 1) * radius
+    values = np.array(rfilter.eval(mi.Float(x.astype(np.float32))), np.float64)
+    across = np.sum(values**2) / np.sum(values) ** 2 * steps / (2 * radius)
+    return float(min(across, 1.0) ** 2)
+
+
 def splat_samples(film, position, radiance, alpha, matrix, active, weight=1, classes=()):
     """Reconstructs one pass: an image tensor (height, width, channels), border included, that holds
     sums of filter weight times (R, G, B, [alpha,] [classes,] 1); `matrix` as for `colour_channels`.

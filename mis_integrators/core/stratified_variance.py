@@ -26,6 +26,13 @@ import numpy as np
 
 TILE, GROUP = 16, 16
 """Tuned: width of the tiles in which pixels are grouped, and pixels a group, about."""
+MOST_POWER = 2.0
+"""Power with which the variance falls where edges across one dimension make it: what contrasts show
+beyond is their noise."""
+STEEP_SHARE = 0.5
+"""Tuned: how much of the power above one is left, on average, from the longest contrast to a few
+hundred iterations. (In fourteen scenes 32 samples told the variance of 512 to 0.7 to 1.4 times, and
+a sum of laws as of `extrapolated` to 0.9 to 2.5 times.)"""
 FITS = 4
 """Times that the extrapolation is fitted, each with weights by the one before."""
 
@@ -121,6 +128,26 @@ def extrapolated(
     variance = np.where(a < 0, b_steep * laws[2.0] + c * laws[3.0], a * laws[1.0] + b * laws[2.0])
     least = d[-1] * min(law / basis(p)[-1] for p, law in laws.items())
     return size * np.maximum(variance, least)
+
+
+def variance_by_power(lengths: np.ndarray, contrast: np.ndarray, count: float) -> float:
+    """The variance of the mean of `count` iterations, from the `contrasts` of blocks (scales,),
+    means over so many pixels that they have next to no noise.
+
+    Up to the longest block V is the sum of contrasts and what is left beyond. There it falls with a
+    power of the length: the last two contrasts show one, which sinks towards one, and
+    `STEEP_SHARE` tells how far. Both tell where it begins."""
+    block, power, last = 2 * lengths[-1], 1.0, contrast[-1]
+    if len(contrast) > 1 and min(contrast[-2:]) > 0:
+        shown = np.log2(contrast[-2] / contrast[-1])
+        power += STEEP_SHARE * np.clip(shown - 1, 0, MOST_POWER - 1)
+        last = np.sqrt(contrast[-1] * contrast[-2] * 2**-power)
+    left = last / (2**power - 1)
+    if count >= block:
+        return float(left * (count / block) ** -power)
+    variance = left + np.append(np.cumsum(contrast[::-1])[::-1], 0)
+    known = np.log(np.maximum(variance, 1e-30))
+    return float(np.exp(np.interp(np.log(count), np.log(np.append(lengths, block)), known)))
 
 
 def _fitted(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ..core.film import as_camera_weights, expected_weight, with_colour
+from ..core.film import as_camera_weights, expected_weight, filter_share, with_colour
 from ..core.recording import recorder
 from ..paths.camera import film_sample_count, film_size
 from ..paths.layers import CHANNELS, SPLIT
@@ -304,6 +304,7 @@ class BDPMSession(PhotonPasses):
             seconds=self.seconds,
             light_paths=self.iteration_light_paths / self.light_path_count,
             denoised=integrator.denoised,
+            filter_share=filter_share(self.sensor.film().rfilter()),
             light_shares=light_shares(self.iteration_light_paths) if chooses else (1.0,),
             volume_dimensions=3 if self.points else 2,
             joins_sensor=self.near_zone is not None,

@@ -15,8 +15,7 @@ from ..photons.frozen import SurfacePhotons, VolumePhotons
 from ..photons.irradiance_cache import IrradianceCache
 from ..photons.kernel_sums import ball_volume
 from ..photons.trace import trace_light_paths
-from ..pilot.denoiser import share_left
-from .common import MOST_LIGHT_PATHS
+from .common import MOST_LIGHT_PATHS, noise_left
 from .parameters import ParameterError
 from .published_optimal import (
     PHOTONS_A_PATH,
@@ -277,7 +276,7 @@ class BDPMOptSession(WeightedSession):
             caustic_cost=merge_settings["caustic_cost"],
             strategies=integrator.strategies,
             first=integrator.first_vertex,
-            camera_paths=self.camera_paths / share_left(integrator.denoised),
+            camera_paths=self.camera_paths / noise_left(integrator, self.sensor),
             full=integrator.weights == "full",
             mix_diffuse=integrator.mix_diffuse,
             fluence=self.fluence,

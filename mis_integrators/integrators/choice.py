@@ -19,15 +19,15 @@ import numpy as np
 from ..core.clock import now
 from ..core.recording import lanes
 from ..core.spectra import channel_mean
-from ..core.stratified_variance import contrasts, extrapolated
+from ..core.stratified_variance import contrasts, variance_by_power
 from ..core.traits import SceneTraits, UnsupportedScene
 from ..paths.camera import film_sample_count
 from ..paths.layers import written
 from ..paths.path_length_statistics import mean_segments
-from ..pilot.denoiser import share_left
-from ..pilot.noise import MEASURES, trimmed_mean
-from ..pilot.setting import UNPLANNED_ITERATIONS
+from ..pilot.noise import MEASURES, shrink_to_neighbours, trimmed_mean
+from ..pilot.setting import UNPLANNED_ITERATIONS, neighbourhoods
 from . import costs
+from .common import noise_left
 from .unidirectional import PathSession
 
 CAMERA, PHOTONS = "path", "bdpm"
@@ -43,6 +43,8 @@ TOGETHER = 512
 OVERRATED = 2.0
 """Tuned: an iteration of photons may take so many times less than its pilot says (1.1 to 2.2 times
 in ten scenes)."""
+GOLDEN = (math.sqrt(5) - 1) / 2
+"""Multiples of this share of a whole are spread evenly, however many there are of them."""
 TRIAL_INDEX = 1 << 28
 """Iteration number of these samples: consecutive in the pixels' sequences."""
 MOST_INSTANCES = 64
@@ -265,11 +267,17 @@ def _clocked_samples(path, pixels):
 
 def _seconds_of_sample(path, count):
     """Seconds that one sample of each of the film's pixels takes, by so many paths of an iteration.
-    They are some runs of near ones, as in a render: apart, paths take up to twice as long."""
+    They are some runs of near ones, as in a render: apart, paths take up to twice as long. Runs
+    that follow each other are far apart: threads would else get unlike parts of the film, and wait
+    for each other."""
     total = film_sample_count(path.sensor) * path.camera_paths
     lane = lanes(count)
-    apart = max(total * TOGETHER // count, 1)
-    number = (lane // TOGETHER * apart + lane % TOGETHER) % total
+    runs = -(-count // TOGETHER)
+    step = round(GOLDEN * runs) or 1
+    while math.gcd(step, runs) > 1:
+        step += 1
+    place = lane // TOGETHER * step % runs
+    number = (place * (total // runs) + lane % TOGETHER) % total
     spectral = path._spectral(TRIAL_INDEX)
     pixel, index = path.pixels_and_indices(number)
     dr.eval(pixel, index)
@@ -299,9 +307,14 @@ def _samples(path, pixels, first):
 
 def _trial_of_path(path, values, prediction, budget, cost):
     """`path`, by the `values` of samples that `cost` so much, for a render of this `budget`. How
-    noisy caustics are that it meets by chance, photons tell: its few samples may have met none."""
-    share = share_left(path.integrator.denoised) / path.camera_paths
-    parts = parts_of_samples(path, values, prediction.mean, budget / cost, share)
+    noisy caustics are that it meets by chance, photons tell: its few samples may have met none. A
+    pixel is as bright as both say: where photons alone came out dark by chance, noise of `path`
+    would count too much."""
+    share = noise_left(path.integrator, path.sensor) / path.camera_paths
+    width = path.sensor.film().crop_size()[0]
+    mean = shrink_to_neighbours(values, neighbourhoods(width, prediction.pixels))
+    mean = (mean + prediction.mean) / 2
+    parts = parts_of_samples(path, values, mean, budget / cost, share)
     for measure, chance in prediction.chance.items():
         squared_bias, variance = parts[measure]
         parts[measure] = squared_bias, max(variance, share * chance)
@@ -329,6 +342,7 @@ def _variance_of_one(session, values, weights, samples):
 def _variance_of_samples(values, weights, samples):
     """Variance of the mean of so many samples a pixel: what `values` (trials, pixels) of
     samples that are consecutive in the pixels' sequences extrapolate to."""
-    lengths, found, counts = contrasts(values, np.ones(len(values), bool), 1)
-    pooled = [[trimmed_mean(weights * contrast)] for contrast in found]
-    return float(extrapolated(lengths, np.array(pooled), counts, samples)[0])
+    lengths, found, _ = contrasts(values, np.ones(len(values), bool), 1)
+    return variance_by_power(
+        lengths, np.array([trimmed_mean(weights * contrast) for contrast in found]), samples
+    )

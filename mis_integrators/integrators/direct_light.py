@@ -21,7 +21,6 @@ from ..paths.light_classes import by_class, class_of
 from ..paths.setting import CameraPass
 from ..photons.queries import Queries, trace_camera_paths
 from ..pilot.cost import USUAL_PHOTONS
-from ..pilot.denoiser import share_left
 from ..pilot.direct_paths import (
     COST,
     EXPONENTS,
@@ -36,6 +35,7 @@ from ..pilot.direct_paths import (
 from ..pilot.noise import MEASURES
 from ..pilot.run import PILOT_INDEX
 from ..pilot.setting import UNPLANNED_ITERATIONS
+from .common import noise_left
 from .purposes import DIRECT
 
 INDICES = 2**32
@@ -140,7 +140,7 @@ class DirectLight:
             pixels = (rows[:, None] * width + columns).ravel()
             found = measure(self._trials(pixels), len(columns))
             noise = DirectNoise(*(values[nearest] for values in found))
-            self.noise = noise.times(share_left(self.session.integrator.denoised))
+            self.noise = noise.times(noise_left(self.session.integrator, self.session.sensor))
         return self.noise
 
     def _trials(self, pixels):

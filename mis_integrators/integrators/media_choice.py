@@ -15,7 +15,6 @@ import numpy as np
 from ..core.spectra import channel_mean
 from ..core.traits import UnsupportedScene
 from ..paths.layers import written
-from ..pilot.denoiser import share_left
 from ..pilot.setting import UNPLANNED_ITERATIONS
 from ..volume.views import views_of
 from .choice import (
@@ -32,6 +31,7 @@ from .choice import (
     trial_of_photons,
     why_blind,
 )
+from .common import noise_left
 
 CAMERA, PHOTONS = "volpath_multiview", "bdpm"
 CANDIDATES = {CAMERA: {}, PHOTONS: {"bdd": 0}}
@@ -125,6 +125,6 @@ def _trial_of_camera_paths(session, prediction, budget):
     values = np.empty((PATH_TRIALS, pixels.count))
     for number in range(PATH_TRIALS):
         values[number] = channel_mean(session.radiance(TRIAL_INDEX, numbers, number))
-    share = share_left(session.integrator.denoised)
+    share = noise_left(session.integrator, session.sensor)
     parts = parts_of_samples(session, values, prediction.mean, budget, share)
     return Trial(CAMERA, session, parts, 1.0)

@@ -317,12 +317,16 @@ class EnvironmentGuide:
         the records' rows."""
         cells = POSITION_CELLS**2
         seen = pmf.any(axis=1)
-        found = pmf[seen].reshape(-1, POSITION_CELLS, POSITION_CELLS)
-        pmf[seen] = smoothed(found, LEVEL_SHARES).reshape(-1, cells)
-        total = pmf.sum(axis=1)
-        pmf /= np.maximum(total, 1e-300)[:, None]
-        self._pmf = from_numpy(mi.Float, pmf.ravel())
-        self._cdf = from_numpy(mi.Float, np.cumsum(pmf, axis=1).ravel())
+        found = smoothed(pmf[seen].reshape(-1, POSITION_CELLS, POSITION_CELLS), LEVEL_SHARES)
+        found = found.reshape(-1, cells)
+        total = np.zeros(self.row_count)
+        total[seen] = found.sum(axis=1)
+        found /= np.maximum(total[seen], 1e-300)[:, None]
+        table = np.zeros((self.row_count, cells), np.float32)
+        table[seen] = found
+        self._pmf = from_numpy(mi.Float, table.ravel())
+        table[seen] = np.cumsum(found, axis=1)
+        self._cdf = from_numpy(mi.Float, table.ravel())
         guided = np.where(total > 0, 1 - DEFENSIVE_SHARE, 0.0)
         if self.portals is not None:
             met = np.bincount(row, minlength=self.row_count)

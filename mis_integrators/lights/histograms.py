@@ -42,14 +42,25 @@ def smoothed(grids, shares):
     """Square histograms (rows, n, n) mixed with coarser versions of themselves, so that a cell that
     the pilot happened to miss beside cells that it met is not left to the plain density (whose few
     samples would carry huge flux). `shares`: of full, half, quarter, ... resolution."""
-    rows, n, _ = grids.shape
-    result = shares[0] * grids
+    levels = [shares[0] * grids]
+    coarse = grids
     for level, share in enumerate(shares[1:], start=1):
-        size = 1 << level
-        coarse = grids.reshape(rows, n // size, size, n // size, size).sum(axis=(2, 4))
-        padded = np.pad(coarse, ((0, 0), (1, 1), (1, 1)))
-        m = n // size
-        spread = sum(padded[:, i : i + m, j : j + m] for i in range(3) for j in range(3)) / 9
-        mixed = (0.5 * coarse + 0.5 * spread) / size**2
-        result = result + share * np.repeat(np.repeat(mixed, size, axis=1), size, axis=2)
+        rows, n, _ = coarse.shape
+        coarse = coarse.reshape(rows, n // 2, 2, n // 2, 2).sum(axis=(2, 4))
+        around = _sums_of_three(_sums_of_three(coarse, 1), 2) / 9
+        levels.append(share * 0.5 ** (2 * level + 1) * (coarse + around))
+    result = levels.pop()
+    while levels:
+        result = np.repeat(np.repeat(result, 2, axis=1), 2, axis=2)
+        result += levels.pop()
     return result
+
+
+def _sums_of_three(grids, axis: int):
+    """Sums of each cell with both of its neighbours along an axis; there is nothing beyond the
+    ends."""
+    grids = np.swapaxes(grids, axis, -1)
+    sums = grids.copy()
+    sums[..., 1:] += grids[..., :-1]
+    sums[..., :-1] += grids[..., 1:]
+    return np.swapaxes(sums, axis, -1)

@@ -77,6 +77,7 @@ def noise_by_radius(
     photons_only: bool = True,
     alike: bool = False,
     light_paths: float = 1.0,
+    filter_share: float = 1.0,
 ) -> Noise:
     """The `Noise` of estimates.
 
@@ -94,6 +95,8 @@ def noise_by_radius(
     light_paths
         How many times as many light sub-paths as in these iterations V is for: noise of photons
         falls with their number.
+    filter_share
+        See `setting.PilotSetting`.
     """
     variance = _means(weights * variance_left(samples))
     disks = np.count_nonzero(samples.mean(axis=2), axis=(0, 2)) if alike else None
@@ -103,7 +106,7 @@ def noise_by_radius(
         own = _means(weights * own_variance_left(samples)) if told_apart else variance
         floor = min(own.min(), variance.min())
     photons = bounded_by_larger_disks(radii, variance, floor, disks) - floor
-    return Noise(photons / light_paths, floor)
+    return Noise(photons / light_paths, filter_share * floor)
 
 
 def _means(values: np.ndarray) -> np.ndarray:

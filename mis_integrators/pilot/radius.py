@@ -107,6 +107,7 @@ def error_by_radius(
     photons_only: bool = True,
     alike: bool = False,
     light_paths: float = 1.0,
+    filter_share: float = 1.0,
 ) -> ErrorByRadius:
     """The `ErrorByRadius` of estimates at the `radii` of the ladder. A ladder of one radius is
     given: its disks are so small that they do not blur.
@@ -119,14 +120,16 @@ def error_by_radius(
         The same corrected at edges.
     weights : (pixels,)
         Of the pixels' squared errors, see `noise.MEASURES`.
-    photons_only, alike, light_paths
+    photons_only, alike, light_paths, filter_share
         See `noise.noise_by_radius`.
     """
     fine = np.exp(np.linspace(np.log(radii[0]), np.log(radii[-1]), 16 * len(radii)))
     if not np.any(plain):
         return ErrorByRadius(radii, fine, {}, {})
     noise = {
-        which: noise_by_radius(radii, samples, weights, photons_only, alike, light_paths)
+        which: noise_by_radius(
+            radii, samples, weights, photons_only, alike, light_paths, filter_share
+        )
         for which, samples in ((False, plain), (True, corrected))
         if samples is not None
     }

@@ -282,6 +282,7 @@ def measure(
                 (setting.at_first_vertex and not setting.passes_lobes) or kind == "seen_caustic",
                 kind == "caustic",
                 setting.light_paths,
+                setting.filter_share,
             )
     caustics = sum(np.mean(middle[kind]) for kind in ("seen_caustic", "caustic") if kind in middle)
     return PilotResult(
@@ -290,7 +291,10 @@ def measure(
         seconds,
         {kind: count * setting.light_paths for kind, count in samples.photons.items()},
         errors,
-        {measure: direct_variance(samples.direct, weights[measure]) for measure in MEASURES},
+        {
+            measure: setting.filter_share * direct_variance(samples.direct, weights[measure])
+            for measure in MEASURES
+        },
         {
             measure: direct_variance(samples.joined, weights[measure]) / setting.light_paths
             if samples.joined is not None

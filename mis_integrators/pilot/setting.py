@@ -64,6 +64,9 @@ class PilotSetting:
     """Of what volume photons are found in: disks across beams, or balls."""
     joins_sensor: bool = False
     """Whether photons are joined with the sensor, too."""
+    filter_share: float = 1.0
+    """What the film's reconstruction filter leaves of noise that is independent from pixel to
+    pixel. (A pilot's pixels are boxes.)"""
 
     def dimensions(self, kind: str) -> int:
         """Power of the radius with which the number of photons grows."""

@@ -9,6 +9,7 @@ from mis_integrators.core.stratified_variance import (
     GROUP,
     contrasts,
     groups_of_alike,
+    variance_by_power,
     variance_law,
     variance_ratio,
 )
@@ -42,6 +43,23 @@ def test_law_is_a_sum_of_covariances(power):
         assert variance_law(power, below, beyond) == pytest.approx(expected, rel=1e-12)
     for m in (1, 2, 8, 64):
         assert variance_law(power, m) == pytest.approx(m**-power, rel=1e-12)
+
+
+def test_variance_by_power_of_known_laws():
+    """Exact for independent numbers, and wherever one knows V within the blocks; beyond, half of
+    the power above one is left. What has no noise has none, and where the last contrast is noise
+    below zero or alone, the power is one."""
+    lengths = 2.0 ** np.arange(5)
+    for count in (1, 3, 32, 33, 1000):
+        assert variance_by_power(lengths, 1 / (2 * lengths), count) == pytest.approx(1 / count)
+    steep = lengths**-1.5 - (2 * lengths) ** -1.5
+    left = variance_by_power(lengths, steep, 32)
+    assert left == pytest.approx(steep[-1] * 2**0.125 / (2**1.25 - 1))
+    assert variance_by_power(lengths, steep, 4) == pytest.approx(4**-1.5 - 32**-1.5 + left)
+    assert variance_by_power(lengths, steep, 512) == pytest.approx(left * 16**-1.25)
+    assert variance_by_power(lengths, 0 * lengths, 8) == pytest.approx(0, abs=1e-20)
+    assert variance_by_power(lengths, np.array([2, 1, 1, 1, 0]), 64) == 0
+    assert variance_by_power(lengths[:1], np.array([0.5]), 10) == pytest.approx(0.1)
 
 
 def test_contrasts_are_those_of_complete_blocks():
