@@ -832,7 +832,7 @@ MUTATIONS = [
         "tests/integrators/test_denoised.py::test_of_the_noise_of_path_a_denoiser_leaves_its_share",
     ),
     Mutation(
-        "integrators/common.py",
+        "integrators/noise_left.py",
         "share_left(integrator.denoised) * filter_share(sensor.film().rfilter())",
         "share_left(integrator.denoised)",
         "all noise of path counts where the film's reconstruction filter leaves little of it",

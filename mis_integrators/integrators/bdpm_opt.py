@@ -15,7 +15,8 @@ from ..photons.frozen import SurfacePhotons, VolumePhotons
 from ..photons.irradiance_cache import IrradianceCache
 from ..photons.kernel_sums import ball_volume
 from ..photons.trace import trace_light_paths
-from .common import MOST_LIGHT_PATHS, noise_left
+from .common import MOST_LIGHT_PATHS
+from .noise_left import noise_left
 from .parameters import ParameterError
 from .published_optimal import (
     PHOTONS_A_PATH,

@@ -27,7 +27,7 @@ from ..paths.path_length_statistics import mean_segments
 from ..pilot.noise import MEASURES, shrink_to_neighbours, trimmed_mean
 from ..pilot.setting import UNPLANNED_ITERATIONS, neighbourhoods
 from . import costs
-from .common import noise_left
+from .noise_left import noise_left
 from .unidirectional import PathSession
 
 CAMERA, PHOTONS = "path", "bdpm"

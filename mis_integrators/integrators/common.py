@@ -10,13 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.film import (
-    Accumulator,
-    direct_channels,
-    filter_share,
-    shared_wavelengths,
-    variance_channels,
-)
+from ..core.film import Accumulator, direct_channels, shared_wavelengths, variance_channels
 from ..core.random import mix, reversed_bits
 from ..core.recording import lanes, settle
 from ..core.render_lock import render_lock, under_render_lock
@@ -38,7 +32,6 @@ from ..paths.camera import film_sample_count
 from ..paths.layers import CHANNELS, channel_names, render_layers, written
 from ..paths.light_classes import CLASSES
 from ..paths.setting import CameraPass, LightPass, Limits, World
-from ..pilot.denoiser import share_left
 from ..pilot.run import PILOT_INDEX
 from .parameters import Parameters
 from .purposes import SURFACES, WAVELENGTH
@@ -52,12 +45,6 @@ MOST_PATHS = 2**32 - 1
 """Camera paths of an iteration at most: their numbers have 32 bits."""
 MOST_LIGHT_PATHS = 2**28
 """Light sub-paths of an iteration at most: the words of their photons are numbered with 32 bits."""
-
-
-def noise_left(integrator, sensor):
-    """What counts of noise that is independent from pixel to pixel, as that of camera paths is:
-    what the film's reconstruction filter leaves, and a denoiser where the image will see one."""
-    return share_left(integrator.denoised) * filter_share(sensor.film().rfilter())
 
 
 class IterativeIntegrator(mi.AdjointIntegrator):

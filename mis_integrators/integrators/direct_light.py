@@ -35,7 +35,7 @@ from ..pilot.direct_paths import (
 from ..pilot.noise import MEASURES
 from ..pilot.run import PILOT_INDEX
 from ..pilot.setting import UNPLANNED_ITERATIONS
-from .common import noise_left
+from .noise_left import noise_left
 from .purposes import DIRECT
 
 INDICES = 2**32

@@ -31,7 +31,7 @@ from .choice import (
     trial_of_photons,
     why_blind,
 )
-from .common import noise_left
+from .noise_left import noise_left
 
 CAMERA, PHOTONS = "volpath_multiview", "bdpm"
 CANDIDATES = {CAMERA: {}, PHOTONS: {"bdd": 0}}
