@@ -187,6 +187,7 @@ class BDPMOptSession(WeightedSession):
     def __init__(self, integrator, scene, sensor, seed, iterations):
         self.cache = self.neighbour_radiance = self.fluence = None
         super().__init__(integrator, scene, sensor, seed, iterations)
+        self.noise_left = noise_left(integrator, sensor)
 
     @property
     def points(self):
@@ -277,7 +278,7 @@ class BDPMOptSession(WeightedSession):
             caustic_cost=merge_settings["caustic_cost"],
             strategies=integrator.strategies,
             first=integrator.first_vertex,
-            camera_paths=self.camera_paths / noise_left(integrator, self.sensor),
+            camera_paths=self.camera_paths / self.noise_left,
             full=integrator.weights == "full",
             mix_diffuse=integrator.mix_diffuse,
             fluence=self.fluence,
