@@ -66,7 +66,7 @@ def filter_share(rfilter):
     x = ((np.arange(steps) + 0.5) / steps * 2 - 1) * radius
     values = np.array(rfilter.eval(mi.Float(x.astype(np.float32))), np.float64)
     across = np.sum(values**2) / np.sum(values) ** 2 * steps / (2 * radius)
-    return float(min(across, 1.0) ** 2)
+    return float(across**2)
 
 
 def splat_samples(film, position, radiance, alpha, matrix, active, weight=1, classes=()):

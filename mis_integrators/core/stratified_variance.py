@@ -27,12 +27,14 @@ import numpy as np
 TILE, GROUP = 16, 16
 """Tuned: width of the tiles in which pixels are grouped, and pixels a group, about."""
 MOST_POWER = 2.0
-"""Power with which the variance falls where edges across one dimension make it: what contrasts show
-beyond is their noise."""
+"""Power with which the variance falls where edges across one dimension make it. What few samples
+show beyond is noise, or does not last."""
 STEEP_SHARE = 0.5
 """Tuned: how much of the power above one is left, on average, from the longest contrast to a few
-hundred iterations. (In fourteen scenes 32 samples told the variance of 512 to 0.7 to 1.4 times, and
-a sum of laws as of `extrapolated` to 0.9 to 2.5 times.)"""
+hundred iterations. (In fourteen scenes 32 samples told the variance of 512 to 0.7 to 1.5 times, and
+a sum of laws as of `extrapolated` to 0.9 to 7 times.)"""
+LASTING = 16
+"""Longest blocks beyond which no power but one is known to last."""
 FITS = 4
 """Times that the extrapolation is fitted, each with weights by the one before."""
 
@@ -135,16 +137,19 @@ def variance_by_power(lengths: np.ndarray, contrast: np.ndarray, count: float) -
     means over so many pixels that they have next to no noise.
 
     Up to the longest block V is the sum of contrasts and what is left beyond. There it falls with a
-    power of the length: the last two contrasts show one, which sinks towards one, and
-    `STEEP_SHARE` tells how far. Both tell where it begins."""
+    power of the length, up to `LASTING` blocks: the last two contrasts show one, which sinks
+    towards one, and `STEEP_SHARE` tells how far. Both tell where it begins."""
     block, power, last = 2 * lengths[-1], 1.0, contrast[-1]
-    if len(contrast) > 1 and min(contrast[-2:]) > 0:
+    if len(contrast) > 1 and last <= 0:
+        last = contrast[-2] / 2  # few pixels may show none by chance
+    elif len(contrast) > 1 and contrast[-2] > 0:
         shown = np.log2(contrast[-2] / contrast[-1])
         power += STEEP_SHARE * np.clip(shown - 1, 0, MOST_POWER - 1)
         last = np.sqrt(contrast[-1] * contrast[-2] * 2**-power)
     left = last / (2**power - 1)
     if count >= block:
-        return float(left * (count / block) ** -power)
+        blocks = count / block
+        return float(left * min(blocks, LASTING) ** -power / max(blocks / LASTING, 1))
     variance = left + np.append(np.cumsum(contrast[::-1])[::-1], 0)
     known = np.log(np.maximum(variance, 1e-30))
     return float(np.exp(np.interp(np.log(count), np.log(np.append(lengths, block)), known)))

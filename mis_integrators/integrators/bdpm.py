@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ..core.film import as_camera_weights, expected_weight, filter_share, with_colour
+from ..core.film import as_camera_weights, expected_weight, with_colour
 from ..core.recording import recorder
 from ..paths.camera import film_sample_count, film_size
 from ..paths.layers import CHANNELS, SPLIT
@@ -19,6 +19,7 @@ from ..pilot.setting import PilotSetting, light_shares, pilot_light_paths
 from .caustic_radii import CausticRadii
 from .common import MOST_LIGHT_PATHS, IterativeIntegrator
 from .direct_light import DirectLight
+from .noise_left import noise_left
 from .photon_passes import PhotonPasses
 from .pilot_passes import SubsetPasses
 from .purposes import CAMERA, LIGHT
@@ -304,7 +305,7 @@ class BDPMSession(PhotonPasses):
             seconds=self.seconds,
             light_paths=self.iteration_light_paths / self.light_path_count,
             denoised=integrator.denoised,
-            filter_share=filter_share(self.sensor.film().rfilter()),
+            filter_share=1.0 if integrator.denoised else noise_left(integrator, self.sensor),
             light_shares=light_shares(self.iteration_light_paths) if chooses else (1.0,),
             volume_dimensions=3 if self.points else 2,
             joins_sensor=self.near_zone is not None,

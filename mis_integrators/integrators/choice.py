@@ -21,7 +21,7 @@ from ..core.recording import lanes
 from ..core.spectra import channel_mean
 from ..core.stratified_variance import contrasts, variance_by_power
 from ..core.traits import SceneTraits, UnsupportedScene
-from ..paths.camera import film_sample_count
+from ..paths.camera import film_sample_count, film_size
 from ..paths.layers import written
 from ..paths.path_length_statistics import mean_segments
 from ..pilot.noise import MEASURES, shrink_to_neighbours, trimmed_mean
@@ -37,7 +37,8 @@ FOR_DENOISERS = {PHOTONS: {"bdd": 1}}
 """Parameters in place of these where the image will be denoised: nearly all noise is then that of
 camera paths, which a denoiser takes away."""
 PATH_TRIALS = 16
-"""Tuned: samples of `path` on each of the pilot's pixels; a power of two."""
+"""Tuned: samples of `path` on each of the pilot's pixels, and twice as many in a render of a given
+time; a power of two."""
 TOGETHER = 512
 """Paths of a run that tells the time of all."""
 OVERRATED = 2.0
@@ -273,7 +274,7 @@ def _seconds_of_sample(path, count):
     total = film_sample_count(path.sensor) * path.camera_paths
     lane = lanes(count)
     runs = -(-count // TOGETHER)
-    step = round(GOLDEN * runs) or 1
+    step = round(GOLDEN * runs)
     while math.gcd(step, runs) > 1:
         step += 1
     place = lane // TOGETHER * step % runs
@@ -307,24 +308,23 @@ def _samples(path, pixels, first):
 
 def _trial_of_path(path, values, prediction, budget, cost):
     """`path`, by the `values` of samples that `cost` so much, for a render of this `budget`. How
-    noisy caustics are that it meets by chance, photons tell: its few samples may have met none. A
-    pixel is as bright as both say: where photons alone came out dark by chance, noise of `path`
-    would count too much."""
+    noisy caustics are that it meets by chance, photons tell: its few samples may have met none."""
     share = noise_left(path.integrator, path.sensor) / path.camera_paths
-    width = path.sensor.film().crop_size()[0]
-    mean = shrink_to_neighbours(values, neighbourhoods(width, prediction.pixels))
-    mean = (mean + prediction.mean) / 2
-    parts = parts_of_samples(path, values, mean, budget / cost, share)
+    parts = parts_of_samples(path, values, prediction, budget / cost, share)
     for measure, chance in prediction.chance.items():
         squared_bias, variance = parts[measure]
         parts[measure] = squared_bias, max(variance, share * chance)
     return Trial(CAMERA, path, parts, cost * path.camera_paths)
 
 
-def parts_of_samples(session, values, mean, samples, share):
+def parts_of_samples(session, values, prediction, samples, share):
     """Those of a `Trial` of camera paths alone, by the `values` (trials, pixels) of a few samples
-    of pixels with this `mean`, where a render has so many `samples` a pixel; `share`: what counts
-    of their noise."""
+    of the pilot's pixels, where a render has so many `samples` a pixel; `share`: what counts of
+    their noise. A pixel is as bright as they and the photons of the `prediction` say: where these
+    alone came out dark by chance, the noise of others would count too much. (That of photons, which
+    is then small, hardly does.)"""
+    cells = neighbourhoods(film_size(session.sensor)[0], prediction.pixels)
+    mean = (shrink_to_neighbours(values, cells) + prediction.mean) / 2
     samples = max(round(samples), 1)
     return {
         measure: (0.0, share * _variance_of_one(session, values, weigh(mean), samples))

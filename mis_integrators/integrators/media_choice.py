@@ -126,5 +126,5 @@ def _trial_of_camera_paths(session, prediction, budget):
     for number in range(PATH_TRIALS):
         values[number] = channel_mean(session.radiance(TRIAL_INDEX, numbers, number))
     share = noise_left(session.integrator, session.sensor)
-    parts = parts_of_samples(session, values, prediction.mean, budget, share)
+    parts = parts_of_samples(session, values, prediction, budget, share)
     return Trial(CAMERA, session, parts, 1.0)

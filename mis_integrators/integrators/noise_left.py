@@ -8,6 +8,10 @@ from ..pilot.denoiser import share_left
 
 def noise_left(integrator, sensor):
     """Share of the variance of noise that is independent from pixel to pixel, as that of camera
-    paths is: what the film's reconstruction filter leaves, and a denoiser where the image will see
-    one."""
-    return share_left(integrator.denoised) * filter_share(sensor.film().rfilter())
+    paths is: what a denoiser leaves where the image will see one, else what the film's
+    reconstruction filter leaves. (A denoiser takes what the filter makes alike in near pixels for
+    detail. In spectral variants all paths of an iteration share their wavelengths: of the noise
+    that these make neither takes anything, though the share says so.)"""
+    if integrator.denoised:
+        return share_left(True)
+    return filter_share(sensor.film().rfilter())

@@ -116,7 +116,8 @@ class OptimalWeights:
     `IrradianceCache`; `neighbour_radiance`: a `NeighbourRadiance` of its cells (full weights only).
     `n`: photons per unit of irradiance in the merge disk (a spectrum of width one). `caustic_cost`:
     what merging a caustic photon costs in units of merging another one (width one). `camera_paths`:
-    N_B; where noise counts that a denoiser leaves, F + d B in place of F + B, it is N_B / d.
+    N_B; where noise counts that a denoiser or the film's filter leaves, F + d B in place of
+    F + B, it is N_B / d.
     `mix_diffuse`:
     whether strategies go on beyond Lambertian vertices; else the first of these is a path's last
     strategy. In scenes with media, which have local weights only, `fluence` is the

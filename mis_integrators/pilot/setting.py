@@ -66,7 +66,7 @@ class PilotSetting:
     """Whether photons are joined with the sensor, too."""
     filter_share: float = 1.0
     """What the film's reconstruction filter leaves of noise that is independent from pixel to
-    pixel. (A pilot's pixels are boxes.)"""
+    pixel, where no denoiser does. (A pilot's pixels are boxes.)"""
 
     def dimensions(self, kind: str) -> int:
         """Power of the radius with which the number of photons grows."""

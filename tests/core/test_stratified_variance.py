@@ -48,7 +48,7 @@ def test_law_is_a_sum_of_covariances(power):
 def test_variance_by_power_of_known_laws():
     """Exact for independent numbers, and wherever one knows V within the blocks; beyond, half of
     the power above one is left. What has no noise has none, and where the last contrast is noise
-    below zero or alone, the power is one."""
+    alone or shows nothing, the power is one, as it is beyond what is known to last."""
     lengths = 2.0 ** np.arange(5)
     for count in (1, 3, 32, 33, 1000):
         assert variance_by_power(lengths, 1 / (2 * lengths), count) == pytest.approx(1 / count)
@@ -58,7 +58,8 @@ def test_variance_by_power_of_known_laws():
     assert variance_by_power(lengths, steep, 4) == pytest.approx(4**-1.5 - 32**-1.5 + left)
     assert variance_by_power(lengths, steep, 512) == pytest.approx(left * 16**-1.25)
     assert variance_by_power(lengths, 0 * lengths, 8) == pytest.approx(0, abs=1e-20)
-    assert variance_by_power(lengths, np.array([2, 1, 1, 1, 0]), 64) == 0
+    assert variance_by_power(lengths, np.array([2.0, 1, 1, 1, 0]), 64) == pytest.approx(0.25)
+    assert variance_by_power(lengths, steep, 2048) == pytest.approx(left * 16**-1.25 / 4)
     assert variance_by_power(lengths[:1], np.array([0.5]), 10) == pytest.approx(0.1)
 
 

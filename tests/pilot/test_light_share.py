@@ -56,6 +56,20 @@ def choice_of(setting, photons, paths, seed=0):
     return result, result.choose(1000)
 
 
+def test_of_camera_noise_a_filter_leaves_its_share():
+    """Of what is there at every radius, and of nothing else."""
+    random = np.random.default_rng(5)
+    own = random.normal(size=(ITERATIONS, 1, 1, 4096))
+    shared = random.normal(size=(ITERATIONS, 1, 1, 4096)) / (RADII / RADII[3])[:, None, None]
+    weights = np.ones(4096)
+    all_of_it, left = (
+        noise_by_radius(RADII, own + shared, weights, photons_only=False, filter_share=share)
+        for share in (1.0, 0.3)
+    )
+    assert left.floor == pytest.approx(0.3 * all_of_it.floor) and left.floor > 0.25
+    np.testing.assert_array_equal(left.photons, all_of_it.photons)
+
+
 @pytest.mark.parametrize("denoised", [False, True])
 @pytest.mark.parametrize("ratio", [0.02, 0.2, 2.0, 20.0])
 def test_share_is_that_of_the_least_error_in_the_time(denoised, ratio):
