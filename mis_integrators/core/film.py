@@ -55,6 +55,14 @@ def colour_channels(radiance, matrix):
     return radiance
 
 
+def filter_line(rfilter, steps=512):
+    """Places across a reconstruction filter, from its centre, and the integral of one of its two
+    factors from each halfway to the next: (steps,) each."""
+    radius = float(rfilter.radius())
+    x = (np.arange(steps) + 0.5) / steps * 2 * radius - radius
+    return x, np.array(rfilter.eval(mi.Float(x.astype(np.float32)))) * (2 * radius / steps)
+
+
 def filter_share(rfilter):
     """What a film's reconstruction filter leaves of the variance of noise that is independent from
     pixel to pixel: the integral of its square, one for a box of a pixel. (In a corridor `path` has
@@ -62,10 +70,8 @@ def filter_share(rfilter):
     0.32 here.)"""
     if rfilter.is_box_filter():
         return 1.0
-    radius, steps = float(rfilter.radius()), 1024
-    x = ((np.arange(steps) + 0.5) / steps * 2 - 1) * radius
-    values = np.array(rfilter.eval(mi.Float(x.astype(np.float32))), np.float64)
-    across = np.sum(values**2) / np.sum(values) ** 2 * steps / (2 * radius)
+    x, values = filter_line(rfilter)
+    across = np.sum(values**2) / np.sum(values) ** 2 / (x[1] - x[0])
     return float(across**2)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ..core.film import filter_share
-from ..pilot.denoiser import share_left
+from ..pilot.denoiser import LEFT
 
 
 def noise_left(integrator, sensor):
@@ -13,5 +13,5 @@ def noise_left(integrator, sensor):
     detail. In spectral variants all paths of an iteration share their wavelengths: of the noise
     that these make neither takes anything, though the share says so.)"""
     if integrator.denoised:
-        return share_left(True)
+        return LEFT
     return filter_share(sensor.film().rfilter())

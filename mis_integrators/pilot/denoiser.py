@@ -26,11 +26,6 @@ GROUPS = 2
 """Groups of camera paths, through near pixels, of a pilot that tells shared noise from other."""
 
 
-def share_left(denoised: bool) -> float:
-    """What counts of the noise of camera paths: all, or what a denoiser leaves."""
-    return LEFT if denoised else 1.0
-
-
 def variance_left(samples: np.ndarray) -> np.ndarray:
     """The variance that counts: (..., pixels).
 

@@ -15,7 +15,14 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.film import add_squares, colour_channels, spread, unfinite_pixels, zero_where
+from ..core.film import (
+    add_squares,
+    colour_channels,
+    filter_line,
+    spread,
+    unfinite_pixels,
+    zero_where,
+)
 from ..core.sums import Sums
 
 SHARED = 4
@@ -64,14 +71,12 @@ def expected_weights(views):
     return mi.TensorXf(image)
 
 
-def _line_weights(rfilter, size, border, steps=512):
+def _line_weights(rfilter, size, border):
     """Integral over the sampled interval [-border, size + border] of the filter centred on each of
     `size` pixels."""
     if rfilter.is_box_filter():
         return np.ones(size, dtype=np.float32)
-    radius = float(rfilter.radius())
-    x = (np.arange(steps) + 0.5) / steps * 2 * radius - radius
-    values = np.array(rfilter.eval(mi.Float(x.astype(np.float32)))) * (2 * radius / steps)
+    x, values = filter_line(rfilter)
     centres = np.arange(size)[:, None] + 0.5
     inside = (centres + x >= -border) & (centres + x <= size + border)
     return (values * inside).sum(axis=1).astype(np.float32)

@@ -47,8 +47,8 @@ def test_law_is_a_sum_of_covariances(power):
 
 def test_variance_by_power_of_known_laws():
     """Exact for independent numbers, and wherever one knows V within the blocks; beyond, half of
-    the power above one is left. What has no noise has none, and where the last contrast is noise
-    alone or shows nothing, the power is one, as it is beyond what is known to last."""
+    the power above one is left. What has no noise has none, and where the last contrast is
+    the only one or shows nothing, the power is one, as it is beyond what is known to last."""
     lengths = 2.0 ** np.arange(5)
     for count in (1, 3, 32, 33, 1000):
         assert variance_by_power(lengths, 1 / (2 * lengths), count) == pytest.approx(1 / count)
