@@ -1013,4 +1013,11 @@ MUTATIONS = [
         "layers lack the merged light of all rounds but the last",
         "tests/integrators/test_aovs.py::test_split_of_merges_in_rounds",
     ),
+    Mutation(
+        "pilot/run.py",
+        "settled is not None and done == FEWEST_ITERATIONS and settled(found := result())",
+        "settled is not None and done == FEWEST_ITERATIONS and (found := result())",
+        "pilots end after their fewest iterations where photons render, too",
+        "tests/integrators/test_auto.py::test_the_pilot_ends_once_path_has_won",
+    ),
 ]

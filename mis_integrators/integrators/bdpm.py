@@ -314,12 +314,12 @@ class BDPMSession(PhotonPasses):
     def pilot_passes(self, setting, pixels):
         return SubsetPasses(self, setting, pixels, CAMERA)
 
-    def _run_pilot(self):
+    def _run_pilot(self, settled=None):
         """With a pilot's light sub-paths."""
         if not self.needs_pilot:
-            return super()._run_pilot()
+            return super()._run_pilot(settled)
         self._use_light_paths(pilot_light_paths(self.iteration_light_paths))
-        pilot = super()._run_pilot()
+        pilot = super()._run_pilot(settled)
         self._use_light_paths(self.iteration_light_paths)
         return pilot
 
@@ -364,6 +364,9 @@ class BDPMSession(PhotonPasses):
         super()._take(choice)
         if choice.prediction is not None and not self.kept:  # those that are kept have their radii
             self.caustic_radii.plan(max(choice.prediction.iterations, 1))
+
+    def _foresee(self, choice):
+        super()._foresee(choice)
         if self.prediction is None:
             self.direct_light.choose_paths()
         else:

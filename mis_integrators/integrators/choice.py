@@ -9,8 +9,9 @@ both renders: the other would lose more in one of them than it wins in the other
 
 from __future__ import annotations
 
+import functools
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -128,35 +129,65 @@ def choose(integrator, scene, sensor, seed, iterations, seconds):
     photons.plan_time(seconds)
     if photons.has_caustics and not integrator.splits_light and not camera_paths_are_blind(photons):
         photons.judge_chance()
-    photons.predict()
+    contest = Contest(path, photons, iterations, seconds)
+    photons.predict(contest.path_wins)
     prediction = photons.prediction
     if prediction is None:
         reason = "no camera path meets a surface that scatters smoothly"
         return Decision(*alone, [f"{alone[0]}: {reason}"])
-
-    planned = prediction.iterations if seconds else iterations or UNPLANNED_ITERATIONS
-    if integrator.splits_light:
-        excluded = f"not {CAMERA}: it does not split the light"
-    else:
-        excluded = why_blind(CAMERA, photons, prediction)
-    if excluded:
+    if excluded := why_not_path(photons):
+        planned = contest.planned
         return decide([trial_of_photons(PHOTONS, photons, 1.0)], [excluded], planned, 1.0)
-
-    if seconds:
-        usual = photons.expected_seconds
-        values, cost = _clocked_samples(path, prediction.pixels)
-    else:
-        usual, cost = _counted_costs(path, photons)
-        values = _samples(path, prediction.pixels, 0)
-    budget = planned * usual
-    alone = _trial_of_path(path, values, prediction, budget, cost)
-    if seconds and alone.product(budget) > trial_of_photons(
-        PHOTONS, photons, usual / OVERRATED
-    ).product(budget):
+    trials, budget, usual = contest.trials()
+    if seconds and not contest.path_wins():
         photons.start()  # its first iterations tell the time, and are kept
-        usual, budget = photons.iteration_seconds, photons.seconds_left
-        alone = _trial_of_path(path, values, prediction, budget, cost)
-    return decide([alone, trial_of_photons(PHOTONS, photons, usual)], [], budget, usual)
+        trials, budget, usual = contest.trials(timed=True)
+    return decide(trials, [], budget, usual)
+
+
+class Contest:
+    """`path` against the photon mapper, in a render of so many iterations of the latter, or of so
+    many seconds: by as much as is known when it is asked."""
+
+    def __init__(self, path, photons, iterations, seconds):
+        self.path, self.photons, self.seconds = path, photons, seconds
+        self.iterations = iterations or UNPLANNED_ITERATIONS
+
+    @property
+    def planned(self):
+        """Iterations of the photon mapper."""
+        return self.photons.prediction.iterations if self.seconds else self.iterations
+
+    @functools.cached_property
+    def _samples(self):
+        """Of `path`, and the seconds of one where those are planned."""
+        pixels = self.photons.prediction.pixels
+        if self.seconds:
+            return _clocked_samples(self.path, pixels)
+        return _samples(self.path, pixels, 0), None
+
+    def trials(self, timed=False):
+        """The `Trial`s of both, the budget, and what an iteration of photons costs: where their
+        first ones are `timed`, as much as these."""
+        photons, (values, cost) = self.photons, self._samples
+        if timed:
+            usual, budget = photons.iteration_seconds, photons.seconds_left
+        elif self.seconds:
+            usual = photons.expected_seconds
+            budget = self.planned * usual
+        else:
+            usual, cost = _counted_costs(self.path, photons)
+            budget = self.planned * usual
+        alone = _trial_of_path(self.path, values, photons.prediction, budget, cost)
+        return [alone, trial_of_photons(PHOTONS, photons, usual)], budget, usual
+
+    def path_wins(self):
+        """Whether `path` renders even if an iteration of photons is `OVERRATED`."""
+        if self.photons.prediction is None or why_not_path(self.photons):
+            return False
+        (alone, photons), budget, usual = self.trials()
+        photons = replace(photons, cost=usual / OVERRATED)
+        return alone.product(budget) <= photons.product(budget)
 
 
 def decide(trials, reasons, budget, usual):
@@ -231,6 +262,13 @@ def why_blind(plugin, session, prediction):
         share = f"{prediction.caustic_share:.1%} of the light"
         return f"not {plugin}: it cannot see the caustics, {share}"
     return None
+
+
+def why_not_path(photons):
+    """Why `path` is not tried against these photons, in one line; `None` if it is."""
+    if photons.integrator.splits_light:
+        return f"not {CAMERA}: it does not split the light"
+    return why_blind(CAMERA, photons, photons.prediction)
 
 
 def trial_of_photons(plugin, session, cost):

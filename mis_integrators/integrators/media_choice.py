@@ -59,7 +59,12 @@ def choose(integrator, scene, sensor, seed, iterations, seconds):
     photons, reason = _photons(render)
     if photons is not None:
         photons.plan_time(seconds)
-        photons.predict()
+
+        def camera_wins():
+            judged = photons.prediction and _judged(camera, photons, iterations, seconds)
+            return bool(judged) and judged.plugin == CAMERA
+
+        photons.predict(camera_wins)
         if photons.prediction is not None:
             return _judged(camera, photons, iterations, seconds)
         reason = "no camera path meets anything that scatters smoothly"

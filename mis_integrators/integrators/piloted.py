@@ -122,38 +122,49 @@ class PilotedSession(IterativeSession):
             untimed, self._untimed = self._untimed, None
             self._choose_by_clock(*untimed)
 
-    def predict(self):
+    def predict(self, settled=None):
         """Runs the pilot, if one is needed, and makes the first choice: enough for a `prediction`.
-        `start` does this, too, and times an iteration where there is a time limit."""
+        `start` does this, too, and times an iteration where there is a time limit. `settled`: asked
+        once there is a prediction by the pilot's fewest iterations, whether that will do."""
         self._end = now() + (math.inf if self.seconds is None else self.seconds)
-        pilot = self._run_pilot()
+
+        def enough(pilot):
+            self._choose_by(pilot, self._foresee)
+            return settled()
+
+        pilot = self._run_pilot(settled and enough)
         if pilot is None:
             self.radii = self.radii or {}
-        elif self.seconds is None:
-            self._take(pilot.choose(pilot.setting.planned_iterations))
         else:
-            guess = pilot.seconds * pilot.setting.light_paths
-            first = pilot.choose(self._left(guess) / guess)
-            self.gathering_seconds = guess * pilot.cost(first)
-            self._take(first)
-            self.expected_seconds = self.gathering_seconds * self.direct_cost()
-            if self.prediction is not None:
-                count = self.prediction.iterations / self.direct_cost()
-                self.prediction = self.prediction._replace(iterations=count)
-            self._untimed = pilot, first, guess
+            self._choose_by(pilot, self._take)
+
+    def _choose_by(self, pilot, take):
+        """Makes the first choice, which `take` is given."""
+        if self.seconds is None:
+            take(pilot.choose(pilot.setting.planned_iterations))
+            return
+        guess = pilot.seconds * pilot.setting.light_paths
+        first = pilot.choose(self._left(guess) / guess)
+        self.gathering_seconds = guess * pilot.cost(first)
+        take(first)
+        self.expected_seconds = self.gathering_seconds * self.direct_cost()
+        if self.prediction is not None:
+            count = self.prediction.iterations / self.direct_cost()
+            self.prediction = self.prediction._replace(iterations=count)
+        self._untimed = pilot, first, guess
 
     @property
     def needs_pilot(self):
         """Radii are not known, and there are photons to gather."""
         return self.radii is None and bool(self.kinds())
 
-    def _run_pilot(self):
-        """The `PilotResult`; None where no pilot is needed."""
+    def _run_pilot(self, settled=None):
+        """The `PilotResult`; None where no pilot is needed. `settled`: as of `run_pilot`."""
         if not self.needs_pilot:
             return None
         setting = self.pilot_setting()
         pixels = pilot_pixels(setting)
-        return run_pilot(setting, pixels, self.pilot_passes(setting, pixels), now)
+        return run_pilot(setting, pixels, self.pilot_passes(setting, pixels), now, settled)
 
     def _left(self, least):
         """Seconds that are left of the render, `least` at least."""
@@ -185,10 +196,15 @@ class PilotedSession(IterativeSession):
             self.kept.clear()
         changed = choice.corrected != self.corrected
         self.radii, self.corrected = dict(choice.radii), dict(choice.corrected)
-        self.prediction, self.light_share = choice.prediction, choice.light_share
+        self.light_share = choice.light_share
         self._use_light_share()
         if changed:
             self._record_camera_pass()
+        self._foresee(choice)
+
+    def _foresee(self, choice: Choice):
+        """Finds the `prediction` for this choice."""
+        self.prediction = choice.prediction
 
     @property
     def most_cost(self):

@@ -129,11 +129,11 @@ class WeightedSession(BDPMSession):
         with that `state` of the weights."""
         raise TypeError(f"{type(self).__name__} does not define beam_weigher")
 
-    def _run_pilot(self):
+    def _run_pilot(self, settled=None):
         """The weights are made before the pilot or after it, see `weighted_pilot`."""
         if self.weighted_pilot:
             self._begin_weighting()
-        pilot = super()._run_pilot()
+        pilot = super()._run_pilot(settled)
         self._begin_weighting()
         return pilot
 

@@ -83,6 +83,7 @@ def run_pilot(
     pixels: PilotPixels,
     passes: PilotPasses,
     now: Callable[[], float] = time.perf_counter,
+    settled: Callable[[PilotResult], bool] | None = None,
 ) -> PilotResult:
     """Runs as many iterations as the render's plan allows, and returns what they have measured.
 
@@ -96,6 +97,8 @@ def run_pilot(
         They trace those pixels, and gather all kinds and corrections of the setting.
     now
         The clock [s] of the render, by which the pilot's time is limited.
+    settled
+        Asked after the fewest iterations: whether what these have measured will do.
     """
     radii: dict[str, np.ndarray] = {}
     photons: dict[str, float] = {}
@@ -103,6 +106,21 @@ def run_pilot(
     direct: list[np.ndarray] = []
     chance: list[np.ndarray] = []
     joined: list[np.ndarray] = []
+
+    def result() -> PilotResult:
+        samples = None
+        if radii or np.any(joined):
+            samples = PilotSamples(
+                radii,
+                photons,
+                {key: np.array([step[key] for step in gathered]) for key in gathered[0]},
+                np.array(direct),
+                passes.seen(),
+                np.array(joined) if joined else None,
+                np.array(chance) if chance else None,
+            )
+        return measure(setting, pixels, samples, seconds)
+
     spent = 0.0
     for done in range(1, MOST_ITERATIONS + 1):
         start = now()
@@ -122,20 +140,9 @@ def run_pilot(
         spent += seconds if done > 1 else 0.0
         if not direct or has_enough(setting, done, spent):
             break
-    samples = None
-    if radii or np.any(joined):
-        of_all = {key: np.array([step[key] for step in gathered]) for key in gathered[0]}
-        of_photons = np.array(joined) if joined else None
-        samples = PilotSamples(
-            radii,
-            photons,
-            of_all,
-            np.array(direct),
-            passes.seen(),
-            of_photons,
-            np.array(chance) if chance else None,
-        )
-    return measure(setting, pixels, samples, seconds)
+        if settled is not None and done == FEWEST_ITERATIONS and settled(found := result()):
+            return found
+    return result()
 
 
 def has_enough(setting: PilotSetting, done: int, seconds: float) -> bool:

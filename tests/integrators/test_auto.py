@@ -498,6 +498,20 @@ def test_a_photon_mapper_that_wins_is_timed(rgb, monkeypatch):
     assert 0 < photons.prediction.iterations * each < 5.0
 
 
+@pytest.mark.parametrize("price, iterations", [(1e-4, 3), (1e4, 16)])
+def test_the_pilot_ends_once_path_has_won(rgb, monkeypatch, price, iterations):
+    """Its fewest iterations then, and else as many as the plan allows."""
+    from mis_integrators.integrators.pilot_passes import SubsetPasses
+
+    set_price_of_path(monkeypatch, price)
+    traced, trace = [], SubsetPasses.trace
+    monkeypatch.setattr(SubsetPasses, "trace", lambda *given: traced.append(given) or trace(*given))
+    session = auto().session(tray("lambertian", "rectangle"), spp=400)
+    session.start()
+    assert (session.decision.plugin == "path") == (price < 1)
+    assert len(traced) == iterations
+
+
 def test_a_photon_mapper_learns_once(rgb, monkeypatch):
     """One pilot a render, whatever is chosen."""
     from mis_integrators.integrators import piloted
