@@ -301,10 +301,17 @@ MUTATIONS = [
     ),
     Mutation(
         "photons/coverage.py",
-        "& (dr.abs(dr.dot(offset, normal)) < SAME_SURFACE_OFFSET * radius)",
-        "& (dr.abs(dr.dot(offset, normal)) < radius)",
+        "& within_disk(place, dr.squared_norm(place), normal, radius * SLACK)",
+        "& within_disk(place, dr.squared_norm(place), normal, radius * SLACK, 2 * radius)",
         "surfaces far below a disk count as covering it",
         "tests/photons",
+    ),
+    Mutation(
+        "photons/coverage.py",
+        "place += normal * dr.dot(hit.p - si.p - place, normal)",
+        "place = hit.p - si.p",
+        "steps down, whose photons count, are taken for edges",
+        "tests/photons/test_coverage.py",
     ),
     Mutation(
         "photons/grid.py",

@@ -13,25 +13,30 @@ import mitsuba as mi
 
 from ..core.random import vertex_streams
 from .curvature import bend
-from .gather import SAME_SURFACE_COSINE, SAME_SURFACE_OFFSET
+from .gather import SAME_SURFACE_COSINE, within_disk
 
 PROBES = 8
 """Tuned: probe rays of a merge disk."""
 HEIGHT = 0.25
 """Tuned: probes start this share of the radius above the vertex, or halfway to what is closer."""
-SMALLEST_SHARE = 0.4
-"""Tuned: right at a wall half of the disk is left. Smaller estimates come from clutter that the
-probes meet as often as from corners, and would brighten more than they mend."""
+SMALLEST_SHARE = 0.25
+"""Tuned: in a corner of three faces a quarter of the disk is left. Smaller estimates come from
+clutter that the probes meet as often as from thin legs, and would brighten more than they mend."""
+SLACK = 1.01
+"""Radius of probes over that of the disk: they may end right at its rim."""
 OWN_STREAM = 0x70726F62
 """Keeps the probes' random numbers apart from those of the camera paths, which share their seed."""
 
 
 @dr.syntax
 def covered_share(scene, vertices, si, radius, seed, active):
-    """Estimated share, in [0.4, 1], of the disk of `radius` around each vertex that lies on surface
-    seen from just above the vertex and like its own (same tests as for photons). Where the
+    """Estimated share, in [0.25, 1], of the disk of `radius` around each vertex that lies on
+    surface seen from just above the vertex and like its own (same tests as for photons). Where the
     surface is curved, so is the disk. `vertices` as of `read_queries`, `si` their surface
-    interactions, found with `gather.FLAGS`; width as theirs."""
+    interactions, found with `gather.FLAGS`; width as theirs.
+
+    A probe that slips past its place in the disk lands further out, on a step down, say, whose
+    photons count. So it stands for the point of that height right above or below its place."""
     normal = mi.Vector3f(dr.mulsign(si.n, -dr.dot(si.n, vertices["ray_d"])))
     bent = bend(si, mi.Frame3f(normal))
     rng = vertex_streams(vertices["path"], vertices["depth"], seed ^ OWN_STREAM)
@@ -51,7 +56,8 @@ def covered_share(scene, vertices, si, radius, seed, active):
         sine, cosine = dr.sincos(
             turn + dr.two_pi / outer * (mi.Float(probe) + dr.select(probe < outer, 0, 0.5))
         )
-        towards = bent.along(cosine, sine, distance) - height * normal
+        place = bent.along(cosine, sine, distance)
+        towards = place - height * normal
         hit = scene.ray_intersect(
             mi.Ray3f(start, dr.normalize(towards)),
             mi.RayFlags.Minimal,
@@ -59,12 +65,11 @@ def covered_share(scene, vertices, si, radius, seed, active):
             reorder=False,
             active=active,
         )
-        offset = hit.p - si.p
+        place += normal * dr.dot(hit.p - si.p - place, normal)
         same = (
             hit.is_valid()
             & (dr.dot(hit.n, si.n) > SAME_SURFACE_COSINE)
-            & (dr.abs(dr.dot(offset, normal)) < SAME_SURFACE_OFFSET * radius)
-            & (dr.squared_norm(offset) < dr.square(1.3 * radius))
+            & within_disk(place, dr.squared_norm(place), normal, radius * SLACK)
         )
         covered += dr.select(same, 1, 0)
         probe += 1
