@@ -1027,4 +1027,18 @@ MUTATIONS = [
         "pilots end after their fewest iterations where photons render, too",
         "tests/integrators/test_auto.py::test_the_pilot_ends_once_path_has_won",
     ),
+    Mutation(
+        "photons/queries.py",
+        "beyond = dr.select(at.edge, vertex, beyond)",
+        "beyond = dr.select(at.edge, beyond, vertex)",
+        "paths count legs and leaves that they pass, and gather nowhere",
+        "tests/integrators/test_edges.py::test_means",
+    ),
+    Mutation(
+        "photons/queries.py",
+        "at.ends, at.even = at.ends & ~at.edge, at.even & ~at.edge",
+        "at.ends = at.ends & ~at.edge",
+        "photons bring the even part of coats on legs, too dark",
+        "tests/integrators/test_edges.py::test_means",
+    ),
 ]

@@ -190,6 +190,9 @@ class BDPMSession(PhotonPasses):
     """Whether in images that will be denoised near pixels share no photons that the camera sees:
     caustic ones have disks of a pixel's size there, and volume photons are joined with the sensor.
     (Weights know one radius for all, and beams only.)"""
+    goes_on_at_edges = True
+    """Whether camera paths may pass edges, if the radius is automatic. (Weights gather at all
+    vertices.)"""
     meets_lights = True
     """Whether camera paths bring caustic light, too, where they meet lights by chance. (Weights
     know of photons alone.)"""
@@ -254,8 +257,15 @@ class BDPMSession(PhotonPasses):
             and meets_one_light(self.scene)
         )
         self.parted = self.narrow is not None and self.narrow.parted
+        self.passes_edges = (
+            self.goes_on_at_edges
+            and self.has_indirect
+            and integrator.bdd == 0
+            and not (integrator.denoised or integrator.initial_radius)
+        )
+        asks_once = integrator.bdd == 0 and self.narrow is None and not self.passes_edges
         self.one_vertex = not self.traits.has_mixed and (
-            (integrator.bdd == 0 and self.narrow is None) or not (self.has_caustics or self.parted)
+            asks_once or not (self.has_caustics or self.parted)
         )
 
     @property

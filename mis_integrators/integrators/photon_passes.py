@@ -4,6 +4,7 @@ these gather, and light that volume photons bring to the sensor."""
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
@@ -14,7 +15,7 @@ from ..mis.chance import ChanceWeights, StartDensity, second_moment
 from ..paths.light_classes import LightClasses, by_class_of_photons
 from ..paths.sensor import Lens
 from ..photons.beams import Beams, gather_along, mean_count_along, read_beams
-from ..photons.coverage import covered_share
+from ..photons.coverage import Edges, covered_share
 from ..photons.curvature import bounded
 from ..photons.gather import FLAGS, QueryVertices, gather_photons, mean_photon_count
 from ..photons.grid import PhotonMap, build_photon_map
@@ -48,6 +49,8 @@ class PhotonPasses(PilotedSession):
     follows_curvature = True
     """Whether merge disks of indirect light are smaller where surfaces are bent, if their radius is
     automatic. (Weights know one radius for all.)"""
+    passes_edges = False
+    """Whether camera paths go on where merge disks are of no use (`Edges`)."""
     points = False
     """Whether volume photons are gathered at vertices in media, and not along beams."""
 
@@ -166,11 +169,13 @@ class PhotonPasses(PilotedSession):
         """The weights of camera paths (a `mis.state.MergeState`); None where there are none."""
         return None
 
-    def _trace_camera(self, camera_pass, capacity, spectral, first=1.0, beyond=None, beams=0):
+    def _trace_camera(
+        self, camera_pass, capacity, spectral, first=1.0, beyond=None, beams=0, edges=None
+    ):
         """What `trace_camera_paths` returns, and the radiance by class (a list; empty where none is
-        kept), with room for so many vertices and beams; `first`, `beyond`: as there. All is
-        evaluated, and what differs between pilots and renders is evaluated before: they share the
-        kernel, which takes long to compile."""
+        kept), with room for so many vertices and beams; `first`, `beyond`: as there; `edges`: the
+        radius of `Edges` (None: zero). All is evaluated, and what differs between pilots and
+        renders is evaluated before: they share the kernel, which takes long to compile."""
         paths, kept, classes = dr.width(camera_pass.pixel), self.integrator.kept_classes, None
         first = dr.opaque(mi.Float, first)
         beyond = dr.full(mi.Float, 1, paths) if beyond is None else beyond
@@ -190,6 +195,10 @@ class PhotonPasses(PilotedSession):
             near_zone=self.near_zone,
             meets_lights=self.by_chance,
         )
+        if self.passes_edges:
+            radius = dr.opaque(mi.Float, 0.0) if edges is None else edges
+            edges = Edges(radius, camera_pass.sequence.own_seed(), self._bounds_disks)
+            queries = replace(queries, edges=edges)
         merge_state = self._merge_state(spectral)
         found = trace_camera_paths(
             self.world, self.limits, camera_pass, queries, merge_state, first, beyond, classes
@@ -402,15 +411,22 @@ class PhotonPasses(PilotedSession):
         if beyond is not None:
             beyond = dr.gather(mi.Float, beyond, camera_pass.pixel, there)
         radiance, alpha, position, vertices, count, classes = self._trace_camera(
-            camera_pass, self.vertex_capacity, spectral, 1.0, beyond, self.beam_capacity
+            camera_pass,
+            self.vertex_capacity,
+            spectral,
+            1.0,
+            beyond,
+            self.beam_capacity,
+            radii["indirect"] if self.corrected.get("indirect") else None,
         )
         for kind, radius in radii.items():
             photon_map = self._map_again(maps[kind], kind, radius)
             parts = self._gather(photon_map, vertices, kind, [radius], spectral)
             if self.corrected[kind]:
-                correction = dr.rcp(
-                    self._covered(scene, tables, vertices, radius, sequence.own_seed())
-                )
+                covered = vertices.get("covered")
+                if covered is None:
+                    covered = self._covered(scene, tables, vertices, radius, sequence.own_seed())
+                correction = dr.rcp(covered)
                 parts = [gathered * correction for gathered in parts]
             for number, gathered in enumerate(parts):
                 gathered = self._per_path(gathered, vertices, kind, self.chunk)

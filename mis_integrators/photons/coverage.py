@@ -8,12 +8,14 @@ rays estimate the covered share of the disk, by which the estimate is divided.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import drjit as dr
 import mitsuba as mi
 
 from ..core.random import vertex_streams
-from .curvature import bend
-from .gather import SAME_SURFACE_COSINE, within_disk
+from .curvature import LEAST_LEFT, bend, bounded, fitting_share
+from .gather import FLAGS, SAME_SURFACE_COSINE, within_disk
 
 PROBES = 8
 """Tuned: probe rays of a merge disk."""
@@ -26,6 +28,34 @@ SLACK = 1.01
 """Radius of probes over that of the disk: they may end right at its rim."""
 OWN_STREAM = 0x70726F62
 """Keeps the probes' random numbers apart from those of the camera paths, which share their seed."""
+LITTLE = 0.3
+"""Tuned: share of a merge disk, less of which is little: two probes of eight."""
+
+
+class Edges(NamedTuple):
+    """What tells camera paths where merge disks are of no use: at legs, leaves, rims and corners.
+
+    `radius`: of the disks; 0: they are of use everywhere. `seed`: of the probes' random numbers.
+    `bent`: whether disks are smaller where surfaces are bent.
+    """
+
+    radius: mi.Float
+    seed: mi.UInt32
+    bent: bool
+
+    def at(self, scene, arrival, active):
+        """The `covered_share` where camera paths have arrived (a `CameraArrival`), one elsewhere;
+        and whether that is little, or the surface more bent than any disk."""
+        active = active & (self.radius > 0)
+        si = arrival.hit.compute_surface_interaction(arrival.ray, FLAGS, active)
+        radius, too_bent = self.radius, mi.Bool(False)
+        if self.bent:
+            too_bent = active & (fitting_share(si, radius) < LEAST_LEFT)
+            radius = bounded(si, radius)
+        vertices = {"ray_d": arrival.ray.d, "path": arrival.path, "depth": arrival.depth}
+        share = covered_share(scene, vertices, si, radius, self.seed, active)
+        share = dr.select(active, share, 1)
+        return share, too_bent | (share < LITTLE)
 
 
 @dr.syntax

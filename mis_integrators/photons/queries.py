@@ -83,12 +83,13 @@ def weight_layout():
     return Layout(dict.fromkeys((*STATE, "share"), mi.Spectrum))
 
 
-def new_vertex_buffer(capacity, weighted=False, split=False, cones=False, hits=False):
+def new_vertex_buffer(capacity, weighted=False, split=False, cones=False, hits=False, edges=False):
     """Room for `capacity` camera vertices, a dictionary: `words` (records of `query_layout`; unused
     ones are zero), if `weighted`, `weights` (records of `weight_layout`), and if light is `split`
     into classes, `first`: whether the path has scattered smoothly nowhere before. With `cones`,
     `pixel`: how wide a pixel is there; 0 where the path has scattered smoothly before. With `hits`,
-    those of lights that are met by chance (records of `hits.chance_layout`; zero: none)."""
+    those of lights that are met by chance (records of `hits.chance_layout`; zero: none). With
+    `edges`, `covered`: which share of the merge disk is; one in unused places."""
     buffer = {"words": dr.zeros(mi.UInt32, query_layout().words * capacity)}
     if weighted:
         buffer["weights"] = weight_layout().room(capacity)
@@ -98,6 +99,8 @@ def new_vertex_buffer(capacity, weighted=False, split=False, cones=False, hits=F
         buffer["pixel"] = dr.zeros(mi.Float, capacity)
     if hits:
         buffer["hits"] = new_hits(capacity)
+    if edges:
+        buffer["covered"] = dr.full(mi.Float, 1, capacity)
     return buffer
 
 
@@ -152,7 +155,9 @@ class Queries:
     `near_zone` (a `NearZone`, or None): volume photons beyond it are joined with the sensor. Then
     photons bring all light of media on the way to the first smooth surface: all segments before it
     have long beams, the first one those within the zone. `meets_lights`: lights that paths meet
-    behind delta surfaces are kept with the smooth vertex before, if it is on a surface.
+    behind delta surfaces are kept with the smooth vertex before, if it is on a surface; `edges`
+    (`coverage.Edges`, or None): where merge disks are of no use there are none but caustic photons,
+    and the `bdd` does not count the vertex; elsewhere the covered share is kept.
     """
 
     bdd: int
@@ -166,6 +171,7 @@ class Queries:
     cones: Any = None
     near_zone: Any = None
     meets_lights: bool = False
+    edges: Any = None
 
 
 class QueryVisitor:
@@ -208,6 +214,7 @@ class QueryVisitor:
                 classes is not None,
                 queries.cones is not None,
                 queries.meets_lights,
+                queries.edges is not None,
             ),
             room=dr.opaque(mi.UInt32, queries.capacity),
             count=dr.zeros(mi.UInt32, self.sections),
@@ -416,6 +423,10 @@ class QueryVisitor:
                 at.throughput = at.throughput * at.rest
                 smooth &= dr.max(at.rest) > 0
             at.ends &= ~at.narrow
+        if self.queries.edges is not None:
+            ends = smooth & (at.ends | at.even)
+            at.covered, at.edge = self.queries.edges.at(self.scene, at, ends)
+            at.ends, at.even = at.ends & ~at.edge, at.even & ~at.edge
         if self.beyond is not None:
             # Other paths go straight through media.
             unseen = state["met"] | at.scatters if self.flies else state["met"]
@@ -522,6 +533,8 @@ class QueryVisitor:
         if state["cone"]:
             width = dr.select(state["met"], 0, state["cone"][0])
             dr.scatter(store.vertices["pixel"], width, slot, wants)
+        if queries.edges is not None:
+            dr.scatter(store.vertices["covered"], at.covered, slot, wants)
         return slot
 
     def leave(self, state, at, rng, bs, weight, delta, active):
@@ -558,6 +571,8 @@ class QueryVisitor:
                 weight = weight * at.rest
                 active &= dr.max(at.rest) > 0
             beyond = dr.select(passed, vertex, beyond)
+        if self.queries.edges is not None:
+            beyond = dr.select(at.edge, vertex, beyond)
         state |= {
             "vertex": dr.select(scattered, beyond, vertex),
             "met": state["met"] | scattered,
@@ -607,7 +622,8 @@ def trace_camera_paths(
     Light that reaches a smooth vertex through delta surfaces belongs to caustic photons and is left
     out; where `queries` say that paths meet lights, that which they have met there is kept with the
     vertex. Delta vertices do not count; a BSDF with both parts is a smooth vertex whose delta part
-    goes on. At `queries.narrow` vertices there is direct light, but they do not count, either.
+    goes on. At `queries.narrow` vertices and `queries.edges` there is direct light, but they do not
+    count, either.
     Where such a vertex would be the last one, and its BSDF has an even part, photons are gathered
     for that, and what the path finds from the next smooth vertex on counts for the rest of the
     BSDF. Where it would not, it counts if it scatters the path evenly.
