@@ -308,8 +308,8 @@ MUTATIONS = [
     ),
     Mutation(
         "photons/coverage.py",
-        "place += normal * dr.dot(hit.p - si.p - place, normal)",
-        "place = hit.p - si.p",
+        "place += normal * dr.dot(offset - place, normal)",
+        "place = offset",
         "steps down, whose photons count, are taken for edges",
         "tests/photons/test_coverage.py",
     ),
@@ -889,7 +889,7 @@ MUTATIONS = [
     ),
     Mutation(
         "photons/curvature.py",
-        "dr.maximum(share, LEAST_LEFT)",
+        "dr.maximum(fitting_share(si, radius), LEAST_LEFT)",
         "1",
         "merge disks are wider than the balls that they touch",
         "tests/photons/test_curvature.py",

@@ -47,9 +47,10 @@ class BDPM(IterativeIntegrator):
      * - pass_narrow
        - |bool|
        - Whether camera paths go on through surfaces with narrow lobes, as of smooth metal or
-         frosted glass, and curves. Only caustic photons are gathered there, and ``bdd`` does not
-         count these vertices. Of a coat on a diffuse base, photons make the base's light.
-         (Default: yes, i.e. |true|)
+         frosted glass, and curves; with ``bdd`` 0 and an automatic radius through legs, leaves and
+         rims, too, that are narrower than merge disks. Only caustic photons are gathered there, and
+         ``bdd`` does not count these vertices. Of a coat on a diffuse base, photons make the base's
+         light. (Default: yes, i.e. |true|)
      * - photon_count
        - |int|
        - Light sub-paths an iteration; 0 stands for as many as the cropped film has pixels. With an
@@ -191,8 +192,7 @@ class BDPMSession(PhotonPasses):
     caustic ones have disks of a pixel's size there, and volume photons are joined with the sensor.
     (Weights know one radius for all, and beams only.)"""
     goes_on_at_edges = True
-    """Whether camera paths may pass edges, if the radius is automatic. (Weights gather at all
-    vertices.)"""
+    """Whether camera paths may pass edges. (Weights gather at all vertices.)"""
     meets_lights = True
     """Whether camera paths bring caustic light, too, where they meet lights by chance. (Weights
     know of photons alone.)"""
@@ -261,6 +261,7 @@ class BDPMSession(PhotonPasses):
             self.goes_on_at_edges
             and self.has_indirect
             and integrator.bdd == 0
+            and integrator.pass_narrow
             and not (integrator.denoised or integrator.initial_radius)
         )
         asks_once = integrator.bdd == 0 and self.narrow is None and not self.passes_edges
@@ -363,7 +364,12 @@ class BDPMSession(PhotonPasses):
         return self.photons_a_path
 
     def _use_light_share(self):
-        self._use_light_paths(max(round(self.light_share * self.iteration_light_paths), 1))
+        self._use_light_paths(self.chosen_light_paths)
+
+    @property
+    def chosen_light_paths(self):
+        """Light sub-paths of an iteration of the render (a pilot traces others)."""
+        return max(round(self.light_share * self.iteration_light_paths), 1)
 
     def start(self):
         super().start()

@@ -130,7 +130,7 @@ def choose(integrator, scene, sensor, seed, iterations, seconds):
     if photons.has_caustics and not integrator.splits_light and not camera_paths_are_blind(photons):
         photons.judge_chance()
     contest = Contest(path, photons, iterations, seconds)
-    photons.predict(contest.path_wins)
+    photons.predict(None if integrator.splits_light else contest.is_settled)
     prediction = photons.prediction
     if prediction is None:
         reason = "no camera path meets a surface that scatters smoothly"
@@ -139,7 +139,7 @@ def choose(integrator, scene, sensor, seed, iterations, seconds):
         planned = contest.planned
         return decide([trial_of_photons(PHOTONS, photons, 1.0)], [excluded], planned, 1.0)
     trials, budget, usual = contest.trials()
-    if seconds and not contest.path_wins():
+    if seconds and not (contest.settled or contest.path_wins()):
         photons.start()  # its first iterations tell the time, and are kept
         trials, budget, usual = contest.trials(timed=True)
     return decide(trials, [], budget, usual)
@@ -152,6 +152,12 @@ class Contest:
     def __init__(self, path, photons, iterations, seconds):
         self.path, self.photons, self.seconds = path, photons, seconds
         self.iterations = iterations or UNPLANNED_ITERATIONS
+        self.settled = False
+
+    def is_settled(self):
+        """Whether `path_wins`; it does then, whatever the clock says later."""
+        self.settled = self.path_wins()
+        return self.settled
 
     @property
     def planned(self):

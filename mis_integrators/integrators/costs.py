@@ -23,7 +23,7 @@ def events(session, segments, last_vertex, gathered, camera_paths=1):
     that shades (`None`: all); `gathered`: photons within a vertex's merge disks.
     """
     camera = float(sum(segments if last_vertex is None else segments[: last_vertex + 1]))
-    paths = getattr(session, "light_path_count", 0) * session.camera_paths / session.path_count
+    paths = getattr(session, "chosen_light_paths", 0) * session.camera_paths / session.path_count
     light = paths * (1 + getattr(session, "photons_a_path", 0))
     return camera_paths * camera, light, camera_paths * gathered, 1.0
 

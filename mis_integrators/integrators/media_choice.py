@@ -8,6 +8,8 @@ blur.) Both are judged on the same pixels, as on surfaces (`choice`).
 
 from __future__ import annotations
 
+import functools
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -60,13 +62,16 @@ def choose(integrator, scene, sensor, seed, iterations, seconds):
     if photons is not None:
         photons.plan_time(seconds)
 
-        def camera_wins():
-            judged = photons.prediction and _judged(camera, photons, iterations, seconds)
-            return bool(judged) and judged.plugin == CAMERA
+        @functools.cache
+        def samples():
+            return _samples(camera, photons.prediction.pixels)
 
-        photons.predict(camera_wins)
+        def judged():
+            return _judged(camera, samples, photons, iterations, seconds)
+
+        photons.predict(lambda: photons.prediction is not None and judged().plugin == CAMERA)
         if photons.prediction is not None:
-            return _judged(camera, photons, iterations, seconds)
+            return judged()
         reason = "no camera path meets anything that scatters smoothly"
     return Decision(CAMERA, camera, [f"{CAMERA}: {reason}"])
 
@@ -107,8 +112,8 @@ def _photons(render):
     return session, None
 
 
-def _judged(camera, photons, iterations, seconds):
-    """The `Decision` once a pilot has run."""
+def _judged(camera, samples, photons, iterations, seconds):
+    """The `Decision` once a pilot has run; `samples`: what asks for the `_samples`."""
     prediction, cost = photons.prediction, PATHS_AN_ITERATION * photons.camera_paths
     budget = cost * (prediction.iterations if seconds else iterations or UNPLANNED_ITERATIONS)
     trials, reasons = [trial_of_photons(PHOTONS, photons, cost)], []
@@ -119,17 +124,21 @@ def _judged(camera, photons, iterations, seconds):
     if reason:
         reasons.append(reason)
     else:
-        trials.insert(0, _trial_of_camera_paths(camera, prediction, budget))
+        trials.insert(0, _trial_of_camera_paths(camera, samples(), prediction, budget))
     return decide(trials, reasons, budget, cost)
 
 
-def _trial_of_camera_paths(session, prediction, budget):
-    """Camera paths on the pilot's pixels, each of which costs one."""
-    pixels = prediction.pixels
+def _samples(session, pixels):
+    """`PATH_TRIALS` samples of each of the pilot's pixels: (samples, pixels)."""
     numbers = dr.arange(mi.UInt32, pixels.count) * (pixels.stride * session.camera_paths)
     values = np.empty((PATH_TRIALS, pixels.count))
     for number in range(PATH_TRIALS):
         values[number] = channel_mean(session.radiance(TRIAL_INDEX, numbers, number))
+    return values
+
+
+def _trial_of_camera_paths(session, values, prediction, budget):
+    """Camera paths, by the `values` of samples, each of which costs one."""
     share = noise_left(session.integrator, session.sensor)
     parts = parts_of_samples(session, values, prediction, budget, share)
     return Trial(CAMERA, session, parts, 1.0)

@@ -170,12 +170,13 @@ class PhotonPasses(PilotedSession):
         return None
 
     def _trace_camera(
-        self, camera_pass, capacity, spectral, first=1.0, beyond=None, beams=0, edges=None
+        self, camera_pass, capacity, spectral, first=1.0, beyond=None, beams=0, edge_radius=None
     ):
         """What `trace_camera_paths` returns, and the radiance by class (a list; empty where none is
-        kept), with room for so many vertices and beams; `first`, `beyond`: as there; `edges`: the
-        radius of `Edges` (None: zero). All is evaluated, and what differs between pilots and
-        renders is evaluated before: they share the kernel, which takes long to compile."""
+        kept), with room for so many vertices and beams; `first`, `beyond`: as there;
+        `edge_radius`: that of `Edges` (None: zero). All is evaluated, and what differs between
+        pilots and renders is evaluated before: they share the kernel, which takes long to
+        compile."""
         paths, kept, classes = dr.width(camera_pass.pixel), self.integrator.kept_classes, None
         first = dr.opaque(mi.Float, first)
         beyond = dr.full(mi.Float, 1, paths) if beyond is None else beyond
@@ -196,9 +197,8 @@ class PhotonPasses(PilotedSession):
             meets_lights=self.by_chance,
         )
         if self.passes_edges:
-            radius = dr.opaque(mi.Float, 0.0) if edges is None else edges
-            edges = Edges(radius, camera_pass.sequence.own_seed(), self._bounds_disks)
-            queries = replace(queries, edges=edges)
+            radius = dr.opaque(mi.Float, 0.0) if edge_radius is None else edge_radius
+            queries = replace(queries, edges=Edges(radius, camera_pass.sequence.own_seed()))
         merge_state = self._merge_state(spectral)
         found = trace_camera_paths(
             self.world, self.limits, camera_pass, queries, merge_state, first, beyond, classes

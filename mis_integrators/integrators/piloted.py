@@ -196,15 +196,14 @@ class PilotedSession(IterativeSession):
             self.kept.clear()
         changed = choice.corrected != self.corrected
         self.radii, self.corrected = dict(choice.radii), dict(choice.corrected)
-        self.light_share = choice.light_share
+        self._foresee(choice)
         self._use_light_share()
         if changed:
             self._record_camera_pass()
-        self._foresee(choice)
 
     def _foresee(self, choice: Choice):
         """Finds the `prediction` for this choice."""
-        self.prediction = choice.prediction
+        self.prediction, self.light_share = choice.prediction, choice.light_share
 
     @property
     def most_cost(self):

@@ -24,34 +24,34 @@ HEIGHT = 0.25
 SMALLEST_SHARE = 0.25
 """Tuned: in a corner of three faces a quarter of the disk is left. Smaller estimates come from
 clutter that the probes meet as often as from thin legs, and would brighten more than they mend."""
+FURTHEST = 3.0
+"""Distance of what a probe hits from the vertex, in radii, beyond which it stands for nothing."""
 SLACK = 1.01
 """Radius of probes over that of the disk: they may end right at its rim."""
 OWN_STREAM = 0x70726F62
 """Keeps the probes' random numbers apart from those of the camera paths, which share their seed."""
 LITTLE = 0.3
-"""Tuned: share of a merge disk, less of which is little: two probes of eight."""
+"""Tuned: share of a merge disk, less of which is little: two probes of eight. More than
+`SMALLEST_SHARE`."""
 
 
 class Edges(NamedTuple):
     """What tells camera paths where merge disks are of no use: at legs, leaves, rims and corners.
 
-    `radius`: of the disks; 0: they are of use everywhere. `seed`: of the probes' random numbers.
-    `bent`: whether disks are smaller where surfaces are bent.
+    `radius`: of the disks, which are smaller where surfaces are bent; 0: they are of use
+    everywhere. `seed`: of the probes' random numbers.
     """
 
     radius: mi.Float
     seed: mi.UInt32
-    bent: bool
 
     def at(self, scene, arrival, active):
         """The `covered_share` where camera paths have arrived (a `CameraArrival`), one elsewhere;
         and whether that is little, or the surface more bent than any disk."""
         active = active & (self.radius > 0)
         si = arrival.hit.compute_surface_interaction(arrival.ray, FLAGS, active)
-        radius, too_bent = self.radius, mi.Bool(False)
-        if self.bent:
-            too_bent = active & (fitting_share(si, radius) < LEAST_LEFT)
-            radius = bounded(si, radius)
+        too_bent = active & (fitting_share(si, self.radius) < LEAST_LEFT)
+        radius = bounded(si, self.radius)
         vertices = {"ray_d": arrival.ray.d, "path": arrival.path, "depth": arrival.depth}
         share = covered_share(scene, vertices, si, radius, self.seed, active)
         share = dr.select(active, share, 1)
@@ -95,9 +95,11 @@ def covered_share(scene, vertices, si, radius, seed, active):
             reorder=False,
             active=active,
         )
-        place += normal * dr.dot(hit.p - si.p - place, normal)
+        offset = hit.p - si.p
+        place += normal * dr.dot(offset - place, normal)
         same = (
             hit.is_valid()
+            & (dr.squared_norm(offset) < dr.square(FURTHEST * radius))
             & (dr.dot(hit.n, si.n) > SAME_SURFACE_COSINE)
             & within_disk(place, dr.squared_norm(place), normal, radius * SLACK)
         )

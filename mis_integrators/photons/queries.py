@@ -180,7 +180,7 @@ class QueryVisitor:
     `first` is what emission, and direct light at the first smooth vertex, count, which other paths
     see, too; `beyond` what direct light counts beyond that, if it is not the same.
 
-    Its state, by name: `vertex`, smooth vertices left behind, `narrow` ones not counted (the last
+    Its state, by name: `vertex`, smooth vertices left behind, those passed not counted (the last
     one counts as the `bdd`-th); `met`, whether there was any of these; `behind_delta`, whether the
     last vertex scattered by a delta function; `scatter_pdf`, the density of the last smooth
     scattering; `origin`, the last smooth vertex; `share`, the weight of direct light there;
@@ -420,6 +420,7 @@ class QueryVisitor:
                 at.parted = at.narrow & self.queries.narrow.has_even_part(bsdf, smooth)
                 at.even = at.parted & at.ends
                 at.rest = dr.select(smooth, state["rest"][0], 1)
+                state["rest"] = selected(smooth, [mi.Spectrum(1)], state["rest"])
                 at.throughput = at.throughput * at.rest
                 smooth &= dr.max(at.rest) > 0
             at.ends &= ~at.narrow
@@ -596,7 +597,7 @@ class QueryVisitor:
         return dr.select(active, rest, 1)
 
     def cross(self, before, after, crosses):
-        passed = {"cone": after["cone"], "wall": after["wall"]}
+        passed = {name: after[name] for name in ("cone", "wall", "asked", "rest")}
         return selected(crosses, {**before, **passed}, after)
 
     def alpha(self, state, visible):

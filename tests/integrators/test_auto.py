@@ -265,7 +265,7 @@ def test_more_camera_paths_cost_more(rgb):
     pixels, light_paths, photons = 10, 30, 3
     for camera_paths in (1, 4):
         session = SimpleNamespace(
-            light_path_count=light_paths,
+            chosen_light_paths=light_paths,
             photons_a_path=photons,
             camera_paths=camera_paths,
             path_count=pixels * camera_paths,

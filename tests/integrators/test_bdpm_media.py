@@ -148,6 +148,14 @@ def test_narrow_lobes_are_passed(rgb, surface, bdd):
     agree_with_volpath(scene, bdd=bdd, direct_paths=3)
 
 
+def test_a_mask_gathers_and_what_is_behind_it(rgb):
+    """A half transparent screen: paths that go through it have asked for photons there."""
+    mask = {"type": "mask", "opacity": 0.5, "nested": {"type": "twosided", "nested": MATT}}
+    place = T().translate([0, 0, 0.5]).scale(0.7)
+    screen = {"type": "rectangle", "to_world": place, "bsdf": mask}
+    agree_with_volpath(fog_scene(homogeneous(0.2), screen=screen), 5, bdd=0)
+
+
 def test_light_through_a_half_transparent_ceiling(rgb):
     """Half of what the floor gets comes through a mask, from a sky that camera paths meet as often
     as next-event estimation finds it."""

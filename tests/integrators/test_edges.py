@@ -148,7 +148,7 @@ def test_which_vertices_are_passed(rgb, radius, expected, round_one):
         path=dr.arange(mi.UInt32, n),
         depth=dr.ones(mi.UInt32, n),
     )
-    edges = Edges(dr.opaque(mi.Float, radius), dr.opaque(mi.UInt32, 7), True)
+    edges = Edges(dr.opaque(mi.Float, radius), dr.opaque(mi.UInt32, 7))
     share, passed = edges.at(scene, arrival, dr.full(mi.Bool, True, n))
     assert np.mean(np.broadcast_to(np.array(passed), n)) == pytest.approx(expected, abs=0.1)
     assert radius > 0 or np.all(np.array(share) == 1)
