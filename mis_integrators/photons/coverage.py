@@ -21,9 +21,10 @@ PROBES = 8
 """Tuned: probe rays of a merge disk."""
 HEIGHT = 0.25
 """Tuned: probes start this share of the radius above the vertex, or halfway to what is closer."""
-SMALLEST_SHARE = 0.25
-"""Tuned: in a corner of three faces a quarter of the disk is left. Smaller estimates come from
-clutter that the probes meet as often as from thin legs, and would brighten more than they mend."""
+SMALLEST_SHARE = 0.4
+"""Tuned: right at a wall half of the disk is left. Smaller estimates come from clutter that the
+probes meet as often as from corners, and would brighten more than they mend. (With 0.25 pilots
+expect next to no blur, and take disks twice as wide.)"""
 FURTHEST = 3.0
 """Distance of what a probe hits from the vertex, in radii, beyond which it stands for nothing."""
 SLACK = 1.01
@@ -31,8 +32,7 @@ SLACK = 1.01
 OWN_STREAM = 0x70726F62
 """Keeps the probes' random numbers apart from those of the camera paths, which share their seed."""
 LITTLE = 0.3
-"""Tuned: share of a merge disk, less of which is little: two probes of eight. More than
-`SMALLEST_SHARE`."""
+"""Tuned: share of a merge disk, less of which is little: two probes of eight."""
 
 
 class Edges(NamedTuple):
@@ -53,14 +53,19 @@ class Edges(NamedTuple):
         too_bent = active & (fitting_share(si, self.radius) < LEAST_LEFT)
         radius = bounded(si, self.radius)
         vertices = {"ray_d": arrival.ray.d, "path": arrival.path, "depth": arrival.depth}
-        share = covered_share(scene, vertices, si, radius, self.seed, active)
+        share = probed_share(scene, vertices, si, radius, self.seed, active)
         share = dr.select(active, share, 1)
-        return share, too_bent | (share < LITTLE)
+        return dr.maximum(share, SMALLEST_SHARE), too_bent | (share < LITTLE)
+
+
+def covered_share(scene, vertices, si, radius, seed, active):
+    """The `probed_share`, but `SMALLEST_SHARE` at least: what estimates are divided by."""
+    return dr.maximum(probed_share(scene, vertices, si, radius, seed, active), SMALLEST_SHARE)
 
 
 @dr.syntax
-def covered_share(scene, vertices, si, radius, seed, active):
-    """Estimated share, in [0.25, 1], of the disk of `radius` around each vertex that lies on
+def probed_share(scene, vertices, si, radius, seed, active):
+    """Estimated share of the disk of `radius` around each vertex that lies on
     surface seen from just above the vertex and like its own (same tests as for photons). Where the
     surface is curved, so is the disk. `vertices` as of `read_queries`, `si` their surface
     interactions, found with `gather.FLAGS`; width as theirs.
@@ -108,4 +113,4 @@ def covered_share(scene, vertices, si, radius, seed, active):
         if (probe == outer) & (covered == outer):
             covered = mi.UInt32(PROBES)
             probe = mi.UInt32(PROBES)
-    return dr.maximum(mi.Float(covered) * (1 / PROBES), SMALLEST_SHARE)
+    return mi.Float(covered) * (1 / PROBES)
