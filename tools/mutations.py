@@ -889,7 +889,7 @@ MUTATIONS = [
     ),
     Mutation(
         "photons/curvature.py",
-        "dr.maximum(fitting_share(si, radius), LEAST_LEFT)",
+        "dr.maximum(share, LEAST_LEFT)",
         "1",
         "merge disks are wider than the balls that they touch",
         "tests/photons/test_curvature.py",
@@ -1029,8 +1029,8 @@ MUTATIONS = [
     ),
     Mutation(
         "photons/queries.py",
-        "beyond = dr.select(at.edge, vertex, beyond)",
-        "beyond = dr.select(at.edge, beyond, vertex)",
+        "passed = passed | at.edge",
+        "passed = passed & ~at.edge",
         "paths count legs and leaves that they pass, and gather nowhere",
         "tests/integrators/test_edges.py::test_means",
     ),

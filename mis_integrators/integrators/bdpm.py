@@ -191,8 +191,6 @@ class BDPMSession(PhotonPasses):
     """Whether in images that will be denoised near pixels share no photons that the camera sees:
     caustic ones have disks of a pixel's size there, and volume photons are joined with the sensor.
     (Weights know one radius for all, and beams only.)"""
-    goes_on_at_edges = True
-    """Whether camera paths may pass edges. (Weights gather at all vertices.)"""
     meets_lights = True
     """Whether camera paths bring caustic light, too, where they meet lights by chance. (Weights
     know of photons alone.)"""
@@ -258,10 +256,9 @@ class BDPMSession(PhotonPasses):
         )
         self.parted = self.narrow is not None and self.narrow.parted
         self.passes_edges = (
-            self.goes_on_at_edges
+            integrator.pass_narrow
             and self.has_indirect
             and integrator.bdd == 0
-            and integrator.pass_narrow
             and not (integrator.denoised or integrator.initial_radius)
         )
         asks_once = integrator.bdd == 0 and self.narrow is None and not self.passes_edges

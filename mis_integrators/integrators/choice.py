@@ -138,10 +138,11 @@ def choose(integrator, scene, sensor, seed, iterations, seconds):
     if excluded := why_not_path(photons):
         planned = contest.planned
         return decide([trial_of_photons(PHOTONS, photons, 1.0)], [excluded], planned, 1.0)
-    trials, budget, usual = contest.trials()
-    if seconds and not (contest.settled or contest.path_wins()):
+    weighed = contest.weigh()
+    if seconds and not (contest.settled or path_wins(*weighed)):
         photons.start()  # its first iterations tell the time, and are kept
-        trials, budget, usual = contest.trials(timed=True)
+        weighed = contest.weigh(timed=True)
+    trials, budget, usual = weighed
     return decide(trials, [], budget, usual)
 
 
@@ -156,7 +157,8 @@ class Contest:
 
     def is_settled(self):
         """Whether `path_wins`; it does then, whatever the clock says later."""
-        self.settled = self.path_wins()
+        if self.photons.prediction is not None and why_not_path(self.photons) is None:
+            self.settled = path_wins(*self.weigh())
         return self.settled
 
     @property
@@ -172,7 +174,21 @@ class Contest:
             return _clocked_samples(self.path, pixels)
         return _samples(self.path, pixels, 0), None
 
-    def trials(self, timed=False):
+    @functools.cached_property
+    def _segments(self):
+        """Mean segments of a camera path, by their numbers."""
+        path, pixels = self.path, self.photons.prediction.pixels
+        return mean_segments(
+            path.scene,
+            path.sensor,
+            path.seed,
+            pixels.stride,
+            pixels.count,
+            path.integrator.max_depth,
+            path.integrator.rr_depth,
+        )
+
+    def weigh(self, timed=False):
         """The `Trial`s of both, the budget, and what an iteration of photons costs: where their
         first ones are `timed`, as much as these."""
         photons, (values, cost) = self.photons, self._samples
@@ -182,18 +198,18 @@ class Contest:
             usual = photons.expected_seconds
             budget = self.planned * usual
         else:
-            usual, cost = _counted_costs(self.path, photons)
+            usual, cost = _counted_costs(self.path, photons, self._segments)
             budget = self.planned * usual
         alone = _trial_of_path(self.path, values, photons.prediction, budget, cost)
         return [alone, trial_of_photons(PHOTONS, photons, usual)], budget, usual
 
-    def path_wins(self):
-        """Whether `path` renders even if an iteration of photons is `OVERRATED`."""
-        if self.photons.prediction is None or why_not_path(self.photons):
-            return False
-        (alone, photons), budget, usual = self.trials()
-        photons = replace(photons, cost=usual / OVERRATED)
-        return alone.product(budget) <= photons.product(budget)
+
+def path_wins(trials, budget, usual):
+    """Whether `path` renders even if an iteration of photons is `OVERRATED`; arguments as
+    `Contest.weigh` returns them."""
+    alone, photons = trials
+    photons = replace(photons, cost=usual / OVERRATED)
+    return alone.product(budget) <= photons.product(budget)
 
 
 def decide(trials, reasons, budget, usual):
@@ -284,18 +300,9 @@ def trial_of_photons(plugin, session, cost):
     return Trial(plugin, session, parts, cost)
 
 
-def _counted_costs(path, photons):
-    """Costs of an iteration of photons and of a sample of `path`, in segments of the latter."""
-    pixels, integrator = photons.prediction.pixels, path.integrator
-    segments = mean_segments(
-        path.scene,
-        path.sensor,
-        path.seed,
-        pixels.stride,
-        pixels.count,
-        integrator.max_depth,
-        integrator.rr_depth,
-    )
+def _counted_costs(path, photons, segments):
+    """Costs of an iteration of photons and of a sample of `path`, in segments of the latter
+    (`mean_segments`)."""
     gathered, paths = photons.prediction.gathered, photons.camera_paths
     counted = costs.events(photons, segments, photons.last_vertex, gathered, paths)
     usual = costs.cost(PHOTONS, counted) + costs.of_direct_paths(photons, segments)

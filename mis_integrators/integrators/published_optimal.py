@@ -45,7 +45,7 @@ class PublishedSession(BDPMSession):
     The pilot of an automatic radius merges at the first strategy's vertex, unweighted.
     """
 
-    chooses_light_paths = widens_caustics = follows_curvature = goes_on_at_edges = False
+    chooses_light_paths = widens_caustics = follows_curvature = False
 
     def __init__(self, integrator, scene, sensor, seed, iterations):
         super().__init__(integrator, scene, sensor, seed, iterations)

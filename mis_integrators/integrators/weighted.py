@@ -35,7 +35,6 @@ class WeightedSession(BDPMSession):
     """Iterations of a `WeightedBDPM`. A subclass makes the weights."""
 
     chooses_light_paths = narrows_volume = suits_denoisers = meets_lights = False
-    goes_on_at_edges = False
     follows_curvature = False  # nor do published weights, see `published_optimal`
     weighted_pilot = False
     """Whether the pilot of the automatic radius renders under the weights, made for

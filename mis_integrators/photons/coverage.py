@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.random import vertex_streams
-from .curvature import LEAST_LEFT, bend, bounded, fitting_share
+from .curvature import LEAST_LEFT, bend, bounded
 from .gather import FLAGS, SAME_SURFACE_COSINE, within_disk
 
 PROBES = 8
@@ -50,8 +50,8 @@ class Edges(NamedTuple):
         and whether that is little, or the surface more bent than any disk."""
         active = active & (self.radius > 0)
         si = arrival.hit.compute_surface_interaction(arrival.ray, FLAGS, active)
-        too_bent = active & (fitting_share(si, self.radius) < LEAST_LEFT)
         radius = bounded(si, self.radius)
+        too_bent = active & (radius <= LEAST_LEFT * self.radius)
         vertices = {"ray_d": arrival.ray.d, "path": arrival.path, "depth": arrival.depth}
         share = probed_share(scene, vertices, si, radius, self.seed, active)
         share = dr.select(active, share, 1)
@@ -65,10 +65,10 @@ def covered_share(scene, vertices, si, radius, seed, active):
 
 @dr.syntax
 def probed_share(scene, vertices, si, radius, seed, active):
-    """Estimated share of the disk of `radius` around each vertex that lies on
-    surface seen from just above the vertex and like its own (same tests as for photons). Where the
-    surface is curved, so is the disk. `vertices` as of `read_queries`, `si` their surface
-    interactions, found with `gather.FLAGS`; width as theirs.
+    """Estimated share of the disk of `radius` around each vertex that lies on surface seen from
+    just above the vertex and like its own (same tests as for photons). Where the surface is curved,
+    so is the disk. `vertices` as of `read_queries`, `si` their surface interactions, found with
+    `gather.FLAGS`; width as theirs.
 
     A probe that slips past its place in the disk lands further out, on a step down, say, whose
     photons count. So it stands for the point of that height right above or below its place."""

@@ -50,23 +50,18 @@ def derivatives(si):
     return [(dr.select(here, edge, dp), sign * dn) for edge, (dp, dn) in zip(edges, given)]
 
 
-def fitting_share(si, radius):
-    """What share of its radius a merge disk can have around surface interactions that know how
-    their normals turn (`gather.FLAGS`): no more than `most_bent` radii of curvature are left, the
-    least of those along the surface's parameters."""
+def bounded(si, radius):
+    """The radius of a merge disk around surface interactions that know how their normals turn
+    (`gather.FLAGS`): no more than `most_bent` radii of curvature, the least of those along the
+    surface's parameters."""
     bent = [
         dr.squared_norm(dn) * dr.rcp(dr.maximum(dr.squared_norm(dp), 1e-30))
         for dp, dn in derivatives(si)
     ]
     curvature = dr.sqrt(dr.maximum(*bent))
     most = most_bent()
-    return most * dr.rcp(dr.maximum(curvature * radius, most))
-
-
-def bounded(si, radius):
-    """The radius of a merge disk around surface interactions: the `fitting_share` of it, but
-    `LEAST_LEFT`."""
-    return radius * dr.maximum(fitting_share(si, radius), LEAST_LEFT)
+    share = most * dr.rcp(dr.maximum(curvature * radius, most))
+    return radius * dr.maximum(share, LEAST_LEFT)
 
 
 class Bend(NamedTuple):

@@ -561,7 +561,7 @@ class QueryVisitor:
             state["wall"] = selected(active, [at.si.n], state["wall"])  # zero in media
         if state["history"]:
             state["history"] = scattered_history(state["history"], delta, active)
-        beyond = dr.select(at.ends, mi.UInt32(self.bdd), vertex) + 1
+        passed = mi.Bool(False)
         if self.queries.narrow is not None:
             passed = at.narrow & ~at.ends
             if self.parts:
@@ -571,9 +571,10 @@ class QueryVisitor:
                 state["rest"] = selected(scattered, [rest], state["rest"])
                 weight = weight * at.rest
                 active &= dr.max(at.rest) > 0
-            beyond = dr.select(passed, vertex, beyond)
         if self.queries.edges is not None:
-            beyond = dr.select(at.edge, vertex, beyond)
+            passed = passed | at.edge
+        beyond = dr.select(at.ends, mi.UInt32(self.bdd), vertex) + 1
+        beyond = dr.select(passed, vertex, beyond)
         state |= {
             "vertex": dr.select(scattered, beyond, vertex),
             "met": state["met"] | scattered,

@@ -22,3 +22,8 @@ import pytest
 def test_integral_of_the_square(rgb, filter, across):
     """Against closed forms; a Gaussian's tail, which is cut off, is 1e-3 of it."""
     assert filter_share(mi.load_dict(filter)) == pytest.approx(across**2, rel=3e-3)
+
+
+@pytest.mark.parametrize("kind", ["mitchell", "catmullrom", "lanczos"])
+def test_no_filter_adds_noise(rgb, kind):
+    assert 0.3 < filter_share(mi.load_dict({"type": kind})) <= 1

@@ -384,6 +384,27 @@ def sensor(kind="perspective", **film_options):
     return result
 
 
+def under_a_lamp(height, **objects):
+    """A floor under a wide lamp, seen from the side and from so high: the dictionary of a scene of
+    `objects` that stand there."""
+    return {
+        "type": "scene",
+        "floor": {"type": "rectangle", "to_world": T().scale(1.5)},
+        "lamp": {
+            "type": "rectangle",
+            "to_world": T().translate([0, 0, 3]).rotate([1, 0, 0], 180),
+            "emitter": {"type": "area", "radiance": 3.0},
+        },
+        "sensor": {
+            "type": "perspective",
+            "fov": 40,
+            "to_world": look((0, -3, height), (0, 0, 0.2), (0, 0, 1)),
+            "film": film(32),
+        },
+        **objects,
+    }
+
+
 def tray(family, emitter, sensor_kind="perspective", only=None, **film_options):
     """The scene: spheres of a family (or one BSDF of it, `only`, on all nine), lit by an emitter of
     the table."""

@@ -8,7 +8,7 @@ import pytest
 from comparing import SessionBatches, agree
 from foggy import volpath
 from selection import extended
-from worlds import diffuse, path
+from worlds import T, diffuse, path, under_a_lamp
 
 RADIUS = 0.12
 """Of merge disks; legs are a fifth of it wide."""
@@ -18,36 +18,13 @@ SETTINGS = {"max_depth": 5, "rr_depth": 50}
 def legs(material=None, floor=None, **objects):
     """A forest of thin legs on a floor, under a lamp: square ones and round ones."""
     rng = np.random.default_rng(4)
-    scene = {
-        "type": "scene",
-        "floor": {
-            "type": "rectangle",
-            "to_world": mi.ScalarTransform4f().scale(1.5),
-            "bsdf": floor or diffuse(0.7),
-        },
-        "lamp": {
-            "type": "rectangle",
-            "to_world": mi.ScalarTransform4f().translate([0, 0, 3]).rotate([1, 0, 0], 180),
-            "emitter": {"type": "area", "radiance": 3.0},
-        },
-        "sensor": {
-            "type": "perspective",
-            "fov": 40,
-            "to_world": mi.ScalarTransform4f().look_at([0, -3, 1], [0, 0, 0.2], [0, 0, 1]),
-            "film": {
-                "type": "hdrfilm",
-                "width": 32,
-                "height": 32,
-                "rfilter": {"type": "box"},
-                "pixel_format": "rgb",
-            },
-        },
-    }
+    ground = {"type": "rectangle", "to_world": T().scale(1.5), "bsdf": floor or diffuse(0.7)}
+    scene = under_a_lamp(1, floor=ground)
     for number, (x, y) in enumerate(rng.uniform(-1, 1, (100, 2))):
         if number % 2:
             shape = {"type": "cylinder", "p0": [x, y, 0], "p1": [x, y, 0.6], "radius": RADIUS / 10}
         else:
-            place = mi.ScalarTransform4f().translate([x, y, 0.3]).scale([RADIUS / 10] * 2 + [0.3])
+            place = T().translate([x, y, 0.3]).scale([RADIUS / 10] * 2 + [0.3])
             shape = {"type": "cube", "to_world": place}
         scene[f"leg{number}"] = {
             **shape,
@@ -100,27 +77,24 @@ def test_means(merged, objects, more):
     agree(merged(**more), path(**SETTINGS), legs(**objects), blocks=1, whole=0.015, block=0.015)
 
 
-def test_without_it_legs_are_dark(merged, monkeypatch):
+def test_without_it_legs_are_dark(merged):
     """The test above is no test else."""
-    from mis_integrators.integrators.bdpm import BDPMSession
 
-    def mean():
-        batches = SessionBatches(merged(camera_paths=2), scene, 1)
+    def mean(pass_narrow):
+        made = merged(camera_paths=2, pass_narrow=pass_narrow)
+        batches = SessionBatches(made, scene, 1)
         batches.add(16)
         return batches.estimate().mean[0].mean()
 
     scene = legs()
-    right = mean()
-    monkeypatch.setattr(BDPMSession, "goes_on_at_edges", False)
-    dark = mean()
-    assert dark < 0.95 * right
+    assert mean(pass_narrow=False) < 0.95 * mean(pass_narrow=True)
 
 
 def test_in_fog(merged):
     """As of `volpath`: volume photons light the legs, too."""
     fog = {
         "type": "cube",
-        "to_world": mi.ScalarTransform4f().translate([0, 0, 1.4]).scale([1.45, 1.45, 1.39]),
+        "to_world": T().translate([0, 0, 1.4]).scale([1.45, 1.45, 1.39]),
         "bsdf": {"type": "null"},
         "interior": {"type": "homogeneous", "albedo": 0.8, "sigma_t": 0.3},
     }
@@ -136,7 +110,7 @@ def test_which_vertices_are_passed(rgb, radius, expected, round_one):
 
     from mis_integrators.photons.coverage import Edges
 
-    leg = {"type": "cube", "to_world": mi.ScalarTransform4f().scale([0.03, 0.03, 1])}
+    leg = {"type": "cube", "to_world": T().scale([0.03, 0.03, 1])}
     if round_one:
         leg = {"type": "cylinder", "p0": [0, 0, -1], "p1": [0, 0, 1], "radius": 0.03}
     scene = mi.load_dict({"type": "scene", "leg": leg})

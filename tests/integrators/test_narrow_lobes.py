@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from comparing import agree, in_one_thread
 from selection import extended
-from worlds import T, diffuse, film, look, path
+from worlds import T, diffuse, film, look, path, under_a_lamp
 
 METAL = {"type": "roughconductor", "material": "Al"}
 FROSTED = {"type": "roughdielectric", "alpha": 0.2}
@@ -125,35 +125,12 @@ def bristles(folder, **objects):
             for k in range(4):
                 file.write(f"{x + dx * k:.4f} {y + dy * k:.4f} {low + 0.2 * k:.4f} 0.008\n")
             file.write("\n")
-    return mi.load_dict(
-        {
-            "type": "scene",
-            "brush": {
-                "type": "bsplinecurve",
-                "filename": str(folder / "bristles.txt"),
-                "bsdf": {"type": "diffuse", "reflectance": 0.7},
-            },
-            "floor": {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(1.5)},
-            "lamp": {
-                "type": "rectangle",
-                "to_world": mi.ScalarTransform4f().translate([0, 0, 3]).rotate([1, 0, 0], 180),
-                "emitter": {"type": "area", "radiance": 3.0},
-            },
-            "sensor": {
-                "type": "perspective",
-                "fov": 40,
-                "to_world": mi.ScalarTransform4f().look_at([0, -3, 2], [0, 0, 0.2], [0, 0, 1]),
-                "film": {
-                    "type": "hdrfilm",
-                    "width": 32,
-                    "height": 32,
-                    "rfilter": {"type": "box"},
-                    "pixel_format": "rgb",
-                },
-            },
-            **objects,
-        }
-    )
+    brush = {
+        "type": "bsplinecurve",
+        "filename": str(folder / "bristles.txt"),
+        "bsdf": diffuse(0.7),
+    }
+    return mi.load_dict(under_a_lamp(2, brush=brush, **objects))
 
 
 @pytest.mark.parametrize("bdd", [0, *extended(1)])
