@@ -372,8 +372,8 @@ MUTATIONS = [
     ),
     Mutation(
         "pilot/radius.py",
-        "return self.squared_bias[corrected] + variance / iterations",
-        "return self.squared_bias[corrected] + variance",
+        "return self.squared_bias + variance / iterations",
+        "return self.squared_bias + variance",
         "the radius does not know how long a render will be",
         RADIUS,
     ),
@@ -1040,5 +1040,26 @@ MUTATIONS = [
         "at.ends = at.ends & ~at.edge",
         "photons bring the even part of coats on legs, too dark",
         "tests/integrators/test_edges.py::test_means",
+    ),
+    Mutation(
+        "photons/disk_walls.py",
+        "return furthest > 1 + SLACK",
+        "return furthest > 1e30",
+        "photons of outdoors light a room through its walls",
+        "tests/photons/test_disk_walls.py::test_no_light_leaks_into_a_room",
+    ),
+    Mutation(
+        "photons/gather.py",
+        "a + dr.select(there, b, 0)",
+        "a",
+        "all photons behind walls are lost",
+        "tests/photons/test_disk_walls.py::test_what_is_seen_behind_walls_counts",
+    ),
+    Mutation(
+        "integrators/pilot_passes.py",
+        "shares[kind].append(share)",
+        "shares[kind].append(share * 0 + 1)",
+        "pilots do not correct at edges",
+        "tests/photons/test_disk_walls.py::test_pilots_correct_each_radius",
     ),
 ]

@@ -91,7 +91,6 @@ def start_like(session, other) -> None:
         {
             **other.learned,
             "radii": {kind: float(other.radii.get(kind, usual)) for kind in kinds},
-            "corrected": {kind: bool(other.corrected.get(kind, False)) for kind in kinds},
         }
     )
     session.start()

@@ -146,7 +146,7 @@ def measure(
     plain = new_session(opened, light_paths, first_guess(opened))
     radius, photons, gathers, gathered = radius_for(plain, photons_a_gather)
     plain, probing = (new_session(opened, light_paths, radius) for _ in range(2))
-    probing.corrected = dict.fromkeys(probing.corrected, True)
+    probing.corrects = lambda kind: kind == "indirect"
     for session in (plain, probing):
         for _ in range(WARM_UP):
             session.iterate()

@@ -44,7 +44,8 @@ def undisturbed():
 
 
 def recorder():
-    """What records the passes of one session: `frozen` (garbage is collected once, before the first
+    """What records the passes of one session (they must not return named tuples, of which Dr.Jit's
+    replays return the first one again): `frozen` (garbage is collected once, before the first
     pass), or what leaves a function as it is in spectral variants: Dr.Jit 1.5 records sensors with
     a response function wrongly (and leaves them corrupted), and cannot record some spectral
     textures."""

@@ -15,7 +15,7 @@ from ..photons.volume_radii import VolumeDensity
 from ..pilot.direct_paths import MOST_PATHS
 from ..pilot.radius import largest_radius
 from ..pilot.run import PILOT_INDEX
-from ..pilot.setting import PilotSetting, light_shares, pilot_light_paths
+from ..pilot.setting import PilotSetting, corrects, light_shares, pilot_light_paths
 from .caustic_radii import CausticRadii
 from .common import MOST_LIGHT_PATHS, IterativeIntegrator
 from .direct_light import DirectLight
@@ -58,9 +58,9 @@ class BDPM(IterativeIntegrator):
      * - initial_radius
        - |float|
        - Merge radius of the first iteration, in scene units; 0 balances noise against blur in a
-         short pilot, apart for caustic and for other photons, and corrects the estimate near edges
-         where that pays. Caustic photons with little light around have larger radii of their own
-         then, and volume photons that lie densely have smaller ones. (Default: 0)
+         short pilot, apart for caustic and for other photons, and with ``bdd`` 0 corrects the
+         estimate near edges. Caustic photons with little light around have larger radii of their
+         own then, and volume photons that lie densely have smaller ones. (Default: 0)
      * - alpha
        - |float|
        - Radius reduction of progressive photon mapping, in (0, 1]: iteration i uses R_i^2 = R_0^2
@@ -209,7 +209,6 @@ class BDPMSession(PhotonPasses):
         self.vertex_capacity = self._vertex_room(self.chunk)
         if integrator.initial_radius:
             self.radii = dict.fromkeys(self.kinds(), integrator.initial_radius)
-        self.corrected = dict.fromkeys(self.kinds(), False)
         self.recorded = recorder()
         self.direct_light = DirectLight(self)
         self.caustic_radii = CausticRadii(self)
@@ -297,6 +296,10 @@ class BDPMSession(PhotonPasses):
             )
             if needed
         ]
+
+    def corrects(self, kind):
+        """Whether what photons of a kind bring is corrected at edges."""
+        return not self.integrator.initial_radius and corrects(kind, self.integrator.bdd == 0)
 
     def pilot_setting(self):
         integrator = self.integrator

@@ -15,9 +15,16 @@ from ..mis.chance import ChanceWeights, StartDensity, second_moment
 from ..paths.light_classes import LightClasses, by_class_of_photons
 from ..paths.sensor import Lens
 from ..photons.beams import Beams, gather_along, mean_count_along, read_beams
-from ..photons.coverage import Edges, covered_share
+from ..photons.coverage import Edges, coverage
 from ..photons.curvature import bounded
-from ..photons.gather import FLAGS, QueryVertices, gather_photons, mean_photon_count
+from ..photons.disk_walls import read_coverage
+from ..photons.gather import (
+    FLAGS,
+    QueryVertices,
+    gather_photons,
+    gather_seen,
+    mean_photon_count,
+)
 from ..photons.grid import PhotonMap, build_photon_map
 from ..photons.hits import meets_one_light
 from ..photons.queries import (
@@ -49,6 +56,9 @@ class PhotonPasses(PilotedSession):
     follows_curvature = True
     """Whether merge disks of indirect light are smaller where surfaces are bent, if their radius is
     automatic. (Weights know one radius for all.)"""
+    cuts_walls = True
+    """Whether estimates that are corrected at edges leave out photons that `DiskWalls` hide.
+    (Weights gather all.)"""
     passes_edges = False
     """Whether camera paths go on where merge disks are of no use (`Edges`)."""
     points = False
@@ -122,9 +132,6 @@ class PhotonPasses(PilotedSession):
 
     # ------------------------------------------------------------------ passes
 
-    def _record_camera_pass(self):
-        self._camera_pass = self.recorded(self._render_chunk)
-
     def _freeze(self):
         """Records the passes anew; from the second iteration on, their kernels run without their
         Python."""
@@ -132,7 +139,7 @@ class PhotonPasses(PilotedSession):
         self._light_pass = self.recorded(self._trace_light)
         self._map_pass = self.recorded(self._build_maps)
         self._sensor_pass = self.recorded(self._splat_photons)
-        self._record_camera_pass()
+        self._camera_pass = self.recorded(self._render_chunk)
 
     def _list_tables(self):
         """Lists what recorded functions read."""
@@ -256,13 +263,7 @@ class PhotonPasses(PilotedSession):
 
     def _merge(self, photon_map, record, kind, radii, spectral, grey=False, weigh=None, scale=1):
         """`gather_photons` of one kind at vertices as of `read_queries`."""
-        takes = takes_photons(record, kind)
-        parted = kind == "indirect" and self.parted
-        vertices = QueryVertices(self.traits, record, spectral["wavelengths"], takes, scale, parted)
-        if kind == "seen_caustic":
-            radii = [dr.minimum(radius, pixel_disk(record)) for radius in radii]
-        elif kind == "indirect" and self._bounds_disks:
-            radii = [bounded(vertices.si, radius) for radius in radii]
+        vertices, radii = self._asking(record, kind, radii, spectral, scale)
         light_paths, max_depth = self._light_paths, self.integrator.max_depth
         marked, chance = self.integrator.splits_light, None
         if self.by_chance and kind != "indirect":
@@ -285,6 +286,37 @@ class PhotonPasses(PilotedSession):
                 photon_map, vertices, radii, light_paths, max_depth, weigh, grey, marked
             )
         return found if chance is None else chance.with_hits(found, radii, grey)
+
+    def _gather_covered(self, scene, photon_map, vertices, kind, radius, covered, spectral):
+        """`_gather` of one radius, corrected by the `Coverage`."""
+        correction = dr.rcp(covered.share)
+        if self.cuts_walls:
+            parts = self._gather_seen(
+                scene, photon_map, vertices, covered.walls, [radius], spectral
+            )
+        else:
+            parts = self._gather(photon_map, vertices, kind, [radius], spectral)
+        return [gathered * correction for gathered in parts]
+
+    def _gather_seen(self, scene, photon_map, vertices, walls, radii, spectral, grey=False):
+        """`gather_seen` of indirect photons."""
+        record = read_queries(vertices)
+        asking, radii = self._asking(record, "indirect", radii, spectral)
+        depth, marked = self.integrator.max_depth, self.integrator.splits_light
+        return gather_seen(
+            scene, photon_map, asking, walls, radii, self._light_paths, depth, grey, marked
+        )
+
+    def _asking(self, record, kind, radii, spectral, scale=1):
+        """The `QueryVertices` that gather photons of a kind, and the radii of their disks."""
+        takes = takes_photons(record, kind)
+        parted = kind == "indirect" and self.parted
+        vertices = QueryVertices(self.traits, record, spectral["wavelengths"], takes, scale, parted)
+        if kind == "seen_caustic":
+            radii = [dr.minimum(radius, pixel_disk(record)) for radius in radii]
+        elif kind == "indirect" and self._bounds_disks:
+            radii = [bounded(vertices.si, radius) for radius in radii]
+        return vertices, radii
 
     @property
     def _bounds_disks(self):
@@ -314,18 +346,20 @@ class PhotonPasses(PilotedSession):
         """The last tier whose photons have the radius of the first, see `build_tiered_map`."""
         return LEFT_TO_DENOISER if self.cones is not None else 0
 
-    def _covered(self, scene, tables, vertices, radius, seed):
-        """`covered` of the vertices of a buffer (recorded: `tables` are what it reads)."""
-        return self.covered(scene, read_queries(vertices), radius, seed)
+    def _coverage(self, scene, tables, vertices, radius, seed):
+        """`coverage` of the vertices of a buffer, its share and what makes its walls (recorded:
+        `tables` are what it reads; of named tuples replays would return the first one again)."""
+        share, walls = self.coverage(scene, read_queries(vertices), radius, seed)
+        return share, vars(walls)
 
-    def covered(self, scene, record, radius, seed):
-        """Share of each vertex' merge disk that holds surface. `record` as of `read_queries`."""
+    def coverage(self, scene, record, radius, seed):
+        """The `Coverage` of each vertex' merge disk. `record` as of `read_queries`."""
         probed = dr.max(record["throughput"]) > 0
         ray = mi.Ray3f(record["ray_o"], record["ray_d"])
         si = record["hit"].compute_surface_interaction(ray, FLAGS, probed)
         if self._bounds_disks:
             radius = bounded(si, radius)
-        return dr.select(probed, covered_share(scene, record, si, radius, seed, probed), 1)
+        return coverage(scene, record, si, radius, seed, probed)
 
     def _records(self, vertices, kind):
         """What gathers photons of a kind, a dictionary of fields: vertices, or beams."""
@@ -417,17 +451,21 @@ class PhotonPasses(PilotedSession):
             1.0,
             beyond,
             self.beam_capacity,
-            radii["indirect"] if self.corrected.get("indirect") else None,
+            radii.get("indirect"),
         )
         for kind, radius in radii.items():
             photon_map = self._map_again(maps[kind], kind, radius)
-            parts = self._gather(photon_map, vertices, kind, [radius], spectral)
-            if self.corrected[kind]:
-                covered = vertices.get("covered")
-                if covered is None:
-                    covered = self._covered(scene, tables, vertices, radius, sequence.own_seed())
-                correction = dr.rcp(covered)
-                parts = [gathered * correction for gathered in parts]
+            if not self.corrects(kind):
+                parts = self._gather(photon_map, vertices, kind, [radius], spectral)
+            else:
+                if "coverage" in vertices:
+                    covered = read_coverage(vertices["coverage"])
+                else:
+                    seed = sequence.own_seed()
+                    covered = self.coverage(scene, read_queries(vertices), radius, seed)
+                parts = self._gather_covered(
+                    scene, photon_map, vertices, kind, radius, covered, spectral
+                )
             for number, gathered in enumerate(parts):
                 gathered = self._per_path(gathered, vertices, kind, self.chunk)
                 gathered = gathered if beyond is None else gathered * beyond

@@ -14,6 +14,7 @@ from ..core.recording import lanes
 from ..core.spectra import channel_mean
 from ..paths.camera import film_sample_count, pixel_at
 from ..paths.setting import CameraPass
+from ..photons.disk_walls import DiskWalls
 from ..photons.queries import read_queries
 from ..pilot.radius import middle_index
 
@@ -28,7 +29,7 @@ class SubsetPasses:
         room = session._vertex_room(pixels.paths) * (1 if session.one_vertex else 4)
         self._record_camera(room, 4 * session._beam_room(pixels.paths))
         self._record_gather()
-        self._covered = session.recorded(session._covered)
+        self._coverage = session.recorded(session._coverage)
         self._join = session.recorded(self._joined_light)
 
     def _record_camera(self, capacity, beams):
@@ -54,13 +55,18 @@ class SubsetPasses:
         session = self.session
         self.photon_capacity = session.photon_capacity, session.volume_capacity
 
-        def gather(scene, tables, photons, density, vertices, radii, spectral):
+        def gather(scene, tables, photons, density, vertices, radii, walls, spectral):
             gathered, moment = {}, None
             for kind, ladder in radii.items():
                 photon_map = session._map(photons, kind, ladder[-1], density)
-                gathered[kind] = session._gather(
-                    photon_map, vertices, kind, ladder, spectral, grey=True
-                )
+                if kind == "indirect" and walls is not None:
+                    gathered[kind] = session._gather_seen(
+                        scene, photon_map, vertices, walls, ladder, spectral, grey=True
+                    )
+                else:
+                    gathered[kind] = session._gather(
+                        photon_map, vertices, kind, ladder, spectral, grey=True
+                    )
                 if kind == "caustic" and session.judges_chance:
                     radius = ladder[middle_index(ladder)]
                     moment = session.moment_of_chance(photon_map, vertices, radius, spectral)
@@ -115,29 +121,33 @@ class SubsetPasses:
             kind: [dr.opaque(mi.Float, float(radius)) for radius in ladder]
             for kind, ladder in radii.items()
         }
+        walls, shares = None, {}
+        for kind, ladder in radii.items():
+            if self.setting.corrects(kind):
+                shares[kind] = []
+                for radius in ladder:
+                    share, walls = self._coverage(
+                        session.scene, session._tables, vertices, radius, seed
+                    )
+                    shares[kind].append(share)
+        # The walls of the largest disks serve all.
+        walls = DiskWalls(**walls) if walls and session.cuts_walls else None
         gathered, moment = self._gather(
-            session.scene, session._tables, photons, self.density, vertices, radii, spectral
+            session.scene, session._tables, photons, self.density, vertices, radii, walls, spectral
         )
         if moment is not None:
             moment = self.by_pixel(
                 session._per_path(moment, vertices, "caustic", self.pixels.paths)
             )
         for kind, values in gathered.items():
-            for corrected in self.setting.corrections(kind):
-                if corrected:
-                    values = [
-                        value
-                        * dr.rcp(
-                            self._covered(session.scene, session._tables, vertices, radius, seed)
-                        )
-                        for value, radius in zip(values, radii[kind])
-                    ]
-                estimates[kind, corrected] = np.array(
-                    [
-                        self.by_pixel(session._per_path(value, vertices, kind, self.pixels.paths))
-                        for value in values
-                    ]
-                )
+            if kind in shares:
+                values = [value * dr.rcp(share) for value, share in zip(values, shares[kind])]
+            estimates[kind] = np.array(
+                [
+                    self.by_pixel(session._per_path(value, vertices, kind, self.pixels.paths))
+                    for value in values
+                ]
+            )
         return estimates, moment
 
     def mean_photon_count(self, photons, vertices, kind, radius, spectral):

@@ -33,7 +33,6 @@ class PilotedSession(IterativeSession):
         super().__init__(integrator, scene, sensor, seed, iterations)
         self.seconds = None  # what rendering may take
         self.radii = None  # by kind of photons, once they are known
-        self.corrected = {}  # whether estimates are corrected at edges, by kind of photons
         self.light_share = 1.0  # of the light sub-paths, those that an iteration has
         self.prediction = None  # a `Prediction`, where a pilot has chosen
         self.iteration_seconds = math.inf  # what one takes, where that is measured
@@ -59,10 +58,6 @@ class PilotedSession(IterativeSession):
         """The block of one iteration."""
         raise TypeError(f"{type(self).__name__} does not define _render")
 
-    def _record_camera_pass(self):
-        """Records the camera pass anew, because its estimates are others."""
-        raise TypeError(f"{type(self).__name__} does not define _record_camera_pass")
-
     def _use_light_share(self):
         """Traces the `light_share` in each iteration from now on."""
         raise TypeError(f"{type(self).__name__} does not define _use_light_share")
@@ -75,8 +70,7 @@ class PilotedSession(IterativeSession):
     @property
     def settings(self):
         radii = {f"radius.{kind}": radius for kind, radius in (self.radii or {}).items()}
-        corrected = {f"edge_correction.{kind}": flag for kind, flag in self.corrected.items()}
-        return {**super().settings, **radii, **corrected}
+        return {**super().settings, **radii}
 
     @property
     def learned(self):
@@ -84,7 +78,6 @@ class PilotedSession(IterativeSession):
             return {}
         return {
             "radii": {kind: float(radius) for kind, radius in self.radii.items()},
-            "corrected": {kind: bool(flag) for kind, flag in self.corrected.items()},
             "light_share": self.light_share,
         }
 
@@ -92,16 +85,15 @@ class PilotedSession(IterativeSession):
         if learned == {} and (self.radii is not None or not self.kinds()):
             return
         fields = Fields(learned, "learned")
-        radii, corrected = fields.object("radii"), fields.object("corrected")
+        radii = fields.object("radii")
         self.radii = {
             kind: radii.number(kind, LARGEST_RADIUS, SMALLEST_RADIUS) for kind in self.kinds()
         }
-        self.corrected = {kind: corrected.boolean(kind) for kind in self.kinds()}
         self.light_share = fields.number("light_share", 1.0, LIGHT_SHARES[-1])
         self._use_light_share()
         self.recall_more(fields)
-        for each in (radii, corrected, fields):
-            each.finish()
+        radii.finish()
+        fields.finish()
 
     def recall_more(self, fields):
         """Takes over what a subclass has `learned` besides."""
@@ -191,15 +183,11 @@ class PilotedSession(IterativeSession):
     def _take(self, choice: Choice):
         """Renders with this choice from now on. What was rendered with another is no longer
         kept."""
-        used = self.radii, self.corrected, self.light_share
-        if (choice.radii, choice.corrected, choice.light_share) != used:
+        if (choice.radii, choice.light_share) != (self.radii, self.light_share):
             self.kept.clear()
-        changed = choice.corrected != self.corrected
-        self.radii, self.corrected = dict(choice.radii), dict(choice.corrected)
+        self.radii = dict(choice.radii)
         self._foresee(choice)
         self._use_light_share()
-        if changed:
-            self._record_camera_pass()
 
     def _foresee(self, choice: Choice):
         """Finds the `prediction` for this choice."""

@@ -45,7 +45,7 @@ class PublishedSession(BDPMSession):
     The pilot of an automatic radius merges at the first strategy's vertex, unweighted.
     """
 
-    chooses_light_paths = widens_caustics = follows_curvature = False
+    chooses_light_paths = widens_caustics = follows_curvature = cuts_walls = False
 
     def __init__(self, integrator, scene, sensor, seed, iterations):
         super().__init__(integrator, scene, sensor, seed, iterations)
@@ -272,9 +272,9 @@ class LightOfIteration:
 
     def _correction(self, kind, record, radius):
         session = self.session
-        if not session.corrected[kind]:
+        if not session.corrects(kind):
             return 1
-        return dr.rcp(session.covered(session.scene, record, radius, self.seed))
+        return dr.rcp(session.coverage(session.scene, record, radius, self.seed).share)
 
     def _add(self, kind, number, weight):
         """Photons of a kind at vertices with a number, all of a vertex under one weight."""

@@ -3,7 +3,8 @@
 Near a wall, or where a floor ends, part of the disk around a vertex holds no surface on which
 photons could land, and density estimation over the whole disk comes out dark: a bias that falls
 only in proportion to the radius, while that of curvature falls with its square. A few short probe
-rays estimate the covered share of the disk, by which the estimate is divided.
+rays estimate the covered share of the disk, by which the estimate is divided. What they hit before
+are walls, behind which photons must be seen (`disk_walls`).
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import mitsuba as mi
 
 from ..core.random import vertex_streams
 from .curvature import LEAST_LEFT, bend, bounded
+from .disk_walls import Coverage, DiskWalls, with_wall
 from .gather import FLAGS, SAME_SURFACE_COSINE, within_disk
 
 PROBES = 8
@@ -29,6 +31,8 @@ FURTHEST = 3.0
 """Distance of what a probe hits from the vertex, in radii, beyond which it stands for nothing."""
 SLACK = 1.01
 """Radius of probes over that of the disk: they may end right at its rim."""
+SOONER = 0.999
+"""Share of the way to its place, before which a probe that has hit something else was stopped."""
 OWN_STREAM = 0x70726F62
 """Keeps the probes' random numbers apart from those of the camera paths, which share their seed."""
 LITTLE = 0.3
@@ -46,29 +50,31 @@ class Edges(NamedTuple):
     seed: mi.UInt32
 
     def at(self, scene, arrival, active):
-        """The `covered_share` where camera paths have arrived (a `CameraArrival`), one elsewhere;
+        """The `Coverage` where camera paths have arrived (a `CameraArrival`), the whole elsewhere;
         and whether that is little, or the surface more bent than any disk."""
         active = active & (self.radius > 0)
         si = arrival.hit.compute_surface_interaction(arrival.ray, FLAGS, active)
         radius = bounded(si, self.radius)
         too_bent = active & (radius <= LEAST_LEFT * self.radius)
         vertices = {"ray_d": arrival.ray.d, "path": arrival.path, "depth": arrival.depth}
-        share = probed_share(scene, vertices, si, radius, self.seed, active)
+        share, walls = probed(scene, vertices, si, radius, self.seed, active)
         share = dr.select(active, share, 1)
-        return dr.maximum(share, SMALLEST_SHARE), too_bent | (share < LITTLE)
+        coverage = Coverage(dr.maximum(share, SMALLEST_SHARE), walls)
+        return coverage, too_bent | (share < LITTLE)
 
 
-def covered_share(scene, vertices, si, radius, seed, active):
-    """The `probed_share`, but `SMALLEST_SHARE` at least: what estimates are divided by."""
-    return dr.maximum(probed_share(scene, vertices, si, radius, seed, active), SMALLEST_SHARE)
+def coverage(scene, vertices, si, radius, seed, active):
+    """The `Coverage`: shares as of `probed`, but `SMALLEST_SHARE` at least, one elsewhere."""
+    share, walls = probed(scene, vertices, si, radius, seed, active)
+    return Coverage(dr.select(active, dr.maximum(share, SMALLEST_SHARE), 1), walls)
 
 
 @dr.syntax
-def probed_share(scene, vertices, si, radius, seed, active):
+def probed(scene, vertices, si, radius, seed, active):
     """Estimated share of the disk of `radius` around each vertex that lies on surface seen from
-    just above the vertex and like its own (same tests as for photons). Where the surface is curved,
-    so is the disk. `vertices` as of `read_queries`, `si` their surface interactions, found with
-    `gather.FLAGS`; width as theirs.
+    just above the vertex and like its own (same tests as for photons), and the `DiskWalls` there.
+    Where the surface is curved, so is the disk. `vertices` as of `read_queries`, `si` their surface
+    interactions, found with `gather.FLAGS`; width as theirs.
 
     A probe that slips past its place in the disk lands further out, on a step down, say, whose
     photons count. So it stands for the point of that height right above or below its place."""
@@ -86,6 +92,7 @@ def probed_share(scene, vertices, si, radius, seed, active):
     # surface there is no edge, and the others are not made.
     outer = PROBES // 2
     covered, probe = mi.UInt32(0), mi.UInt32(0)
+    near, far = mi.Vector3f(0), mi.Vector3f(0)
     while dr.hint(active & (probe < PROBES), label="coverage probes"):
         distance = radius * dr.sqrt((mi.Float(PROBES - 1 - probe) + shift) * (1 / PROBES))
         sine, cosine = dr.sincos(
@@ -109,8 +116,10 @@ def probed_share(scene, vertices, si, radius, seed, active):
             & within_disk(place, dr.squared_norm(place), normal, radius * SLACK)
         )
         covered += dr.select(same, 1, 0)
+        stopped = hit.is_valid() & ~same & (hit.t < SOONER * dr.norm(towards))
+        near, far = with_wall(near, far, si.p, hit, start, radius, stopped)
         probe += 1
         if (probe == outer) & (covered == outer):
             covered = mi.UInt32(PROBES)
             probe = mi.UInt32(PROBES)
-    return mi.Float(covered) * (1 / PROBES)
+    return mi.Float(covered) * (1 / PROBES), DiskWalls(near, far, height)

@@ -14,6 +14,7 @@ from ..core.traits import lookup
 from ..paths.lobes import even_bound, even_part
 from ..paths.subpaths import vertex_bsdf_of
 from ..paths.vertex import SMALLEST_COSINE, per_projected, upright
+from .disk_walls import Hidden
 from .grid import for_each_photon
 from .kernel_sums import KernelSums, disk_area
 from .queries import DEPTH, EVEN_PART
@@ -50,6 +51,7 @@ class QueryVertices:
         si = record["hit"].compute_surface_interaction(ray, FLAGS, active)
         self.traits, self.si, self.bsdf, self.active = traits, si, si.bsdf(), active
         self.p, self.n, self.plane, self.depth = si.p, si.n, si.n, depth & DEPTH
+        self.path = record["path"]
         self.facing = mi.Frame3f.cos_theta(si.wi)
         self.side = dr.dot(si.n, -ray.d)
         self.first = record.get("first")
@@ -201,8 +203,61 @@ def gather_photons(
     `marked` and not `grey` three, one for each of `light_classes.CLASSES`.
     """
     sums = KernelSums(radii, vertices.factor, grey, marked)
+    brought = _brought_by(sums, photon_map, vertices, max_depth, weigh, height)
 
     def visit(index, landing, offset, distance_squared, hit, totals):
+        return sums.add(totals, *brought(index, landing, offset, distance_squared, hit))
+
+    active = vertices.active
+    totals = for_each_photon(photon_map, vertices.p, radii[-1], active, visit, sums.zeros())
+    return sums.estimates(totals, disk_area, light_path_count, active)
+
+
+def gather_seen(
+    scene,
+    photon_map,
+    vertices,
+    walls,
+    radii,
+    light_path_count,
+    max_depth: int,
+    grey: bool = False,
+    marked: bool = False,
+):
+    """Radiance as of `gather_photons` at `QueryVertices`, without the photons that `DiskWalls` hide
+    from them."""
+    sums = KernelSums(radii, vertices.factor, grey, marked)
+    brought = _brought_by(sums, photon_map, vertices, max_depth)
+
+    def visit(index, landing, offset, distance_squared, hit, state):
+        before, behind, hidden = state
+        value, inside, *rest = brought(index, landing, offset, distance_squared, hit)
+        is_behind = walls.behind(offset)
+        before = sums.add(before, value, [each & ~is_behind for each in inside], *rest)
+        inside = [each & is_behind for each in inside]
+        behind = sums.add(behind, value, inside, *rest)
+        hidden = [
+            each.add(index, vertices.path, value, offset, here)
+            for each, here in zip(hidden, inside)
+        ]
+        return before, behind, hidden
+
+    active = vertices.active
+    state = sums.zeros(), sums.zeros(), [Hidden.none() for _ in radii]
+    before, behind, hidden = for_each_photon(
+        photon_map, vertices.p, radii[-1], active, visit, state
+    )
+    seen = [each.seen(scene, vertices, walls) for each in hidden for _ in range(sums.classes)]
+    totals = [a + dr.select(there, b, 0) for a, there, b in zip(before, seen, behind)]
+    return sums.estimates(totals, disk_area, light_path_count, active)
+
+
+def _brought_by(sums, photon_map, vertices, max_depth, weigh=None, height=None):
+    """A function of a photon, called as `for_each_photon` does (but for the state): what it brings,
+    and what `KernelSums.add` wants to know besides."""
+    radii = sums.radii
+
+    def brought(index, landing, offset, distance_squared, hit):
         hit &= same_surface(landing, vertices.n)
         if max_depth > 0:
             hit &= landing.depth + vertices.depth <= max_depth
@@ -211,11 +266,9 @@ def gather_photons(
         value, weights = _contribution(flux, towards, vertices, index, landing, weigh, hit)
         # The largest radius is tested again, too: without, kernels are slower by some per cent.
         inside = [hit & within_disk(offset, distance_squared, vertices.n, r, height) for r in radii]
-        return sums.add(totals, value, inside, vertices, landing, delta_at_light, weights)
+        return value, inside, vertices, landing, delta_at_light, weights
 
-    active = vertices.active
-    totals = for_each_photon(photon_map, vertices.p, radii[-1], active, visit, sums.zeros())
-    return sums.estimates(totals, disk_area, light_path_count, active)
+    return brought
 
 
 def _contribution(flux, towards, vertices, index, landing, weigh, active):

@@ -23,6 +23,7 @@ from ..paths.setting import CameraPass, Limits, World
 from ..paths.subpaths import selected, smooth_at
 from ..paths.vertex import PhaseOrBSDF, Sides
 from .beams import FIRST, LEVEL_SHIFT, LONG, SHORT, beam_layout, new_beams
+from .disk_walls import coverage_layout
 from .hits import chance_layout, new_hits, write_hit
 from .points import new_points, point_layout
 
@@ -89,7 +90,7 @@ def new_vertex_buffer(capacity, weighted=False, split=False, cones=False, hits=F
     into classes, `first`: whether the path has scattered smoothly nowhere before. With `cones`,
     `pixel`: how wide a pixel is there; 0 where the path has scattered smoothly before. With `hits`,
     those of lights that are met by chance (records of `hits.chance_layout`; zero: none). With
-    `edges`, `covered`: which share of the merge disk is; one in unused places."""
+    `edges`, `coverage`: that of the merge disk (records of `disk_walls.coverage_layout`)."""
     buffer = {"words": dr.zeros(mi.UInt32, query_layout().words * capacity)}
     if weighted:
         buffer["weights"] = weight_layout().room(capacity)
@@ -100,7 +101,7 @@ def new_vertex_buffer(capacity, weighted=False, split=False, cones=False, hits=F
     if hits:
         buffer["hits"] = new_hits(capacity)
     if edges:
-        buffer["covered"] = dr.full(mi.Float, 1, capacity)
+        buffer["coverage"] = dr.zeros(mi.UInt32, coverage_layout().words * capacity)
     return buffer
 
 
@@ -157,7 +158,7 @@ class Queries:
     have long beams, the first one those within the zone. `meets_lights`: lights that paths meet
     behind delta surfaces are kept with the smooth vertex before, if it is on a surface; `edges`
     (`coverage.Edges`, or None): where merge disks are of no use there are none but caustic photons,
-    and the `bdd` does not count the vertex; elsewhere the covered share is kept.
+    and the `bdd` does not count the vertex; elsewhere the coverage is kept.
     """
 
     bdd: int
@@ -426,7 +427,7 @@ class QueryVisitor:
             at.ends &= ~at.narrow
         if self.queries.edges is not None:
             ends = smooth & (at.ends | at.even)
-            at.covered, at.edge = self.queries.edges.at(self.scene, at, ends)
+            at.coverage, at.edge = self.queries.edges.at(self.scene, at, ends)
             at.ends, at.even = at.ends & ~at.edge, at.even & ~at.edge
         if self.beyond is not None:
             # Other paths go straight through media.
@@ -535,7 +536,9 @@ class QueryVisitor:
             width = dr.select(state["met"], 0, state["cone"][0])
             dr.scatter(store.vertices["pixel"], width, slot, wants)
         if queries.edges is not None:
-            dr.scatter(store.vertices["covered"], at.covered, slot, wants)
+            share, walls = at.coverage
+            record = {**vars(walls), "bare": 1 - share}
+            coverage_layout().write(store.vertices["coverage"], record, slot, wants)
         return slot
 
     def leave(self, state, at, rng, bs, weight, delta, active):

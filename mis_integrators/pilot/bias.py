@@ -18,8 +18,7 @@ LEAST_BIAS, MOST_BIAS = 0.003, 1.0
 of it a short pilot sees. (In Cornell boxes, a corridor, rooms lit through a door or a window it is
 0.002 to 0.04.)"""
 LEAST_CORRECTED = 1e-4
-"""Tuned: the same where the correction at edges adds what plain estimates lack (1e-4 to 1.6e-3 in
-Cornell boxes)."""
+"""Tuned: the same of estimates that are corrected at edges (1e-4 to 1.6e-3 in Cornell boxes)."""
 MISFIT_OF_LAW = 0.15
 """Tuned: relative error of the law itself, beyond the noise of Q."""
 

@@ -15,16 +15,14 @@ Fitted
     is curvature). Then Q is c R^q over a known constant. Few iterations do not tell c and q: all
     laws count, by how well they explain Q (`bias.expected_squared_bias`).
 Corrected estimates
-    At edges part of the disk holds no surface, and the plain estimate is too dark. The corrected
-    one divides by the share of the disk that probe rays find covered; it is too bright in clutter,
-    where there is no edge. How much plain estimates lack of what the correction adds is measured
-    (`edges.py`). What either does wrong then is added to the fitted bias.
+    At edges part of the disk holds no surface, and a plain estimate is too dark. The corrected one
+    divides by the share of the disk that probe rays find covered. Little of its bias may show: the
+    laws begin at a smaller one.
 Minimised
-    bias^2(R) + V(R) / n(R), over R and over plain or corrected estimates, where n(R) is the number
-    of iterations that there will be: larger disks and probe rays make an iteration dearer
-    (`cost.py`). Where the camera sees the vertices that gather it is the product of both measures
-    that is least: close to a bright lamp blur may be little of all pixels' relative error, and most
-    of the absolute one.
+    bias^2(R) + V(R) / n(R) over R, where n(R) is the number of iterations that there will be:
+    larger disks make an iteration dearer (`cost.py`). Where the camera sees the vertices that
+    gather it is the product of both measures that is least: close to a bright lamp blur may be
+    little of all pixels' relative error, and most of the absolute one.
 """
 
 from __future__ import annotations
@@ -35,7 +33,6 @@ from typing import NamedTuple
 import numpy as np
 
 from .bias import LEAST_BIAS, LEAST_CORRECTED, expected_squared_bias, squared_difference
-from .edges import light_lost_at_edges
 from .noise import Noise, noise_by_radius
 
 LADDER_STEPS = 7
@@ -73,128 +70,99 @@ def middle_index(radii: np.ndarray) -> int:
 
 
 class ErrorByRadius(NamedTuple):
-    """Squared bias and variance of the estimates from one kind of photons. Both are
-    dictionaries, False: plain estimates, True: corrected ones. They are empty where the pilot found
-    no photon."""
+    """Squared bias and variance of the estimates from one kind of photons; None where the pilot
+    found no photon."""
 
     ladder: np.ndarray
     fine: np.ndarray
     """Radii to choose from."""
-    squared_bias: dict[bool, np.ndarray]
+    squared_bias: np.ndarray | None
     """At the fine radii."""
-    noise: dict[bool, Noise]
+    noise: Noise | None
     """Of an iteration of the render, at the ladder."""
 
-    def at(self, radius: float, corrected: bool, light_share: float = 1.0) -> tuple[float, float]:
+    def at(self, radius: float, light_share: float = 1.0) -> tuple[float, float]:
         """Squared bias and variance at a radius, with that share of the light sub-paths."""
-        if corrected not in self.noise:
+        if self.squared_bias is None or self.noise is None:
             return 0.0, 0.0
-        bias = between(np.array([radius]), self.fine, self.squared_bias[corrected])
-        variance = between(np.array([radius]), self.ladder, self.noise[corrected].at(light_share))
+        bias = between(np.array([radius]), self.fine, self.squared_bias)
+        variance = between(np.array([radius]), self.ladder, self.noise.at(light_share))
         return float(bias[0]), float(variance[0])
 
-    def after(self, iterations: np.ndarray, corrected: bool, light_share: float) -> np.ndarray:
-        """The mean squared errors of so many iterations with each of the fine radii."""
-        variance = between(self.fine, self.ladder, self.noise[corrected].at(light_share))
-        return self.squared_bias[corrected] + variance / iterations
+    def after(self, iterations: np.ndarray, light_share: float) -> np.ndarray:
+        """The mean squared errors of so many iterations with each of the fine radii; there are
+        photons."""
+        assert self.squared_bias is not None and self.noise is not None
+        variance = between(self.fine, self.ladder, self.noise.at(light_share))
+        return self.squared_bias + variance / iterations
 
 
 def error_by_radius(
     radii: np.ndarray,
-    plain: np.ndarray,
-    corrected: np.ndarray | None,
+    samples: np.ndarray,
     weights: np.ndarray,
     photons_only: bool = True,
     alike: bool = False,
     light_paths: float = 1.0,
     filter_share: float = 1.0,
+    corrected: bool = False,
 ) -> ErrorByRadius:
     """The `ErrorByRadius` of estimates at the `radii` of the ladder. A ladder of one radius is
     given: its disks are so small that they do not blur.
 
     Parameters
     ----------
-    plain : (iterations, radii, groups, pixels)
+    samples : (iterations, radii, groups, pixels)
         Estimates of independent iterations, by the groups of camera paths of `denoiser`.
-    corrected : as `plain`, or None
-        The same corrected at edges.
     weights : (pixels,)
         Of the pixels' squared errors, see `noise.MEASURES`.
     photons_only, alike, light_paths, filter_share
         See `noise.noise_by_radius`.
+    corrected
+        Whether they are corrected at edges.
     """
     fine = np.exp(np.linspace(np.log(radii[0]), np.log(radii[-1]), 16 * len(radii)))
-    if not np.any(plain):
-        return ErrorByRadius(radii, fine, {}, {})
-    noise = {
-        which: noise_by_radius(
-            radii, samples, weights, photons_only, alike, light_paths, filter_share
-        )
-        for which, samples in ((False, plain), (True, corrected))
-        if samples is not None
-    }
-    plain = plain.mean(axis=2)
-    at_edges: dict[bool, np.ndarray | float] = {False: 0.0}
-    best, least = plain, LEAST_BIAS
-    if corrected is not None:
-        corrected = corrected.mean(axis=2)
-        added, lacking, deviation = light_lost_at_edges(plain, corrected, weights)
-        wrong = {False: lacking**2 + deviation**2, True: (1 - lacking) ** 2 + deviation**2}
-        at_edges = {which: between(fine, radii, added * wrong[which]) for which in wrong}
-        best = plain + lacking[:, None] * (corrected - plain)
-        least *= (LEAST_CORRECTED / LEAST_BIAS) ** min(max(lacking[-1], 0.0), 1.0)
+    if not np.any(samples):
+        return ErrorByRadius(radii, fine, None, None)
+    noise = noise_by_radius(radii, samples, weights, photons_only, alike, light_paths, filter_share)
     blur = np.zeros(len(fine))
     if len(radii) > 1:
-        difference, error = squared_difference(best, weights)
-        blur = expected_squared_bias(radii, difference, error, len(plain), fine, least)
-    return ErrorByRadius(
-        radii,
-        fine,
-        {which: blur + at_edges[which] for which in noise},
-        noise,
-    )
-
-
-class RadiusChoice(NamedTuple):
-    """A radius, and whether estimates are corrected at edges."""
-
-    radius: float
-    corrected: bool
+        least = LEAST_CORRECTED if corrected else LEAST_BIAS
+        difference, error = squared_difference(samples.mean(axis=2), weights)
+        blur = expected_squared_bias(radii, difference, error, len(samples), fine, least)
+    return ErrorByRadius(radii, fine, blur, noise)
 
 
 def best_radius(
     errors: Sequence[ErrorByRadius],
-    iterations: Callable[[np.ndarray, bool], np.ndarray],
-    used: tuple[float, bool] | None = None,
+    iterations: Callable[[np.ndarray], np.ndarray],
+    used: float | None = None,
     reluctance: float = 0.0,
     light_share: float = 1.0,
-) -> RadiusChoice:
-    """The `RadiusChoice` with the least product of the `errors`, bias^2 + V / n, one for each
-    measure. Where the pilot found no photon it is a middling radius.
+) -> float:
+    """The radius with the least product of the `errors`, bias^2 + V / n, one for each measure.
+    Where the pilot found no photon it is a middling one.
 
     Parameters
     ----------
     iterations
-        n: how many iterations of given radii (fine) and correction there will be.
-    used : (radius, corrected)
-        A choice that is kept unless the errors fall by more than the share `reluctance`.
+        n: how many iterations of given radii (fine) there will be.
+    used
+        A radius that is kept unless the errors fall by more than the share `reluctance`.
     light_share
         Of the light sub-paths, those that an iteration has.
     """
     radii, fine = errors[0].ladder, errors[0].fine
-    choices = []
-    for corrected in errors[0].squared_bias:
-        n = iterations(fine, corrected)
-        predicted = np.prod([each.after(n, corrected, light_share) for each in errors], axis=0)
-        at = int(np.argmin(predicted))
-        candidates = [(float(predicted[at]), float(fine[at]))]
-        if used is not None and used[1] == corrected:
-            at = int(np.argmin(np.abs(np.log(fine / used[0]))))
-            candidates.append((float(predicted[at]) * (1 - reluctance) ** len(errors), used[0]))
-        choices += [(error, RadiusChoice(radius, corrected)) for error, radius in candidates]
-    if not choices:
-        return RadiusChoice(float(radii[middle_index(radii)]), False)
-    return min(choices)[1]
+    if errors[0].squared_bias is None:
+        return float(radii[middle_index(radii)])
+    n = iterations(fine)
+    predicted = np.prod([each.after(n, light_share) for each in errors], axis=0)
+    best = int(np.argmin(predicted))
+    if used is not None:
+        kept = int(np.argmin(np.abs(np.log(fine / used))))
+        if predicted[kept] * (1 - reluctance) ** len(errors) < predicted[best]:
+            return used
+    return float(fine[best])
 
 
 def between(wanted: np.ndarray, radii: np.ndarray, values: np.ndarray) -> np.ndarray:

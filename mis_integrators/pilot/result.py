@@ -1,5 +1,4 @@
-"""What a pilot has measured, and the choice that follows from it: radii and corrections at edges.
-Pure functions."""
+"""What a pilot has measured, and the choice that follows from it. Pure functions."""
 
 from __future__ import annotations
 
@@ -11,7 +10,7 @@ import numpy as np
 
 from .cost import iteration_cost
 from .noise import MEASURES, direct_variance, shrink_to_neighbours
-from .radius import ErrorByRadius, RadiusChoice, best_radius, error_by_radius, middle_index
+from .radius import ErrorByRadius, best_radius, error_by_radius, middle_index
 from .setting import PilotPixels, PilotSetting, neighbourhoods
 
 Radii = TypeVar("Radii", float, np.ndarray)
@@ -28,9 +27,8 @@ class PilotSamples(NamedTuple):
     below."""
     photons: dict[str, float]
     """By kind: photons within the ladder's largest radius of a vertex, on average."""
-    gathered: dict[tuple[str, bool], np.ndarray]
-    """By kind and whether they are corrected at edges: what photons bring, (iterations, radii,
-    groups of camera paths, pixels)."""
+    gathered: dict[str, np.ndarray]
+    """By kind: what photons bring, (iterations, radii, groups of camera paths, pixels)."""
     direct: np.ndarray
     """Light that neither photons bring nor other paths see, (iterations, groups, pixels)."""
     seen: np.ndarray
@@ -80,11 +78,10 @@ class Prediction(NamedTuple):
 
 @dataclass(frozen=True)
 class Choice:
-    """Radii and corrections at edges by kind of photons, and what is predicted of them: None where
-    no camera path meets a surface that gathers."""
+    """Radii by kind of photons, and what is predicted of them: None where no camera path meets a
+    surface that gathers."""
 
     radii: dict[str, float]
-    corrected: dict[str, bool]
     prediction: Prediction | None
     light_share: float = 1.0
     """Of the light sub-paths, those that an iteration has."""
@@ -160,19 +157,12 @@ class PilotResult:
         radius = RADIUS_WITHOUT_VERTICES * self.setting.extent
         if not self.errors:
             kinds = self.setting.kinds
-            return Choice(dict.fromkeys(kinds, radius), dict.fromkeys(kinds, False), None)
+            return Choice(dict.fromkeys(kinds, radius), None)
         chosen = {
             kind: self._best_radius(kind, share, count, kept, reluctance) for kind in self._met
         }
-        choice = Choice(
-            {
-                kind: chosen[kind].radius if kind in chosen else radius
-                for kind in self.setting.kinds
-            },
-            {kind: kind in chosen and chosen[kind].corrected for kind in self.setting.kinds},
-            None,
-            share,
-        )
+        radii = {kind: chosen.get(kind, radius) for kind in self.setting.kinds}
+        choice = Choice(radii, None, share)
         return replace(choice, prediction=self._predict(choice, count))
 
     @property
@@ -189,13 +179,13 @@ class PilotResult:
 
     def _best_radius(
         self, kind: str, share: float, count: float, kept: Choice | None, reluctance: float
-    ) -> RadiusChoice:
-        """The `RadiusChoice` for one kind of photons, with a `share` of the light sub-paths."""
+    ) -> float:
+        """The radius for one kind of photons, with a `share` of the light sub-paths."""
 
-        def iterations(radius: np.ndarray, corrected: bool) -> np.ndarray:
-            return np.maximum(count / self._cost(kind, radius, corrected, share), 1)
+        def iterations(radius: np.ndarray) -> np.ndarray:
+            return np.maximum(count / self._cost(kind, radius, share), 1)
 
-        used = None if kept is None else (kept.radii[kind], kept.corrected[kind])
+        used = None if kept is None else kept.radii[kind]
         errors = [self.errors[measure][kind] for measure in self._measures]
         return best_radius(errors, iterations, used, reluctance, share)
 
@@ -203,10 +193,7 @@ class PilotResult:
         """The `Prediction` for a choice."""
         errors, share = {}, choice.light_share
         for measure, by_kind in self.errors.items():
-            found = [
-                by_kind[kind].at(choice.radii[kind], choice.corrected[kind], share)
-                for kind in by_kind
-            ]
+            found = [by_kind[kind].at(choice.radii[kind], share) for kind in by_kind]
             errors[measure] = PredictedError(
                 sum(squared_bias for squared_bias, _ in found),
                 self.direct[measure]
@@ -230,16 +217,16 @@ class PilotResult:
         share_of_radius = radius / self.errors["relmse"][kind].ladder[-1]
         return share * self.photons[kind] * share_of_radius ** self.setting.dimensions(kind)
 
-    def _cost(self, kind: str, radius: Radii, corrected: bool, share: float) -> Radii:
+    def _cost(self, kind: str, radius: Radii, share: float) -> Radii:
         """Cost of an iteration by one kind of photons, see `cost`."""
-        gathered = self.gathered(kind, radius, share)
-        return iteration_cost(gathered, corrected, self.setting.camera_paths, share)
+        gathered, corrects = self.gathered(kind, radius, share), self.setting.corrects(kind)
+        return iteration_cost(gathered, corrects, self.setting.camera_paths, share)
 
     def cost(self, choice: Choice) -> float:
-        """Cost of an iteration with the radii and corrections of a choice, see `cost`."""
+        """Cost of an iteration with the radii of a choice, see `cost`."""
         return max(
             (
-                self._cost(kind, radius, choice.corrected[kind], choice.light_share)
+                self._cost(kind, radius, choice.light_share)
                 for kind, radius in choice.radii.items()
                 if kind in self._met
             ),
@@ -259,7 +246,7 @@ def measure(
         nothing = np.zeros(pixels.count)
         return PilotResult(setting, pixels, seconds, {}, {}, {}, {}, nothing, 0.0, 0.0, {})
     middle = {
-        kind: samples.gathered[kind, False][:, middle_index(ladder)].mean(axis=1)
+        kind: samples.gathered[kind][:, middle_index(ladder)].mean(axis=1)
         for kind, ladder in samples.ladder.items()
     }  # (iterations, pixels)
     of_photons = sum(middle.values())
@@ -270,19 +257,16 @@ def measure(
     weights = {measure: weigh(mean) for measure, weigh in MEASURES.items()}
     errors: dict[str, dict[str, ErrorByRadius]] = {measure: {} for measure in MEASURES}
     for kind, ladder in samples.ladder.items():
-        by_correction = {
-            corrected: samples.gathered[kind, corrected] for corrected in setting.corrections(kind)
-        }
         for measure in MEASURES:
             errors[measure][kind] = error_by_radius(
                 ladder,
-                by_correction[False],
-                by_correction.get(True),
+                samples.gathered[kind],
                 weights[measure],
                 (setting.at_first_vertex and not setting.passes_lobes) or kind == "seen_caustic",
                 kind == "caustic",
                 setting.light_paths,
                 setting.filter_share,
+                setting.corrects(kind),
             )
     caustics = sum(np.mean(middle[kind]) for kind in ("seen_caustic", "caustic") if kind in middle)
     return PilotResult(

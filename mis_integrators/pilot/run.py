@@ -51,9 +51,9 @@ class PilotIteration(Protocol):
 
     def gather(
         self, radii: dict[str, np.ndarray]
-    ) -> tuple[dict[tuple[str, bool], np.ndarray], np.ndarray | None]:
-        """What photons bring for the radii of each kind, by kind and whether the estimate is
-        corrected at edges: mean over the channels, (radii, groups of camera paths, pixels). And the
+    ) -> tuple[dict[str, np.ndarray], np.ndarray | None]:
+        """What photons bring for the radii of each kind, corrected at edges where the setting says
+        so: mean over the channels, (radii, groups of camera paths, pixels). And the
         second moment of one camera path that meets the light of caustic photons by chance, (groups,
         pixels); None where nobody asks."""
 
@@ -102,7 +102,7 @@ def run_pilot(
     """
     radii: dict[str, np.ndarray] = {}
     photons: dict[str, float] = {}
-    gathered: list[dict[tuple[str, bool], np.ndarray]] = []
+    gathered: list[dict[str, np.ndarray]] = []
     direct: list[np.ndarray] = []
     chance: list[np.ndarray] = []
     joined: list[np.ndarray] = []
@@ -113,7 +113,7 @@ def run_pilot(
             samples = PilotSamples(
                 radii,
                 photons,
-                {key: np.array([step[key] for step in gathered]) for key in gathered[0]},
+                {kind: np.array([step[kind] for step in gathered]) for kind in gathered[0]},
                 np.array(direct),
                 passes.seen(),
                 np.array(joined) if joined else None,

@@ -77,12 +77,17 @@ class PilotSetting:
         """A usual number where none is planned."""
         return self.iterations or UNPLANNED_ITERATIONS
 
-    def corrections(self, kind: str) -> tuple[bool, ...]:
-        """The estimates to compare: plain ones, and those corrected at edges where these may be
-        better. Caustics have edges of their own; only the smooth indirect light gains from knowing
-        the surfaces' edges, and only where the camera sees the vertices: deeper ones are spread
-        over the scene, and their blur averages out."""
-        return (False, True) if kind == "indirect" and self.at_first_vertex else (False,)
+    def corrects(self, kind: str) -> bool:
+        """Whether the render corrects estimates at edges."""
+        return corrects(kind, self.at_first_vertex)
+
+
+def corrects(kind: str, at_first_vertex: bool) -> bool:
+    """Whether estimates from photons of a kind are corrected at edges. Caustics have edges of their
+    own; only the smooth indirect light gains from knowing the surfaces' edges, and only where the
+    camera sees the vertices: deeper ones are spread over the scene, and their blur averages
+    out."""
+    return kind == "indirect" and at_first_vertex
 
 
 def pilot_light_paths(count: int) -> int:

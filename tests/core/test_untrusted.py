@@ -267,49 +267,41 @@ LEARNED = {
         {"radii": {}},
         {
             "radii": {"indirect": 0.1},
-            "corrected": {"indirect": False},
             "light_share": 1.0,
             "direct_light": {},
         },
         {
             "radii": {"indirect": -1, "caustic": 0.1},
-            "corrected": {"indirect": True, "caustic": True},
             "light_share": 1.0,
             "direct_light": {},
         },
         {
             "radii": {"indirect": 1, "caustic": 1e999},
-            "corrected": {"indirect": True, "caustic": True},
             "light_share": 1.0,
             "direct_light": {},
         },
         {
             "radii": {"indirect": 1, "caustic": 1},
-            "corrected": {"indirect": True, "caustic": 1},
             "light_share": 1.0,
             "direct_light": {},
         },
         {
             "radii": {"indirect": 1, "caustic": 1},
-            "corrected": {"indirect": True, "caustic": True},
             "light_share": 1.0,
             "direct_light": {"photon_light": 1, "photon_error": -1, "iterations": 1},
         },
         {
             "radii": {"indirect": 1, "caustic": 1},
-            "corrected": {"indirect": True, "caustic": True},
             "light_share": 1.0,
             "direct_light": {"photon_light": 1, "photon_error": 1},
         },
         {
             "radii": {"indirect": 1, "caustic": 1},
-            "corrected": {"indirect": True, "caustic": True},
             "light_share": 2.0,
             "direct_light": {},
         },
         {
             "radii": {"indirect": 1, "caustic": 1, "more": 1},
-            "corrected": {"indirect": True, "caustic": True},
             "light_share": 1.0,
             "direct_light": {},
         },
@@ -401,11 +393,10 @@ def test_what_a_session_has_learned_is_taken(sessions, plugin):
     derandomize=True,
     suppress_health_check=[hypothesis.HealthCheck.function_scoped_fixture],
 )
-@hypothesis.given(st.sampled_from(["radii", "corrected", "direct_light", "more"]), JSON)
+@hypothesis.given(st.sampled_from(["radii", "direct_light", "more"]), JSON)
 def test_any_value_that_was_learned(sessions, name, value):
     learned = {
         "radii": {"indirect": 0.1, "caustic": 0.1},
-        "corrected": {"indirect": False, "caustic": False},
         "light_share": 1.0,
         "direct_light": {},
         name: value,

@@ -10,13 +10,12 @@ def knowing(session, radii, iterations):
 
 
 def learned(session, radii, iterations=0.0, **others):
-    """What a session of photons can `recall`: `radii` by kind, or one for all; no correction at
-    edges, all light sub-paths, and caustic photons with radii for a render of so many `iterations`
-    (0: all alike), but for `others`."""
+    """What a session of photons can `recall`: `radii` by kind, or one for all; all light sub-paths,
+    and caustic photons with radii for a render of so many `iterations` (0: all alike), but for
+    `others`."""
     kinds = session.kinds()
     return {
         "radii": radii if isinstance(radii, dict) else dict.fromkeys(kinds, radii),
-        "corrected": dict.fromkeys(kinds, False),
         "light_share": 1.0,
         "caustic_radii": {"iterations": iterations},
         "direct_light": {},

@@ -9,7 +9,7 @@ from mis_integrators import render_views
 from mis_integrators._plugins import PLUGINS
 from mis_integrators.pilot.noise import MEASURES, trimmed_mean
 from mis_integrators.pilot.result import PilotResult, PilotSamples, measure
-from mis_integrators.pilot.setting import PilotSetting, pilot_pixels
+from mis_integrators.pilot.setting import pilot_pixels
 
 import drjit as dr
 import mitsuba as mi
@@ -217,8 +217,7 @@ def test_same_seed_same_edges(rgb):
         session = bdpm(bdd=0, initial_radius=0.0, photon_count=3000).session(
             glossy_box(size=128), seed=5
         )
-        corrected = {"caustic": False, "indirect": True}
-        session.recall(learned(session, 0.3, corrected=corrected))
+        session.recall(learned(session, 0.3))
         session.iterate()
         images.append(session.image())
     np.testing.assert_allclose(*images, rtol=1e-4, atol=1e-6)
@@ -1004,7 +1003,7 @@ def test_rare_photons_get_no_smallest_radius(rgb):
     samples = PilotSamples(
         {"indirect": np.array([0.01 * 2**i for i in range(7)])},
         {"indirect": 0.0},
-        {("indirect", corrected): np.zeros((4, 7, 1, 256)) for corrected in (False, True)},
+        {"indirect": np.zeros((4, 7, 1, 256))},
         np.ones((4, 1, 256)),
         np.zeros(256),
     )
@@ -1386,10 +1385,9 @@ def kernels(integrator, scene, seed):
 
 
 @pytest.mark.parametrize("plugin", ["bdpm_opt2", *extended("bdpm")])
-def test_no_seed_has_kernels_of_its_own(rgb, plugin, monkeypatch):
+def test_no_seed_has_kernels_of_its_own(rgb, plugin):
     """Numbers that depend on chance are not literals: seconds of compiling would come again with
-    each seed. (Whether estimates are corrected at edges is no number.)"""
-    monkeypatch.setattr(PilotSetting, "corrections", lambda setting, kind: (False,))
+    each seed."""
     gc.collect()  # kernels know all the scenes that there are
     scene, integrator = glossy_box(), mi.load_dict({"type": plugin, "photon_count": 3000})
     first, second, third = (kernels(integrator, scene, seed) for seed in (1, 2, 3))

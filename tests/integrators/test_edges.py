@@ -35,14 +35,12 @@ def legs(material=None, floor=None, **objects):
 
 @pytest.fixture
 def merged(rgb, monkeypatch):
-    """`bdpm` with `bdd` 0 and this radius, as if a pilot had chosen it with the correction."""
+    """`bdpm` with `bdd` 0 and this radius, as if a pilot had chosen it."""
     from mis_integrators.integrators.bdpm import BDPMSession
 
     def predict(session, settled=None):
         if session.radii is None:
             session.radii = dict.fromkeys(session.kinds(), RADIUS)
-            session.corrected = {kind: kind == "indirect" for kind in session.kinds()}
-            session._record_camera_pass()
 
     monkeypatch.setattr(BDPMSession, "predict", predict)
     return lambda **more: mi.load_dict({"type": "bdpm", "bdd": 0, **SETTINGS, **more})
@@ -123,6 +121,6 @@ def test_which_vertices_are_passed(rgb, radius, expected, round_one):
         depth=dr.ones(mi.UInt32, n),
     )
     edges = Edges(dr.opaque(mi.Float, radius), dr.opaque(mi.UInt32, 7))
-    share, passed = edges.at(scene, arrival, dr.full(mi.Bool, True, n))
+    coverage, passed = edges.at(scene, arrival, dr.full(mi.Bool, True, n))
     assert np.mean(np.broadcast_to(np.array(passed), n)) == pytest.approx(expected, abs=0.1)
-    assert radius > 0 or np.all(np.array(share) == 1)
+    assert radius > 0 or np.all(np.array(coverage.share) == 1)

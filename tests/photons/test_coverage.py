@@ -22,7 +22,7 @@ def scene_with(**shapes):
 def share_at(scene, x, height=0.5):
     """Covered shares of `COUNT` disks around the floor's point (x, 0, 0), seen from so high above
     it."""
-    from mis_integrators.photons.coverage import covered_share  # of the active variant
+    from mis_integrators.photons.coverage import coverage  # of the active variant
     from mis_integrators.photons.gather import FLAGS
 
     ray = mi.Ray3f(mi.Point3f(dr.full(mi.Float, x, COUNT), 0, height), mi.Vector3f(0, 0, -1))
@@ -32,11 +32,8 @@ def share_at(scene, x, height=0.5):
         "path": dr.arange(mi.UInt32, COUNT),
         "depth": dr.ones(mi.UInt32, COUNT),
     }
-    return np.array(
-        covered_share(
-            scene, vertices, si, dr.opaque(mi.Float, RADIUS), dr.opaque(mi.UInt32, 7), mi.Bool(True)
-        )
-    )
+    radius, seed = dr.opaque(mi.Float, RADIUS), dr.opaque(mi.UInt32, 7)
+    return np.array(coverage(scene, vertices, si, radius, seed, mi.Bool(True)).share)
 
 
 def lacks(shares, expected):

@@ -75,7 +75,7 @@ def indirect_light(scene, radius, corrected):
     session = mi.load_dict(
         {"type": "bdpm", "bdd": 0, "max_depth": 6, "photon_count": 20000}
     ).session(scene, seed=1, spp=64)
-    session.radii, session.corrected = {"indirect": radius}, {"indirect": corrected}
+    session.radii, session.corrects = {"indirect": radius}, lambda kind: corrected
     for _ in range(64):
         session.iterate()
     direct = path(2)

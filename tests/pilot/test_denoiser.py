@@ -49,8 +49,8 @@ def test_radius_for_a_denoiser(seed):
     scale = fine / RADII[3]
     chosen = {}
     for groups, left in ((1, 1.0), (2, LEFT)):
-        errors = radius.error_by_radius(RADII, samples_of(seed, groups), None, np.ones(PIXELS))
-        chosen[groups] = radius.best_radius([errors], lambda *_: n).radius
+        errors = radius.error_by_radius(RADII, samples_of(seed, groups), np.ones(PIXELS))
+        chosen[groups] = radius.best_radius([errors], lambda _: n)
         true = (0.05 * scale**2) ** 2 + (0.05**2 + left * 9) / scale**2 / n
         best = fine[np.argmin(true)]
         assert best / 1.5 < chosen[groups] < 1.5 * best, (chosen, best)

@@ -48,7 +48,7 @@ def choice_of(setting, photons, paths, seed=0):
     samples = PilotSamples(
         {"indirect": RADII},
         {"indirect": 0.0},
-        {("indirect", corrected): gathered for corrected in setting.corrections("indirect")},
+        {"indirect": gathered},
         np.zeros((ITERATIONS, groups, count)),
         np.zeros(count),
     )
@@ -79,7 +79,7 @@ def test_share_is_that_of_the_least_error_in_the_time(denoised, ratio):
     left = LEFT if denoised else 1.0
     result, choice = choice_of(setting_of(denoised), ratio * left, 1.0)
     errors = result.errors["relmse"]["indirect"]
-    noise = errors.noise[False]
+    noise = errors.noise
     at_radius = np.interp(choice.radii["indirect"], RADII, noise.photons)
     best = np.sqrt(at_radius / noise.floor * CAMERA_SHARE / (1 - CAMERA_SHARE))
     best = np.clip(best, LIGHT_SHARES[-1], 1)

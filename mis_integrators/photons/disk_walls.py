@@ -1,0 +1,120 @@
+"""DiskWalls that stand in merge disks, and the photons behind them.
+
+Where a floor goes on behind a wall, the photons out there lie on the same plane as those in here,
+and may be a thousand times as bright. A photon behind a wall counts only if it is seen from where
+the probes of the disk start (`coverage`), as the covered share counts only surface that is. One
+photon speaks for all behind a vertex' walls, drawn in proportion to what it brings: the expected
+estimate is that of a shadow ray to each.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import drjit as dr
+import mitsuba as mi
+
+from ..core.recording import lanes
+from ..core.records import Layout
+from ..core.spectra import channel_mean
+
+SLACK = 1e-3
+"""How much further than a wall, relative to its distance, photons are behind it; and by how much
+shadow rays end before a photon."""
+CLOSEST = 1e-4
+"""Least distance of walls, in radii of the disk."""
+ALIKE = 0.7
+"""Cosine between walls, more of which makes them one."""
+
+
+@dataclass
+class DiskWalls:
+    """The two nearest walls of merge disks that do not face alike.
+
+    `near`, `far`: minus the wall's normal over the distance to its plane, so that offsets from the
+    vertex whose product with it is above one are behind; zero: none. `height`: of the place above
+    the vertex from which photons must be seen.
+    """
+
+    near: mi.Vector3f
+    far: mi.Vector3f
+    height: mi.Float
+
+    def behind(self, offset):
+        """Whether places, `offset` from the vertices, are behind a wall."""
+        furthest = dr.maximum(dr.dot(offset, self.near), dr.dot(offset, self.far))
+        return furthest > 1 + SLACK
+
+
+class Coverage(NamedTuple):
+    """Of merge disks: the covered `share`, by which estimates are divided, and the `DiskWalls`."""
+
+    share: mi.Float
+    walls: DiskWalls
+
+
+def coverage_layout():
+    """Fields of a vertex' coverage: the `bare` share of its disk, and the walls. Zero: none."""
+    return Layout({"near": mi.Vector3f, "bare": mi.Float, "far": mi.Vector3f, "height": mi.Float})
+
+
+def read_coverage(words):
+    """The `Coverage` of all vertices of a buffer."""
+    layout = coverage_layout()
+    record = layout.read(words, lanes(layout.capacity(words)))
+    walls = DiskWalls(record["near"], record["far"], record["height"])
+    return Coverage(1 - record["bare"], walls)
+
+
+def with_wall(near, far, p, hit, start, radius, active):
+    """The two nearest walls (as of `DiskWalls`) around vertices at `p` with disks of a `radius`:
+    `near` and `far`, and what a ray from `start` has `hit` where it is `active`."""
+    normal = dr.mulsign(hit.n, dr.dot(hit.n, start - hit.p))
+    distance = dr.dot(normal, p - hit.p)
+    active = active & (distance > -CLOSEST * radius)
+    wall = -normal / dr.maximum(distance, CLOSEST * radius)
+    nearness = dr.norm(wall)
+    alike = dr.dot(normal, near) < -ALIKE * dr.norm(near)
+    first = active & (nearness > dr.norm(near))
+    second = active & ~first & ~alike & (nearness > dr.norm(far))
+    far = dr.select(first & ~alike, near, dr.select(second, wall, far))
+    return dr.select(first, wall, near), far
+
+
+@dataclass
+class Hidden:
+    """Photons behind walls within one radius: the sum of their `light`, mean over the channels, and
+    the `offset` of the one that speaks for them."""
+
+    light: mi.Float
+    offset: mi.Vector3f
+
+    @staticmethod
+    def none():
+        """Before the first of them."""
+        return Hidden(mi.Float(0), mi.Vector3f(0))
+
+    def add(self, index, path, value, offset, active):
+        """These with the `value` of photon `index` more; `path`: the number of the camera path."""
+        light = dr.select(active, channel_mean(value), 0)
+        total = self.light + light
+        drawn = light > _uniform(index, path) * total
+        return Hidden(total, dr.select(drawn, offset, self.offset))
+
+    def seen(self, scene, vertices, walls):
+        """Whether the one is seen."""
+        start = vertices.p + dr.mulsign(vertices.n, vertices.side) * walls.height
+        towards = vertices.p + self.offset - start
+        distance = dr.norm(towards)
+        ray = mi.Ray3f(start, towards / dr.maximum(distance, 1e-30))
+        ray.maxt = distance * (1 - SLACK)
+        return ~scene.ray_test(ray, coherent=False, active=vertices.active & (self.light > 0))
+
+
+def _uniform(index, path):
+    """A number in [0, 1) for each photon and camera path: one that need not be better than this."""
+    word = (index * 0x9E3779B9) ^ (path * 0x85EBCA6B)
+    word = (word ^ (word >> 15)) * 0x2C1B3C6D
+    word = (word ^ (word >> 12)) * 0x297A2D39
+    return mi.Float((word ^ (word >> 15)) >> 8) * 2**-24

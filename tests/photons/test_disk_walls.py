@@ -1,0 +1,177 @@
+"""Walls in merge disks: which are known, which photons they hide, and rooms without leaks of
+light."""
+
+import dataclasses
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from comparing import agree
+from worlds import T, diffuse, film, look, path
+
+SETTINGS = {"max_depth": 5, "rr_depth": 50}
+OUTSIDE, RADIUS = 100.0, 0.15
+
+
+def room(**objects):
+    """A dim room on a bright plain: its walls and ceiling stand on the floor that goes on outside,
+    as far as those go on beyond its corners."""
+    places = {
+        "left": T().translate([-0.5, 0, 0.5]).rotate([0, 1, 0], 90),
+        "right": T().translate([0.5, 0, 0.5]).rotate([0, 1, 0], -90),
+        "back": T().translate([0, 0.5, 0.5]).rotate([1, 0, 0], 90),
+        "front": T().translate([0, -0.5, 0.5]).rotate([1, 0, 0], -90),
+        "ceiling": T().translate([0, 0, 1]).rotate([1, 0, 0], 180),
+        "floor": T(),
+    }
+    grey = {"type": "twosided", "bsdf": diffuse(0.7)}
+    walls = {
+        name: {"type": "rectangle", "to_world": place, "bsdf": grey}
+        for name, place in places.items()
+    }
+    return mi.load_dict(
+        {
+            "type": "scene",
+            **walls,
+            "lamp": {
+                "type": "sphere",
+                "center": [0.1, 0, 0.6],
+                "radius": 0.1,
+                "emitter": {"type": "area", "radiance": 3.0},
+            },
+            "sun": {"type": "point", "position": [0, 0, 4], "intensity": OUTSIDE},
+            "sensor": {
+                "type": "perspective",
+                "fov": 80,
+                "to_world": look((0, -0.45, 0.6), (0, 0.5, 0.3), (0, 0, 1)),
+                "film": film(32),
+            },
+            **objects,
+        }
+    )
+
+
+@pytest.fixture
+def merged(rgb, monkeypatch):
+    """`bdpm` with `bdd` 0 and this radius, as if a pilot had chosen it."""
+    from mis_integrators.integrators.bdpm import BDPMSession
+
+    def predict(session, settled=None):
+        if session.radii is None:
+            session.radii = dict.fromkeys(session.kinds(), RADIUS)
+
+    monkeypatch.setattr(BDPMSession, "predict", predict)
+    return lambda **more: mi.load_dict({"type": "bdpm", "bdd": 0, **SETTINGS, **more})
+
+
+@pytest.mark.parametrize("denoised", [False, True])
+def test_no_light_leaks_into_a_room(merged, denoised):
+    """As bright as of `path`, all of it within 3 %, in images that will be denoised, too, whose
+    camera paths pass no edges. (With the photons of outside a fifth too bright.)"""
+    whole = 0.015 if not denoised else 0.03
+    agree(merged(denoised=denoised), path(**SETTINGS), room(), blocks=1, whole=whole, block=whole)
+
+
+def test_it_leaks_without_walls(merged, monkeypatch):
+    """The test above is no test else."""
+    from mis_integrators.integrators.bdpm import BDPMSession
+
+    def mean(cuts_walls):
+        monkeypatch.setattr(BDPMSession, "cuts_walls", cuts_walls)
+        session = merged(camera_paths=2).session(room(), seed=1)
+        for _ in range(16):
+            session.iterate()
+        return np.mean(session.image())
+
+    assert mean(False) > 1.1 * mean(True)
+
+
+def gathered_by_pilot(radii, cuts_walls=False, at_first_vertex=True, coverage=None):
+    """What the first iteration of a pilot gathers, a mean for each radius. `coverage`: in place of
+    `PhotonPasses._coverage`."""
+    from mis_integrators.pilot.setting import pilot_pixels
+
+    session = mi.load_dict({"type": "bdpm", "bdd": 0, **SETTINGS}).session(room(), seed=1)
+    session.cuts_walls = cuts_walls
+    setting = session.pilot_setting()
+    pixels = pilot_pixels(setting)
+    passes = session.pilot_passes(
+        dataclasses.replace(setting, at_first_vertex=at_first_vertex), pixels
+    )
+    if coverage is not None:
+        passes._coverage = coverage
+    gathered, _ = passes.trace(0).gather({"indirect": np.array(radii)})
+    return gathered["indirect"].mean(axis=(1, 2))
+
+
+def test_pilots_correct_each_radius(rgb):
+    """What a pilot gathers is corrected by the share of the very disk: more for larger ones."""
+    radii = [0.01, 0.05, 0.2]
+    ratio = gathered_by_pilot(radii) / gathered_by_pilot(radii, at_first_vertex=False)
+    assert 1 <= ratio[0] < 1.1 and np.all(ratio[1:] > 1.1 * ratio[:-1]), ratio
+
+
+def test_what_is_seen_behind_walls_counts(rgb):
+    """Half of all disks are behind a wall that is not there: next to nothing is hidden from places
+    above their centres."""
+
+    def halves(scene, tables, vertices, radius, seed):
+        towards = {"near": mi.Vector3f(1000, 0, 0), "far": mi.Vector3f(0)}
+        return mi.Float(1), {**towards, "height": 0.2 * radius}
+
+    radii = [0.02, 0.04]
+    all_of_it = gathered_by_pilot(radii, at_first_vertex=False)
+    assert gathered_by_pilot(radii, True, coverage=halves) == pytest.approx(all_of_it, rel=0.05)
+
+
+def vectors(rows):
+    return mi.Vector3f(*np.array(rows, dtype=np.float32).T)
+
+
+def test_the_two_nearest_walls_that_do_not_face_alike(rgb):
+    """Among walls at distances 0.5 and 0.2 on the right, 0.3 behind and 0.1 on the left, in all
+    orders."""
+    from types import SimpleNamespace
+
+    from mis_integrators.photons.disk_walls import DiskWalls, with_wall
+
+    met = [((0.5, 0, 0), (1, 0, 0)), ((0.2, 0, 0), (1, 0, 0)), ((0, 0.3, 0), (0, 1, 0))]
+    met.append(((-0.1, 0, 0), (1, 0, 0)))
+    rng = np.random.default_rng(2)
+    for _ in range(8):
+        near, far = mi.Vector3f(0), mi.Vector3f(0)
+        for at in rng.permutation(len(met)):
+            p, n = met[at]
+            hit = SimpleNamespace(p=mi.Point3f(*p), n=mi.Normal3f(*n))
+            near, far = with_wall(
+                near, far, mi.Point3f(0), hit, mi.Point3f(0, 0, 0.01), mi.Float(1), mi.Bool(True)
+            )
+        walls = DiskWalls(near, far, mi.Float(0.01))
+        places = vectors([(-0.15, 0, 0), (0.25, 0, 0), (0.15, 0.35, 0), (-0.05, 0.1, 0)])
+        assert list(np.array(walls.behind(places))) == [True, True, False, False]
+
+
+def test_one_photon_speaks_for_all_in_proportion(rgb):
+    """It is seen as often as the share of the light that is: photons on one side of a screen bring
+    a quarter of it. (4096 vertices: five standard deviations.)"""
+    from types import SimpleNamespace
+
+    from mis_integrators.photons.disk_walls import DiskWalls, Hidden
+
+    screen = {"type": "rectangle", "to_world": T().rotate([0, 1, 0], 90)}
+    scene, n = mi.load_dict({"type": "scene", "screen": screen}), 4096
+    hidden, number = Hidden.none(), dr.arange(mi.UInt32, n)
+    for index, (x, light) in enumerate([(-0.1, 1.0), (0.1, 3.0), (-0.2, 0.5), (0.2, 1.5)]):
+        photon = mi.UInt32(index) + number * 4
+        offset = mi.Vector3f(x - 0.05, 0, 0)
+        hidden = hidden.add(photon, number, mi.Spectrum(light), offset, mi.Bool(True))
+    vertices = SimpleNamespace(
+        p=mi.Point3f(dr.full(mi.Float, 0.05, n), 0, 0),
+        n=mi.Normal3f(0, 0, 1),
+        side=mi.Float(1),
+        active=mi.Bool(True),
+    )
+    walls = DiskWalls(mi.Vector3f(0), mi.Vector3f(0), mi.Float(0.02))
+    seen = np.array(hidden.seen(scene, vertices, walls))
+    assert abs(seen.mean() - 0.75) < 5 * np.sqrt(0.75 * 0.25 / n)
