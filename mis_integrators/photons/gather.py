@@ -51,7 +51,7 @@ class QueryVertices:
         si = record["hit"].compute_surface_interaction(ray, FLAGS, active)
         self.traits, self.si, self.bsdf, self.active = traits, si, si.bsdf(), active
         self.p, self.n, self.plane, self.depth = si.p, si.n, si.n, depth & DEPTH
-        self.path = record["path"]
+        self.path = record.get("path")
         self.facing = mi.Frame3f.cos_theta(si.wi)
         self.side = dr.dot(si.n, -ray.d)
         self.first = record.get("first")
