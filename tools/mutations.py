@@ -365,8 +365,8 @@ MUTATIONS = [
     ),
     Mutation(
         "pilot/bias.py",
-        "m * (m - 1)\n    )",
-        "m * m\n    )",
+        "(m * (m - 1))",
+        "(m * m)",
         "products of iterations are biased",
         RADIUS,
     ),
@@ -1043,7 +1043,7 @@ MUTATIONS = [
     ),
     Mutation(
         "photons/disk_walls.py",
-        "return furthest > 1 + SLACK",
+        "return furthest > BEHIND",
         "return furthest > 1e30",
         "photons of outdoors light a room through its walls",
         "tests/photons/test_disk_walls.py::test_no_light_leaks_into_a_room",
@@ -1057,9 +1057,16 @@ MUTATIONS = [
     ),
     Mutation(
         "integrators/pilot_passes.py",
-        "shares[kind].append(share)",
-        "shares[kind].append(share * 0 + 1)",
+        "[share for share, _ in found]",
+        "[share * 0 + 1 for share, _ in found]",
         "pilots do not correct at edges",
         "tests/photons/test_disk_walls.py::test_pilots_correct_each_radius",
+    ),
+    Mutation(
+        "photons/gather.py",
+        "brings = value * vertices.factor",
+        "brings = value * 0 + 1",
+        "photons behind walls are tested regardless of what they bring",
+        "tests/photons/test_disk_walls.py::test_light_of_another_colour",
     ),
 ]

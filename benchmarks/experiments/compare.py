@@ -286,7 +286,7 @@ def _row(measured: Measured, mine: dict, base: dict, measurement: Measurement) -
 
 
 def chosen(settings: dict) -> str:
-    """What a session chose by itself: radii, edge corrections."""
+    """What a session chose by itself: radii."""
     return " ".join(
         f"{name}={value:.3g}" if isinstance(value, float) else f"{name}={value}"
         for name, value in settings.items()

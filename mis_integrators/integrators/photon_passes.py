@@ -56,7 +56,7 @@ class PhotonPasses(PilotedSession):
     follows_curvature = True
     """Whether merge disks of indirect light are smaller where surfaces are bent, if their radius is
     automatic. (Weights know one radius for all.)"""
-    cuts_walls = True
+    leaves_out_hidden = True
     """Whether estimates that are corrected at edges leave out photons that `DiskWalls` hide.
     (Weights gather all.)"""
     passes_edges = False
@@ -287,21 +287,12 @@ class PhotonPasses(PilotedSession):
             )
         return found if chance is None else chance.with_hits(found, radii, grey)
 
-    def _gather_covered(self, scene, photon_map, vertices, kind, radius, covered, spectral):
-        """`_gather` of one radius, corrected by the `Coverage`."""
-        correction = dr.rcp(covered.share)
-        if self.cuts_walls:
-            parts = self._gather_seen(
-                scene, photon_map, vertices, covered.walls, [radius], spectral
-            )
-        else:
-            parts = self._gather(photon_map, vertices, kind, [radius], spectral)
-        return [gathered * correction for gathered in parts]
-
-    def _gather_seen(self, scene, photon_map, vertices, walls, radii, spectral, grey=False):
-        """`gather_seen` of indirect photons."""
-        record = read_queries(vertices)
-        asking, radii = self._asking(record, "indirect", radii, spectral)
+    def _gather_indirect(self, scene, photon_map, vertices, walls, radii, spectral, grey=False):
+        """`_gather` of indirect photons; those that the `DiskWalls` of each radius hide are left
+        out, if `leaves_out_hidden`."""
+        if not self.leaves_out_hidden:
+            return self._gather(photon_map, vertices, "indirect", radii, spectral, grey)
+        asking, radii = self._asking(read_queries(vertices), "indirect", radii, spectral)
         depth, marked = self.integrator.max_depth, self.integrator.splits_light
         return gather_seen(
             scene, photon_map, asking, walls, radii, self._light_paths, depth, grey, marked
@@ -463,9 +454,10 @@ class PhotonPasses(PilotedSession):
                 else:
                     seed = sequence.own_seed()
                     covered = self.coverage(scene, read_queries(vertices), radius, seed)
-                parts = self._gather_covered(
-                    scene, photon_map, vertices, kind, radius, covered, spectral
+                found = self._gather_indirect(
+                    scene, photon_map, vertices, [covered.walls], [radius], spectral
                 )
+                parts = [gathered * dr.rcp(covered.share) for gathered in found]
             for number, gathered in enumerate(parts):
                 gathered = self._per_path(gathered, vertices, kind, self.chunk)
                 gathered = gathered if beyond is None else gathered * beyond

@@ -59,9 +59,9 @@ class SubsetPasses:
             gathered, moment = {}, None
             for kind, ladder in radii.items():
                 photon_map = session._map(photons, kind, ladder[-1], density)
-                if kind == "indirect" and walls is not None:
-                    gathered[kind] = session._gather_seen(
-                        scene, photon_map, vertices, walls, ladder, spectral, grey=True
+                if kind in walls:
+                    gathered[kind] = session._gather_indirect(
+                        scene, photon_map, vertices, walls[kind], ladder, spectral, grey=True
                     )
                 else:
                     gathered[kind] = session._gather(
@@ -121,17 +121,15 @@ class SubsetPasses:
             kind: [dr.opaque(mi.Float, float(radius)) for radius in ladder]
             for kind, ladder in radii.items()
         }
-        walls, shares = None, {}
+        walls, shares = {}, {}
         for kind, ladder in radii.items():
             if self.setting.corrects(kind):
-                shares[kind] = []
-                for radius in ladder:
-                    share, walls = self._coverage(
-                        session.scene, session._tables, vertices, radius, seed
-                    )
-                    shares[kind].append(share)
-        # The walls of the largest disks serve all.
-        walls = DiskWalls(**walls) if walls and session.cuts_walls else None
+                found = [
+                    self._coverage(session.scene, session._tables, vertices, radius, seed)
+                    for radius in ladder
+                ]
+                shares[kind] = [share for share, _ in found]
+                walls[kind] = [DiskWalls(**around) for _, around in found]
         gathered, moment = self._gather(
             session.scene, session._tables, photons, self.density, vertices, radii, walls, spectral
         )

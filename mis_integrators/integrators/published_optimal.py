@@ -45,7 +45,7 @@ class PublishedSession(BDPMSession):
     The pilot of an automatic radius merges at the first strategy's vertex, unweighted.
     """
 
-    chooses_light_paths = widens_caustics = follows_curvature = cuts_walls = False
+    chooses_light_paths = widens_caustics = follows_curvature = leaves_out_hidden = False
 
     def __init__(self, integrator, scene, sensor, seed, iterations):
         super().__init__(integrator, scene, sensor, seed, iterations)

@@ -35,7 +35,7 @@ class WeightedSession(BDPMSession):
     """Iterations of a `WeightedBDPM`. A subclass makes the weights."""
 
     chooses_light_paths = narrows_volume = suits_denoisers = meets_lights = False
-    cuts_walls = False
+    leaves_out_hidden = False
     follows_curvature = False  # nor do published weights, see `published_optimal`
     weighted_pilot = False
     """Whether the pilot of the automatic radius renders under the weights, made for

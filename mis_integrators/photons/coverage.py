@@ -3,8 +3,8 @@
 Near a wall, or where a floor ends, part of the disk around a vertex holds no surface on which
 photons could land, and density estimation over the whole disk comes out dark: a bias that falls
 only in proportion to the radius, while that of curvature falls with its square. A few short probe
-rays estimate the covered share of the disk, by which the estimate is divided. What they hit before
-are walls, behind which photons must be seen (`disk_walls`).
+rays estimate the covered share of the disk, by which the estimate is divided. Surfaces
+that stop a probe on its way are walls, behind which photons must be seen (`disk_walls`).
 """
 
 from __future__ import annotations

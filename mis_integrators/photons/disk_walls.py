@@ -1,10 +1,11 @@
-"""DiskWalls that stand in merge disks, and the photons behind them.
+"""Walls that stand in merge disks, and the photons behind them.
 
 Where a floor goes on behind a wall, the photons out there lie on the same plane as those in here,
 and may be a thousand times as bright. A photon behind a wall counts only if it is seen from where
-the probes of the disk start (`coverage`), as the covered share counts only surface that is. One
-photon speaks for all behind a vertex' walls, drawn in proportion to what it brings: the expected
-estimate is that of a shadow ray to each.
+the probes of the disk start (`coverage`), as the covered share counts only surface that is. One of
+those behind a vertex' walls is tested in place of all, drawn in proportion to what they bring: the
+mean over the channels is expected to be that of a shadow ray to each. (Its channels, and classes of
+light, share the one test.)
 """
 
 from __future__ import annotations
@@ -19,13 +20,14 @@ from ..core.recording import lanes
 from ..core.records import Layout
 from ..core.spectra import channel_mean
 
-SLACK = 1e-3
-"""How much further than a wall, relative to its distance, photons are behind it; and by how much
-shadow rays end before a photon."""
+BEHIND = 1 + 1e-3
+"""Distance of photons that are behind a wall, over that of the wall."""
+SHADOW_END = 1 - 1e-3
+"""Share of the way to a photon at which shadow rays end."""
 CLOSEST = 1e-4
 """Least distance of walls, in radii of the disk."""
 ALIKE = 0.7
-"""Cosine between walls, more of which makes them one."""
+"""Tuned: cosine between walls, more of which makes them one."""
 
 
 @dataclass
@@ -44,7 +46,7 @@ class DiskWalls:
     def behind(self, offset):
         """Whether places, `offset` from the vertices, are behind a wall."""
         furthest = dr.maximum(dr.dot(offset, self.near), dr.dot(offset, self.far))
-        return furthest > 1 + SLACK
+        return furthest > BEHIND
 
 
 class Coverage(NamedTuple):
@@ -84,23 +86,25 @@ def with_wall(near, far, p, hit, start, radius, active):
 
 @dataclass
 class Hidden:
-    """Photons behind walls within one radius: the sum of their `light`, mean over the channels, and
-    the `offset` of the one that speaks for them."""
+    """Photons behind walls within one radius: the one that is tested in place of all, at an
+    `offset` from the vertex, has the least `key` of them. They are independent exponential numbers
+    whose rates are what the photons bring (Efraimidis and Spirakis 2006, Weighted random sampling
+    with a reservoir): whatever the order, each has the least one in proportion to that. Infinite:
+    there are none."""
 
-    light: mi.Float
+    key: mi.Float
     offset: mi.Vector3f
 
     @staticmethod
     def none():
         """Before the first of them."""
-        return Hidden(mi.Float(0), mi.Vector3f(0))
+        return Hidden(mi.Float(dr.inf), mi.Vector3f(0))
 
-    def add(self, index, path, value, offset, active):
-        """These with the `value` of photon `index` more; `path`: the number of the camera path."""
-        light = dr.select(active, channel_mean(value), 0)
-        total = self.light + light
-        drawn = light > _uniform(index, path) * total
-        return Hidden(total, dr.select(drawn, offset, self.offset))
+    def add(self, p, path, value, offset, active):
+        """These with the `value` of a photon at `p` more; `path`: the number of the camera path."""
+        key = -dr.log(1 - _uniform(p, path)) / channel_mean(value)
+        least = active & (key < self.key)
+        return Hidden(dr.select(least, key, self.key), dr.select(least, offset, self.offset))
 
     def seen(self, scene, vertices, walls):
         """Whether the one is seen."""
@@ -108,13 +112,15 @@ class Hidden:
         towards = vertices.p + self.offset - start
         distance = dr.norm(towards)
         ray = mi.Ray3f(start, towards / dr.maximum(distance, 1e-30))
-        ray.maxt = distance * (1 - SLACK)
-        return ~scene.ray_test(ray, coherent=False, active=vertices.active & (self.light > 0))
+        ray.maxt = distance * SHADOW_END
+        return ~scene.ray_test(ray, coherent=False, active=vertices.active & (self.key < dr.inf))
 
 
-def _uniform(index, path):
-    """A number in [0, 1) for each photon and camera path: one that need not be better than this."""
-    word = (index * 0x9E3779B9) ^ (path * 0x85EBCA6B)
+def _uniform(p, path):
+    """A number in [0, 1) for each camera path and photon at `p`, not for its place in a map, which
+    chance decides."""
+    x, y, z = (dr.reinterpret_array(mi.UInt32, place) for place in p)
+    word = (x * 0x9E3779B1) ^ (y * 0x85EBCA77) ^ (z * 0xC2B2AE3D) ^ (path * 0x27D4EB2F)
     word = (word ^ (word >> 15)) * 0x2C1B3C6D
     word = (word ^ (word >> 12)) * 0x297A2D39
     return mi.Float((word ^ (word >> 15)) >> 8) * 2**-24

@@ -51,7 +51,7 @@ class QueryVertices:
         si = record["hit"].compute_surface_interaction(ray, FLAGS, active)
         self.traits, self.si, self.bsdf, self.active = traits, si, si.bsdf(), active
         self.p, self.n, self.plane, self.depth = si.p, si.n, si.n, depth & DEPTH
-        self.path = record.get("path")
+        self.path = record["path"]
         self.facing = mi.Frame3f.cos_theta(si.wi)
         self.side = dr.dot(si.n, -ray.d)
         self.first = record.get("first")
@@ -224,20 +224,22 @@ def gather_seen(
     grey: bool = False,
     marked: bool = False,
 ):
-    """Radiance as of `gather_photons` at `QueryVertices`, without the photons that `DiskWalls` hide
-    from them."""
+    """Radiance as of `gather_photons` at `QueryVertices`, without the photons that `DiskWalls` (a
+    list: for each radius) hide from them."""
     sums = KernelSums(radii, vertices.factor, grey, marked)
     brought = _brought_by(sums, photon_map, vertices, max_depth)
 
     def visit(index, landing, offset, distance_squared, hit, state):
         before, behind, hidden = state
         value, inside, *rest = brought(index, landing, offset, distance_squared, hit)
-        is_behind = walls.behind(offset)
-        before = sums.add(before, value, [each & ~is_behind for each in inside], *rest)
-        inside = [each & is_behind for each in inside]
+        is_behind = [each.behind(offset) for each in walls]
+        clear = [here & ~there for here, there in zip(inside, is_behind)]
+        before = sums.add(before, value, clear, *rest)
+        inside = [here & there for here, there in zip(inside, is_behind)]
         behind = sums.add(behind, value, inside, *rest)
+        brings = value * vertices.factor
         hidden = [
-            each.add(index, vertices.path, value, offset, here)
+            each.add(landing.p, vertices.path, brings, offset, here)
             for each, here in zip(hidden, inside)
         ]
         return before, behind, hidden
@@ -247,7 +249,11 @@ def gather_seen(
     before, behind, hidden = for_each_photon(
         photon_map, vertices.p, radii[-1], active, visit, state
     )
-    seen = [each.seen(scene, vertices, walls) for each in hidden for _ in range(sums.classes)]
+    seen = [
+        there
+        for each, around in zip(hidden, walls)
+        for there in [each.seen(scene, vertices, around)] * sums.classes
+    ]
     totals = [a + dr.select(there, b, 0) for a, there, b in zip(before, seen, behind)]
     return sums.estimates(totals, disk_area, light_path_count, active)
 

@@ -180,7 +180,7 @@ def for_each_photon(photon_map, p, radius, active, visit, state):
 
     `hit` marks the lanes whose photon belongs to the row that has been read (another one may share
     its place); `landing` is the photon's `Landing`, `offset` its position minus `p`. `state` is a
-    tuple of Dr.Jit arrays.
+    tree of Dr.Jit arrays.
     """
     return visit_hits(DiskQuery(photon_map, p, radius, active), visit, state)
 

@@ -23,24 +23,21 @@ MISFIT_OF_LAW = 0.15
 """Tuned: relative error of the law itself, beyond the noise of Q."""
 
 
-def expected_products(a: np.ndarray, b: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Weighted mean over pixels of E[a] E[b], without bias: products of different iterations only.
-    `a`, `b`: (iterations, ..., pixels)."""
-    m = a.shape[0]
-    return np.mean(weights * (a.sum(axis=0) * b.sum(axis=0) - (a * b).sum(axis=0)), axis=-1) / (
-        m * (m - 1)
-    )
+def expected_square(samples: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Weighted mean over pixels of E[samples]^2, without bias: products of different iterations
+    only. `samples`: (iterations, ..., pixels)."""
+    m = samples.shape[0]
+    products = samples.sum(axis=0) ** 2 - (samples**2).sum(axis=0)
+    return np.mean(weights * products, axis=-1) / (m * (m - 1))
 
 
-def jackknife(a: np.ndarray, b: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """`expected_products` and its standard error, by leaving out one iteration at a time (the
+def jackknife(samples: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """`expected_square` and its standard error, by leaving out one iteration at a time (the
     jackknife): neighbouring pixels share photons, so that pixels are no independent samples."""
-    value, m = expected_products(a, b, weights), a.shape[0]
+    value, m = expected_square(samples, weights), samples.shape[0]
     if m < 3:
         return value, np.abs(value)
-    left_out = np.stack(
-        [expected_products(np.delete(a, i, 0), np.delete(b, i, 0), weights) for i in range(m)]
-    )
+    left_out = np.stack([expected_square(np.delete(samples, i, 0), weights) for i in range(m)])
     return value, np.sqrt((m - 1) / m * ((left_out - left_out.mean(axis=0)) ** 2).sum(axis=0))
 
 
@@ -50,7 +47,7 @@ def squared_difference(samples: np.ndarray, weights: np.ndarray) -> tuple[np.nda
     `samples`: (iterations, radii, pixels); `weights`: (pixels,).
     """
     steps = np.diff(samples, axis=1)
-    difference, error = jackknife(steps, steps, weights)
+    difference, error = jackknife(steps, weights)
     return np.concatenate([[0.0], difference]), np.concatenate([[0.0], error])
 
 

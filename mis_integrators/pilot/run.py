@@ -94,7 +94,7 @@ def run_pilot(
     pixels
         Those that it takes: `setting.pilot_pixels`.
     passes
-        They trace those pixels, and gather all kinds and corrections of the setting.
+        They trace those pixels, and gather all kinds of the setting.
     now
         The clock [s] of the render, by which the pilot's time is limited.
     settled

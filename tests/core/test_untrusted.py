@@ -267,41 +267,43 @@ LEARNED = {
         {"radii": {}},
         {
             "radii": {"indirect": 0.1},
+            "caustic_radii": {"iterations": 0.0},
             "light_share": 1.0,
             "direct_light": {},
         },
         {
             "radii": {"indirect": -1, "caustic": 0.1},
+            "caustic_radii": {"iterations": 0.0},
             "light_share": 1.0,
             "direct_light": {},
         },
         {
             "radii": {"indirect": 1, "caustic": 1e999},
+            "caustic_radii": {"iterations": 0.0},
             "light_share": 1.0,
             "direct_light": {},
         },
         {
             "radii": {"indirect": 1, "caustic": 1},
-            "light_share": 1.0,
-            "direct_light": {},
-        },
-        {
-            "radii": {"indirect": 1, "caustic": 1},
+            "caustic_radii": {"iterations": 0.0},
             "light_share": 1.0,
             "direct_light": {"photon_light": 1, "photon_error": -1, "iterations": 1},
         },
         {
             "radii": {"indirect": 1, "caustic": 1},
+            "caustic_radii": {"iterations": 0.0},
             "light_share": 1.0,
             "direct_light": {"photon_light": 1, "photon_error": 1},
         },
         {
             "radii": {"indirect": 1, "caustic": 1},
+            "caustic_radii": {"iterations": 0.0},
             "light_share": 2.0,
             "direct_light": {},
         },
         {
             "radii": {"indirect": 1, "caustic": 1, "more": 1},
+            "caustic_radii": {"iterations": 0.0},
             "light_share": 1.0,
             "direct_light": {},
         },
@@ -397,6 +399,7 @@ def test_what_a_session_has_learned_is_taken(sessions, plugin):
 def test_any_value_that_was_learned(sessions, name, value):
     learned = {
         "radii": {"indirect": 0.1, "caustic": 0.1},
+        "caustic_radii": {"iterations": 0.0},
         "light_share": 1.0,
         "direct_light": {},
         name: value,

@@ -1,5 +1,20 @@
 """What a pilot would have found, said instead."""
 
+import mitsuba as mi
+
+
+def as_chosen(monkeypatch, radius, **settings):
+    """What makes `bdpm` with `bdd` 0 and these `settings`, and more, whose pilot chooses this
+    radius."""
+    from mis_integrators.integrators.bdpm import BDPMSession
+
+    def predict(session, settled=None):
+        if session.radii is None:
+            session.radii = dict.fromkeys(session.kinds(), radius)
+
+    monkeypatch.setattr(BDPMSession, "predict", predict)
+    return lambda **more: mi.load_dict({"type": "bdpm", "bdd": 0, **settings, **more})
+
 
 def knowing(session, radii, iterations):
     """The session, which knows its `radii` (by kind, or one for all), as in a render of so many

@@ -204,6 +204,7 @@ class JointPaths:
             "ray_o": ray.o,
             "ray_d": ray.d,
             "hit": hit,
+            "path": dr.arange(mi.UInt32, COUNT),
             "throughput": dr.select(self.valid, mi.Spectrum(1), 0),
             "depth": dr.full(mi.UInt32, LAST_VERTEX | (level + 1), COUNT),
             **dict(zip(STATE, stored[level])),

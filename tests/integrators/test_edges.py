@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from comparing import SessionBatches, agree
 from foggy import volpath
+from pilots import as_chosen
 from selection import extended
 from worlds import T, diffuse, path, under_a_lamp
 
@@ -35,15 +36,7 @@ def legs(material=None, floor=None, **objects):
 
 @pytest.fixture
 def merged(rgb, monkeypatch):
-    """`bdpm` with `bdd` 0 and this radius, as if a pilot had chosen it."""
-    from mis_integrators.integrators.bdpm import BDPMSession
-
-    def predict(session, settled=None):
-        if session.radii is None:
-            session.radii = dict.fromkeys(session.kinds(), RADIUS)
-
-    monkeypatch.setattr(BDPMSession, "predict", predict)
-    return lambda **more: mi.load_dict({"type": "bdpm", "bdd": 0, **SETTINGS, **more})
+    return as_chosen(monkeypatch, RADIUS, **SETTINGS)
 
 
 GLASS = {"type": "sphere", "center": [0, -1, 0.4], "radius": 0.3, "bsdf": {"type": "dielectric"}}

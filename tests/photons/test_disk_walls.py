@@ -3,11 +3,14 @@ light."""
 
 import dataclasses
 
+from mis_integrators.core.packing import pack_direction, pack_surface
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 from comparing import agree
+from pilots import as_chosen, learned
 from worlds import T, diffuse, film, look, path
 
 SETTINGS = {"max_depth": 5, "rr_depth": 50}
@@ -54,15 +57,7 @@ def room(**objects):
 
 @pytest.fixture
 def merged(rgb, monkeypatch):
-    """`bdpm` with `bdd` 0 and this radius, as if a pilot had chosen it."""
-    from mis_integrators.integrators.bdpm import BDPMSession
-
-    def predict(session, settled=None):
-        if session.radii is None:
-            session.radii = dict.fromkeys(session.kinds(), RADIUS)
-
-    monkeypatch.setattr(BDPMSession, "predict", predict)
-    return lambda **more: mi.load_dict({"type": "bdpm", "bdd": 0, **SETTINGS, **more})
+    return as_chosen(monkeypatch, RADIUS, **SETTINGS)
 
 
 @pytest.mark.parametrize("denoised", [False, True])
@@ -77,8 +72,8 @@ def test_it_leaks_without_walls(merged, monkeypatch):
     """The test above is no test else."""
     from mis_integrators.integrators.bdpm import BDPMSession
 
-    def mean(cuts_walls):
-        monkeypatch.setattr(BDPMSession, "cuts_walls", cuts_walls)
+    def mean(leaves_out):
+        monkeypatch.setattr(BDPMSession, "leaves_out_hidden", leaves_out)
         session = merged(camera_paths=2).session(room(), seed=1)
         for _ in range(16):
             session.iterate()
@@ -87,13 +82,13 @@ def test_it_leaks_without_walls(merged, monkeypatch):
     assert mean(False) > 1.1 * mean(True)
 
 
-def gathered_by_pilot(radii, cuts_walls=False, at_first_vertex=True, coverage=None):
+def gathered_by_pilot(radii, leaves_out_hidden=False, at_first_vertex=True, coverage=None):
     """What the first iteration of a pilot gathers, a mean for each radius. `coverage`: in place of
     `PhotonPasses._coverage`."""
     from mis_integrators.pilot.setting import pilot_pixels
 
     session = mi.load_dict({"type": "bdpm", "bdd": 0, **SETTINGS}).session(room(), seed=1)
-    session.cuts_walls = cuts_walls
+    session.leaves_out_hidden = leaves_out_hidden
     setting = session.pilot_setting()
     pixels = pilot_pixels(setting)
     passes = session.pilot_passes(
@@ -152,26 +147,75 @@ def test_the_two_nearest_walls_that_do_not_face_alike(rgb):
         assert list(np.array(walls.behind(places))) == [True, True, False, False]
 
 
-def test_one_photon_speaks_for_all_in_proportion(rgb):
-    """It is seen as often as the share of the light that is: photons on one side of a screen bring
-    a quarter of it. (4096 vertices: five standard deviations.)"""
-    from types import SimpleNamespace
+def seen_by_many(photons, reflectance, n=4096):
+    """What `gather_seen` finds at n vertices at the origin of a floor of this reflectance, from
+    photons (x, y, flux) that are all behind a wall, in units of what one of flux one brings to a
+    white floor: (3, n). A screen hides those at negative y."""
+    from mis_integrators.core.traits import SceneTraits
+    from mis_integrators.photons.disk_walls import DiskWalls
+    from mis_integrators.photons.gather import QueryVertices, gather_photons, gather_seen
+    from mis_integrators.photons.grid import build_photon_map
+    from mis_integrators.photons.photon import new_photons, power_layout, surface_layout
 
-    from mis_integrators.photons.disk_walls import DiskWalls, Hidden
-
-    screen = {"type": "rectangle", "to_world": T().rotate([0, 1, 0], 90)}
-    scene, n = mi.load_dict({"type": "scene", "screen": screen}), 4096
-    hidden, number = Hidden.none(), dr.arange(mi.UInt32, n)
-    for index, (x, light) in enumerate([(-0.1, 1.0), (0.1, 3.0), (-0.2, 0.5), (0.2, 1.5)]):
-        photon = mi.UInt32(index) + number * 4
-        offset = mi.Vector3f(x - 0.05, 0, 0)
-        hidden = hidden.add(photon, number, mi.Spectrum(light), offset, mi.Bool(True))
-    vertices = SimpleNamespace(
-        p=mi.Point3f(dr.full(mi.Float, 0.05, n), 0, 0),
-        n=mi.Normal3f(0, 0, 1),
-        side=mi.Float(1),
-        active=mi.Bool(True),
+    floor = {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": reflectance}}
+    place = T().translate([0.05, -1, 0]).rotate([0, 1, 0], 90)
+    screen = {"type": "rectangle", "to_world": place}
+    scene = mi.load_dict({"type": "scene", "floor": floor, "screen": screen})
+    count, up = len(photons), mi.Vector3f(0, 0, 1)
+    places = np.array([(x, y, 0) for x, y, _ in photons])
+    surface, power = new_photons(count)
+    index = dr.arange(mi.UInt32, count)
+    word = dr.zeros(mi.UInt32, count) + pack_surface(up, mi.UInt32(2), mi.Bool(False))
+    surface_layout().write(surface, {"p": mi.Point3f(vectors(places)), "surface": word}, index)
+    towards = dr.zeros(mi.UInt32, count) + pack_direction(up)
+    flux = mi.Spectrum(vectors([flux for *_, flux in photons]))
+    power_layout().write(power, {"flux": flux, "towards": towards}, index)
+    box, radius = scene.bbox(), dr.opaque(mi.Float, 0.2)
+    photon_map = build_photon_map(
+        surface, power, mi.UInt32([count]), box, radius, count, "indirect"
     )
-    walls = DiskWalls(mi.Vector3f(0), mi.Vector3f(0), mi.Float(0.02))
-    seen = np.array(hidden.seen(scene, vertices, walls))
-    assert abs(seen.mean() - 0.75) < 5 * np.sqrt(0.75 * 0.25 / n)
+    ray = mi.Ray3f(mi.Point3f(dr.zeros(mi.Float, n), 0, 0.01), mi.Vector3f(0, 0, -1))
+    record = {
+        "ray_o": ray.o,
+        "ray_d": ray.d,
+        "hit": scene.ray_intersect_preliminary(ray),
+        "throughput": mi.Spectrum(dr.ones(mi.Float, n)),
+        "depth": dr.ones(mi.UInt32, n),
+        "path": dr.arange(mi.UInt32, n),
+    }
+    vertices = QueryVertices(SceneTraits(scene, None), record, [])
+    wall = DiskWalls(mi.Vector3f(1000, 0, 0), mi.Vector3f(0), mi.Float(0.02))
+    (found,) = gather_seen(scene, photon_map, vertices, [wall], [radius], 1, -1)
+    (everything,) = gather_photons(photon_map, vertices, [radius], 1, -1)
+    assert np.all(np.array(everything) >= np.array(found))
+    return np.array(found) * 0.2**2 * np.pi**2
+
+
+def test_one_photon_is_tested_in_proportion(rgb):
+    """It is seen as often as the share of the light that is: three quarters. (Five standard
+    deviations.)"""
+    photons = [(0.1, -0.1, [1.0] * 3), (0.1, 0.1, [3.0] * 3), (0.1, -0.12, [0.5] * 3)]
+    photons.append((0.1, 0.12, [1.5] * 3))
+    found = seen_by_many(photons, 1.0)[0]
+    assert found.max() == pytest.approx(6, rel=1e-3) and found.min() == 0
+    share = np.mean(found > 0)
+    assert abs(share - 0.75) < 5 * np.sqrt(0.75 * 0.25 / len(found))
+
+
+def test_light_of_another_colour(rgb):
+    """Hidden blue photons, however bright, bring a red floor nothing, and take nothing from it."""
+    photons = [(0.1, -0.1, [0, 0, 10.0]), (0.1, 0.1, [1.0, 0, 0])]
+    red = {"type": "rgb", "value": [0.8, 0, 0]}
+    found = seen_by_many(photons, red)
+    np.testing.assert_allclose(found[0], 0.8, rtol=1e-3)
+
+
+def test_same_seed_same_walls(rgb):
+    """Which photon is tested does not depend on its place in a map, which chance decides."""
+    images = []
+    for _ in range(2):
+        session = mi.load_dict({"type": "bdpm", "bdd": 0, **SETTINGS}).session(room(), seed=5)
+        session.recall(learned(session, 0.3))
+        session.iterate()
+        images.append(session.image())
+    np.testing.assert_allclose(*images, rtol=1e-3, atol=1e-5)

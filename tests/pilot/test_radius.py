@@ -67,7 +67,7 @@ def test_products_of_iterations_are_unbiased():
     rng = np.random.default_rng(0)
     truth = np.array([0.3, 1.0])[:, None] * np.ones(2000)
     samples = truth + rng.normal(size=(5, 2, 2000))
-    value, error = jackknife(samples, samples, np.ones(2000))
+    value, error = jackknife(samples, np.ones(2000))
     spread = np.sqrt(2 / (5 * 4) / 2000 + 4 * truth[:, 0] ** 2 / (5 * 2000))
     assert np.all(np.abs(value - truth[:, 0] ** 2) < FIVE_SIGMA * spread)
     assert np.all(error < 4 * spread) and np.all(error > spread / 4)
