@@ -1064,6 +1064,13 @@ MUTATIONS = [
     ),
     Mutation(
         "photons/gather.py",
+        "apart > OFF_SHEET * r",
+        "apart > r",
+        "the next slat of a blind lights this one",
+        "tests/photons/test_disk_walls.py::test_photons_on_another_sheet_must_be_seen",
+    ),
+    Mutation(
+        "photons/gather.py",
         "brings = value * vertices.factor",
         "brings = value * 0 + 1",
         "photons behind walls are tested regardless of what they bring",

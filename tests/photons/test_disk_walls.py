@@ -147,10 +147,11 @@ def test_the_two_nearest_walls_that_do_not_face_alike(rgb):
         assert list(np.array(walls.behind(places))) == [True, True, False, False]
 
 
-def seen_by_many(photons, reflectance, n=4096):
+def seen_by_many(photons, reflectance, n=4096, below=0.0, wall=1000.0):
     """What `gather_seen` finds at n vertices at the origin of a floor of this reflectance, from
     photons (x, y, flux) that are all behind a wall, in units of what one of flux one brings to a
-    white floor: (3, n). A screen hides those at negative y."""
+    white floor: (3, n). A screen hides those at negative y. `below`: how far below the floor they
+    lie; `wall`: one over its distance."""
     from mis_integrators.core.traits import SceneTraits
     from mis_integrators.photons.disk_walls import DiskWalls
     from mis_integrators.photons.gather import QueryVertices, gather_photons, gather_seen
@@ -162,7 +163,7 @@ def seen_by_many(photons, reflectance, n=4096):
     screen = {"type": "rectangle", "to_world": place}
     scene = mi.load_dict({"type": "scene", "floor": floor, "screen": screen})
     count, up = len(photons), mi.Vector3f(0, 0, 1)
-    places = np.array([(x, y, 0) for x, y, _ in photons])
+    places = np.array([(x, y, -below) for x, y, _ in photons])
     surface, power = new_photons(count)
     index = dr.arange(mi.UInt32, count)
     word = dr.zeros(mi.UInt32, count) + pack_surface(up, mi.UInt32(2), mi.Bool(False))
@@ -184,10 +185,10 @@ def seen_by_many(photons, reflectance, n=4096):
         "path": dr.arange(mi.UInt32, n),
     }
     vertices = QueryVertices(SceneTraits(scene, None), record, [])
-    wall = DiskWalls(mi.Vector3f(1000, 0, 0), mi.Vector3f(0), mi.Float(0.02))
-    (found,) = gather_seen(scene, photon_map, vertices, [wall], [radius], 1, -1)
+    walls = DiskWalls(mi.Vector3f(wall, 0, 0), mi.Vector3f(0), mi.Float(0.02))
+    (found,) = gather_seen(scene, photon_map, vertices, [walls], [radius], 1, -1)
     (everything,) = gather_photons(photon_map, vertices, [radius], 1, -1)
-    assert np.all(np.array(everything) >= np.array(found))
+    assert np.all(np.array(everything) >= np.array(found)) and np.any(np.array(everything) > 0)
     return np.array(found) * 0.2**2 * np.pi**2
 
 
@@ -208,6 +209,14 @@ def test_light_of_another_colour(rgb):
     red = {"type": "rgb", "value": [0.8, 0, 0]}
     found = seen_by_many(photons, red)
     np.testing.assert_allclose(found[0], 0.8, rtol=1e-3)
+
+
+@pytest.mark.parametrize("below, seen", [(0.0, 1.0), (0.01, 1.0), (0.05, 0.0)])
+def test_photons_on_another_sheet_must_be_seen(rgb, below, seen):
+    """Those of the next slat of a blind are hidden by this one, but for a distance that may be the
+    same sheet's."""
+    found = seen_by_many([(0.1, 0.1, [1.0] * 3)], 1.0, below=below, wall=0.0)
+    np.testing.assert_allclose(found, seen, rtol=1e-3)
 
 
 def test_same_seed_same_walls(rgb):
