@@ -3,8 +3,8 @@
 Near a wall, or where a floor ends, part of the disk around a vertex holds no surface on which
 photons could land, and density estimation over the whole disk comes out dark: a bias that falls
 only in proportion to the radius, while that of curvature falls with its square. A few short probe
-rays estimate the covered share of the disk, by which the estimate is divided. Surfaces
-that stop a probe on its way are walls, behind which photons must be seen (`disk_walls`).
+rays estimate the covered share of the disk, by which the estimate is divided. Surfaces that stop a
+probe on its way are walls, behind which photons must be seen (`disk_walls`).
 """
 
 from __future__ import annotations
@@ -58,14 +58,17 @@ class Edges(NamedTuple):
         too_bent = active & (radius <= LEAST_LEFT * self.radius)
         vertices = {"ray_d": arrival.ray.d, "path": arrival.path, "depth": arrival.depth}
         share, walls = probed(scene, vertices, si, radius, self.seed, active)
-        share = dr.select(active, share, 1)
-        coverage = Coverage(dr.maximum(share, SMALLEST_SHARE), walls)
-        return coverage, too_bent | (share < LITTLE)
+        return usable(share, walls, active), too_bent | (active & (share < LITTLE))
 
 
 def coverage(scene, vertices, si, radius, seed, active):
-    """The `Coverage`: shares as of `probed`, but `SMALLEST_SHARE` at least, one elsewhere."""
-    share, walls = probed(scene, vertices, si, radius, seed, active)
+    """The `Coverage` of merge disks: what is `probed`, made `usable`."""
+    return usable(*probed(scene, vertices, si, radius, seed, active), active)
+
+
+def usable(share, walls, active):
+    """The `Coverage` by which estimates can be divided: shares are `SMALLEST_SHARE` at least, and
+    one elsewhere."""
     return Coverage(dr.select(active, dr.maximum(share, SMALLEST_SHARE), 1), walls)
 
 

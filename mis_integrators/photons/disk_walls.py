@@ -86,7 +86,7 @@ def with_wall(near, far, p, hit, start, radius, active):
 
 @dataclass
 class Hidden:
-    """Photons behind walls within one radius: the one that is tested in place of all, at an
+    """Photons within one radius that must be seen: the one that is tested in place of all, at an
     `offset` from the vertex, has the least `key` of them. They are independent exponential numbers
     whose rates are what the photons bring (Efraimidis and Spirakis 2006, Weighted random sampling
     with a reservoir): whatever the order, each has the least one in proportion to that. Infinite:

@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from comparing import agree
+from gathering import vertices_at
 from pilots import as_chosen, learned
 from worlds import T, diffuse, film, look, path
 
@@ -152,9 +153,8 @@ def seen_by_many(photons, reflectance, n=4096, below=0.0, wall=1000.0):
     photons (x, y, flux) that are all behind a wall, in units of what one of flux one brings to a
     white floor: (3, n). A screen hides those at negative y. `below`: how far below the floor they
     lie; `wall`: one over its distance."""
-    from mis_integrators.core.traits import SceneTraits
     from mis_integrators.photons.disk_walls import DiskWalls
-    from mis_integrators.photons.gather import QueryVertices, gather_photons, gather_seen
+    from mis_integrators.photons.gather import gather_photons, gather_seen
     from mis_integrators.photons.grid import build_photon_map
     from mis_integrators.photons.photon import new_photons, power_layout, surface_layout
 
@@ -176,15 +176,7 @@ def seen_by_many(photons, reflectance, n=4096, below=0.0, wall=1000.0):
         surface, power, mi.UInt32([count]), box, radius, count, "indirect"
     )
     ray = mi.Ray3f(mi.Point3f(dr.zeros(mi.Float, n), 0, 0.01), mi.Vector3f(0, 0, -1))
-    record = {
-        "ray_o": ray.o,
-        "ray_d": ray.d,
-        "hit": scene.ray_intersect_preliminary(ray),
-        "throughput": mi.Spectrum(dr.ones(mi.Float, n)),
-        "depth": dr.ones(mi.UInt32, n),
-        "path": dr.arange(mi.UInt32, n),
-    }
-    vertices = QueryVertices(SceneTraits(scene, None), record, [])
+    vertices = vertices_at(scene, ray, n)
     walls = DiskWalls(mi.Vector3f(wall, 0, 0), mi.Vector3f(0), mi.Float(0.02))
     (found,) = gather_seen(scene, photon_map, vertices, [walls], [radius], 1, -1)
     (everything,) = gather_photons(photon_map, vertices, [radius], 1, -1)

@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from comparing import pictures
+from gathering import vertices_at
 from pilots import learned
 
 RADIUS, TIERS = 0.05, 7
@@ -120,9 +121,7 @@ def test_tiers_bring_what_brute_force_finds(rgb, up, left, monkeypatch):
     photons of a few tiers are `left` to a denoiser, these are all in the first, and each vertex has
     its own radius there. The scene is a floor: flat along one axis or another, where wide disks
     reach beyond the grid."""
-    from mis_integrators.core.traits import SceneTraits
     from mis_integrators.photons import tiers as module
-    from mis_integrators.photons.gather import QueryVertices
     from mis_integrators.photons.tiers import TieredMap, build_tiered_map, gather_tiers
 
     monkeypatch.setattr(module, "AT_NARROW_LOBES", 4.0)  # far beyond the grid's margin
@@ -155,15 +154,7 @@ def test_tiers_bring_what_brute_force_finds(rgb, up, left, monkeypatch):
     assert TieredMap.has_made(built.arrays())
     queries = on_floor(rng, m)[:, axes]
     ray = mi.Ray3f(mi.Point3f((queries + up).T.copy()), -mi.Vector3f(*up))
-    record = {
-        "ray_o": ray.o,
-        "ray_d": ray.d,
-        "hit": scene.ray_intersect_preliminary(ray),
-        "throughput": mi.Spectrum(dr.ones(mi.Float, m)),
-        "depth": dr.ones(mi.UInt32, m),
-        "path": dr.arange(mi.UInt32, m),
-    }
-    vertices = QueryVertices(SceneTraits(scene, None), record, [])
+    vertices = vertices_at(scene, ray, m)
     narrow = np.arange(m) % 2 == 1
     first = RADIUS * rng.uniform(0.3, 1.5, m) if left else np.full(m, RADIUS)
     (found,) = gather_tiers(
