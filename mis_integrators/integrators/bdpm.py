@@ -248,8 +248,9 @@ class BDPMSession(PhotonPasses):
             self.cones is None or integrator.bdd > 0 or self.narrow is not None
         )
         self.by_chance = (
-            self.cones is not None
+            self.has_caustics
             and self.meets_lights
+            and not integrator.initial_radius
             and self.traits.has_light_surfaces
             and meets_one_light(self.scene)
         )

@@ -269,16 +269,14 @@ class PhotonPasses(PilotedSession):
         if self.by_chance and kind != "indirect":
             chance = ChanceWeights(self.lights, light_paths, vertices, record["hits"])
         if isinstance(photon_map, TieredMap):
-            narrow, first, weigher = mi.Bool(False), radii[0], chance and chance.weigher
-            if self.narrow is not None:
-                narrow = self.narrow.at(vertices.bsdf, vertices.si, vertices.active)
+            first, weigher = radii[0], chance and chance.weigher
             found = gather_tiers(
-                photon_map, vertices, first, light_paths, max_depth, weigher, marked, narrow
+                photon_map, vertices, first, light_paths, max_depth, weigher, marked
             )
             if chance is not None:
                 flux, left = chance.hits["flux"], self._tiers_left
                 active = vertices.active & (flux > 0)
-                radii = [photon_map.radii_of(vertices.p, flux, first, narrow, left, active)]
+                radii = [photon_map.radii_of(vertices.p, flux, first, left, active)]
         else:
             if chance is not None:
                 weigh = chance.weigher(photon_map, radii)

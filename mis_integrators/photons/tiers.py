@@ -25,9 +25,6 @@ from .light_around import TIERS
 from .light_cells import flux_of, tier_radius
 from .photon import landing_of
 
-AT_NARROW_LOBES = 2.0
-"""Tuned: how many times larger disks are at surfaces with narrow lobes, where one photon in the
-lobe brings as much as many elsewhere."""
 LEFT_TO_DENOISER = 3
 """Tuned: the last tier whose photons have disks of a pixel's size in images that will be denoised.
 They bring at most `MOST_OF_LIGHT` of what falls within eight pixels."""
@@ -62,12 +59,12 @@ class TieredMap:
         photon_map = PhotonMap(grid, start, surface, power, *words)
         return photon_map, tier_radius(radius, number), count
 
-    def radii_of(self, p, flux, first, narrow, left, active):
+    def radii_of(self, p, flux, first, left, active):
         """Radii of the disks of photons of that `flux`, would they land at `p` (of a map whose
         photons carry something); other arguments as of `gather_tiers` and `tiers_of`."""
         radius, around = self._arrays["tier_radius"], self._arrays["around"]
         number = tiers_of(around, p, flux, radius, left, active)
-        return dr.select(number > 0, tier_radius(radius, number) * widening(narrow), first)
+        return dr.select(number > 0, tier_radius(radius, number), first)
 
 
 def tier_table(capacity):
@@ -84,11 +81,6 @@ def tiers_of(around, p, flux, radius, left, active):
     """Tiers of photons as of `LightAround.tier`, but those up to `left` are the first."""
     number = around.tier(p, flux, radius, active)
     return dr.select(number > left, number, 0)
-
-
-def widening(narrow):
-    """By what all disks but those of the first tier are larger, at vertices with `narrow` lobes."""
-    return dr.select(narrow, mi.Float(AT_NARROW_LOBES), 1)
 
 
 def build_tiered_map(surface, power, count, bbox, radius, capacity, around, left=0, mis_words=None):
@@ -109,19 +101,18 @@ def build_tiered_map(surface, power, count, bbox, radius, capacity, around, left
 
 
 def gather_tiers(
-    tiered, vertices, first, light_path_count, max_depth, weigher=None, marked=False, narrow=False
+    tiered, vertices, first, light_path_count, max_depth, weigher=None, marked=False
 ):
-    """`gather_photons` of all tiers, each with its radius, which at vertices with `narrow` lobes is
-    `AT_NARROW_LOBES` times as large, but the first with the radius `first` (of width one, or one a
-    vertex). `weigher(photon_map, radii)`: what makes `weigh` of a tier's map (None: no weights).
-    Other arguments and result as there, but that there is one estimate, not one for each radius."""
-    wider = widening(narrow)
+    """`gather_photons` of all tiers, each with its radius, but the first with the radius `first`
+    (of width one, or one a vertex). `weigher(photon_map, radii)`: what makes `weigh` of a tier's
+    map (None: no weights). Other arguments and result as there, but that there is one estimate, not
+    one for each radius."""
 
     def step(number, totals):
         photon_map, radius, count = tiered.tier(number)
         there = copy.copy(vertices)
         there.active = vertices.active & (count > 0)
-        disk = dr.select(number > 0, radius * wider, first)
+        disk = dr.select(number > 0, radius, first)
         parts = gather_photons(
             photon_map,
             there,

@@ -115,16 +115,12 @@ def test_order_of_photons_does_not_matter(rgb):
 
 @pytest.mark.parametrize("left", [0, 1])
 @pytest.mark.parametrize("up", [(0, 0, 1), (0, 1, 0)], ids="zy")
-def test_tiers_bring_what_brute_force_finds(rgb, up, left, monkeypatch):
+def test_tiers_bring_what_brute_force_finds(rgb, up, left):
     """Sum over the photons within their own radii, of BSDF x flux over the area of their disks.
-    Where lobes are narrow, at every second vertex, disks are wider, but for the first tier. Where
-    photons of a few tiers are `left` to a denoiser, these are all in the first, and each vertex has
-    its own radius there. The scene is a floor: flat along one axis or another, where wide disks
-    reach beyond the grid."""
-    from mis_integrators.photons import tiers as module
+    Where photons of a few tiers are `left` to a denoiser, these are all in the first, and each
+    vertex has its own radius there. The scene is a floor: flat along one axis or another, where
+    wide disks reach beyond the grid."""
     from mis_integrators.photons.tiers import TieredMap, build_tiered_map, gather_tiers
-
-    monkeypatch.setattr(module, "AT_NARROW_LOBES", 4.0)  # far beyond the grid's margin
 
     rng, n, m = np.random.default_rng(7), 3000, 700
     scene = mi.load_dict(
@@ -155,19 +151,10 @@ def test_tiers_bring_what_brute_force_finds(rgb, up, left, monkeypatch):
     queries = on_floor(rng, m)[:, axes]
     ray = mi.Ray3f(mi.Point3f((queries + up).T.copy()), -mi.Vector3f(*up))
     vertices = vertices_at(scene, ray, m)
-    narrow = np.arange(m) % 2 == 1
     first = RADIUS * rng.uniform(0.3, 1.5, m) if left else np.full(m, RADIUS)
-    (found,) = gather_tiers(
-        TieredMap(built.arrays(), box, n),
-        vertices,
-        mi.Float(first),
-        10.0,
-        -1,
-        narrow=mi.Bool(narrow),
-    )
+    (found,) = gather_tiers(TieredMap(built.arrays(), box, n), vertices, mi.Float(first), 10.0, -1)
     distance = np.linalg.norm(queries[:, None] - points[None], axis=-1)
-    radii = RADIUS * 2.0**tiers * np.where(narrow[:, None] & (tiers > 0), 4.0, 1)
-    radii = np.where(tiers == 0, np.float32(first)[:, None], radii)
+    radii = np.where(tiers == 0, np.float32(first)[:, None], RADIUS * 2.0**tiers)
     assert np.abs(distance / radii - 1).min() > 1e-6  # what single precision tells apart
     lit = (distance < radii) * flux / (np.pi * radii**2)
     expected = lit.sum(axis=1) * 0.5 / np.pi / 10
