@@ -112,9 +112,10 @@ def narrow_bsdfs(scene):
     if not rough:
         return None
     looks = look_at(rough)
-    narrow = concentration(looks) > NARROW
+    has_even_part = parted(looks)
+    narrow = concentration(rest_of(looks, has_even_part)) > NARROW
     seen = narrow @ (1 << np.arange(len(COSINES)))
-    seen |= np.where(narrow.any(axis=1) & parted(looks), PARTED, 0)
+    seen |= np.where(narrow.any(axis=1) & has_even_part, PARTED, 0)
     bits = dict(zip((b.ptr for b in rough), seen))
     values = [bits.get(b.ptr, 0) for b in bsdfs]
     return registry_table(bsdfs, mi.BSDFPtr, values, mi.UInt32) if narrow.any() else None
@@ -161,6 +162,14 @@ def parted(looks):
     share = np.where(looks.value > 0, looks.even / np.maximum(looks.value, 1e-30), 0)
     evenly = (looks.weight * share).mean(axis=2)
     return np.any(evenly > EVEN_SHARE * looks.weight.mean(axis=2), axis=1)
+
+
+def rest_of(looks, has_even_part):
+    """What these BSDFs have besides their even part, and others as a whole (`Looks`)."""
+    share = np.where(looks.value > 0, looks.even / np.maximum(looks.value, 1e-30), 1)
+    rest = 1 - np.where(has_even_part[:, None, None], share, 0)
+    rest = np.where((looks.weight * rest).mean(axis=2, keepdims=True) > 1e-3, rest, 0)
+    return looks._replace(value=looks.value * rest, weight=looks.weight * rest)
 
 
 def look_at(bsdfs):
