@@ -277,6 +277,20 @@ MUTATIONS = [
         "paths end behind narrow lobes that they pass",
         LOBES,
     ),
+    Mutation(
+        "paths/lobes.py",
+        "concentration(rest_of(looks, has_even_part)) > NARROW",
+        "concentration(looks) > NARROW",
+        "a coat on a bright ground does not count as narrow",
+        LOBES,
+    ),
+    Mutation(
+        "integrators/bdpm.py",
+        "            and not integrator.initial_radius\n            and self.traits.has_light",
+        "            and self.cones is not None\n            and self.traits.has_light",
+        "in raw renders photons alone bring caustic light",
+        "tests/integrators/test_chance.py::test_who_shares",
+    ),
     # ------------------------------------------------------------------ photons
     Mutation(
         "photons/gather.py",
@@ -322,9 +336,9 @@ MUTATIONS = [
     ),
     Mutation(
         "photons/tiers.py",
-        "disk = dr.select(number > 0, radius * wider, first)",
-        "disk = dr.select(number > 0, radius * wider, first * wider)",
-        "well lit photons, too, have wide disks at narrow lobes",
+        "disk = dr.select(number > 0, radius, first)",
+        "disk = radius",
+        "well lit photons that the camera sees have no disks of a pixel's size",
         TIERS,
     ),
     Mutation(

@@ -29,6 +29,8 @@ PARTED = 1 << len(COSINES)
 """Bit of a BSDF with an even part."""
 EVEN_SHARE = 0.15
 """Tuned: of the light that a BSDF scatters, what its even part has at least."""
+LEAST_REST = 1e-3
+"""Albedo of what a BSDF has besides its even part, less than which is rounding."""
 OFF_LOBE = 0.7
 """Cosine of the direction off the lobe."""
 EVEN = int(mi.BSDFFlags.DiffuseReflection | mi.BSDFFlags.DiffuseTransmission)
@@ -103,9 +105,9 @@ def curves(scene):
 
 
 def narrow_bsdfs(scene):
-    """A registry table: of each BSDF of the scene a bit for each of the `COSINES`, whether its
-    `concentration` is above `NARROW` there; and where it is so, whether it is one of the `parted`
-    ones. None where there is no narrow BSDF."""
+    """A registry table: of each BSDF of the scene a bit for each of the `COSINES`, whether the
+    `concentration` of what paths would go on for is above `NARROW` there; and where it is so,
+    whether the BSDF is one of the `parted` ones. None where there is no narrow BSDF."""
     bsdfs = used_bsdfs(scene)  # all have a place in the table: any may be asked for
     smooth = [b for b in bsdfs if mi.has_flag(b.flags(), mi.BSDFFlags.Smooth)]
     rough = [b for b in smooth if int(b.flags()) & ~_WITHOUT_LOBES]
@@ -159,17 +161,21 @@ def concentration(looks):
 def parted(looks):
     """Which of the BSDFs have an even part that is worth gathering photons for, as seen under some
     of the angles: an array."""
-    share = np.where(looks.value > 0, looks.even / np.maximum(looks.value, 1e-30), 0)
-    evenly = (looks.weight * share).mean(axis=2)
+    evenly = (looks.weight * _even_share(looks)).mean(axis=2)
     return np.any(evenly > EVEN_SHARE * looks.weight.mean(axis=2), axis=1)
 
 
 def rest_of(looks, has_even_part):
-    """What these BSDFs have besides their even part, and others as a whole (`Looks`)."""
-    share = np.where(looks.value > 0, looks.even / np.maximum(looks.value, 1e-30), 1)
-    rest = 1 - np.where(has_even_part[:, None, None], share, 0)
-    rest = np.where((looks.weight * rest).mean(axis=2, keepdims=True) > 1e-3, rest, 0)
+    """The `Looks` at what BSDFs have besides their even part: a coat of plastic is as narrow as it
+    is alone. BSDFs without one are left whole."""
+    rest = np.where(has_even_part[:, None, None], 1 - _even_share(looks), 1)
+    rest *= (looks.weight * rest).mean(axis=2, keepdims=True) > LEAST_REST
     return looks._replace(value=looks.value * rest, weight=looks.weight * rest)
+
+
+def _even_share(looks):
+    """Of the light that BSDFs scatter into each of the directions."""
+    return np.where(looks.value > 0, looks.even / np.maximum(looks.value, 1e-30), 0)
 
 
 def look_at(bsdfs):

@@ -100,9 +100,7 @@ def build_tiered_map(surface, power, count, bbox, radius, capacity, around, left
     return TieredMap(arrays, bbox, capacity)
 
 
-def gather_tiers(
-    tiered, vertices, first, light_path_count, max_depth, weigher=None, marked=False
-):
+def gather_tiers(tiered, vertices, first, light_path_count, max_depth, weigher=None, marked=False):
     """`gather_photons` of all tiers, each with its radius, but the first with the radius `first`
     (of width one, or one a vertex). `weigher(photon_map, radii)`: what makes `weigh` of a tier's
     map (None: no weights). Other arguments and result as there, but that there is one estimate, not
