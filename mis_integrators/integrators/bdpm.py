@@ -249,6 +249,7 @@ class BDPMSession(PhotonPasses):
         )
         self.by_chance = (
             self.has_caustics
+            and self.traits.has_delta
             and self.meets_lights
             and not integrator.initial_radius
             and self.traits.has_light_surfaces

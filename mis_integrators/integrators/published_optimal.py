@@ -46,6 +46,7 @@ class PublishedSession(BDPMSession):
     """
 
     chooses_light_paths = widens_caustics = follows_curvature = leaves_out_hidden = False
+    suits_denoisers = meets_lights = False
 
     def __init__(self, integrator, scene, sensor, seed, iterations):
         super().__init__(integrator, scene, sensor, seed, iterations)

@@ -14,7 +14,8 @@ cannot: see `second_moment`.
 
 Left out are roulette, transmittance of media, the choices at delta surfaces (taken as alike from
 both sides), and that etendue changes with the squared index of refraction. Weights are functions of
-the path all the same.
+the path all the same; but where the radius depends on a photon's flux, that of a photon which has
+survived roulette on its way is a little larger than that of a hit.
 """
 
 from __future__ import annotations

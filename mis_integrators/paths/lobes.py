@@ -23,7 +23,7 @@ NARROW = 30.0
 """Tuned: concentration from which on photons are gathered one vertex later."""
 COSINES = 0.25, 0.5, 0.75, 1.0
 """Of the angles under which BSDFs are looked at."""
-SAMPLES = 64
+SAMPLES = 256
 """Directions sampled of each BSDF under each angle."""
 PARTED = 1 << len(COSINES)
 """Bit of a BSDF with an even part."""

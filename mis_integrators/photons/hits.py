@@ -38,18 +38,18 @@ def new_hits(capacity):
     return dr.zeros(mi.UInt32, chance_layout().words * capacity)
 
 
-def write_hit(hits, slot, lights, si, ray, light, left, cosine, pdf, active):
-    """Keeps `light` that a `ray` has met at `si` at the places `slot`. The path left its last
-    smooth vertex with the mean throughput `left`, at `cosine` to the normal, with density `pdf` per
+def write_hit(hits, slot, lights, si, ray, light, sent, cosine, pdf, active):
+    """Keeps `light` that a `ray` has met at `si` at the places `slot`; `sent`: the radiance of
+    photons that come from there, which know nothing of the path's roulette, nor of what media take
+    away. The path left its last smooth vertex at `cosine` to the normal, with density `pdf` per
     solid angle."""
     ref = dr.zeros(mi.Interaction3f)
     ref.p, ref.time, ref.wavelengths = ray.o, ray.time, ray.wavelengths
     ds = mi.DirectionSample3f(lights.scene, si, ref)
     density = lights.start_density(ref, ds, active)
-    sent = left * density
     hit = {
         "light": light,
         "ratio": density_ratio(density, cosine, pdf),
-        "flux": dr.select(sent > 0, channel_mean(light) * dr.rcp(sent), 0),
+        "flux": dr.select(density > 0, channel_mean(sent) * dr.rcp(density), 0),
     }
     chance_layout().write(hits, hit, slot, active)

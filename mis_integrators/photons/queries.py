@@ -188,11 +188,12 @@ class QueryVisitor:
     `times`, how many times light counts that is found there; `sums`, the state of `weights`;
     `history`, what `classes` carry along; `cone`, with the queries' `cones` the path's; `left`,
     where paths meet lights by chance, the place of the last smooth vertex, the cosine at which they
-    left it, and the mean throughput with which they did; `rest`, where BSDFs are parted, the share
-    of light that photons have not brought at the last smooth vertex; `asked`, where paths may do so
-    again, whether they have; `clear`, in scenes with media, the share of light that has got through
-    these without being scattered; and `wall`, where beams are kept, the normal of the surface that
-    the path has left last, zero after a vertex in a medium. The last eight are lists.
+    left it, and what photons would keep of their flux from here to there; `rest`, where BSDFs are
+    parted, the share of light that photons have not brought at the last smooth vertex; `asked`,
+    where paths may do so again, whether they have; `clear`, in scenes with media, the share of
+    light that has got through these without being scattered; and `wall`, where beams are kept, the
+    normal of the surface that the path has left last, zero after a vertex in a medium. The last
+    eight are lists.
 
     In media, paths scatter until they have left `bdd` smooth vertices behind, and go straight on
     from there; where photons are asked for at points, until they have left one more behind. Where
@@ -259,7 +260,7 @@ class QueryVisitor:
             "sums": [] if self.weights is None else self.weights.init(n_paths),
             "history": [] if self.classes is None else start_of_camera_path(),
             "cone": [] if self.queries.cones is None else self.queries.cones.begin(),
-            "left": [mi.UInt32(0), one, one] if self.queries.meets_lights else [],
+            "left": [mi.UInt32(0), one, mi.Spectrum(1)] if self.queries.meets_lights else [],
             "rest": [mi.Spectrum(1)] if self.parts else [],
             "asked": [mi.Bool(False)] if self.asks_again else [],
             "clear": [mi.Spectrum(1)] if self.traits.has_media else [],
@@ -376,17 +377,17 @@ class QueryVisitor:
             kept = active & met & behind_delta
         light = at.throughput * ds.emitter.eval(at.si, shown | kept)
         if self.queries.meets_lights:
-            self._keep_hit(state["left"], at, light, scatter_pdf, kept)
+            self._keep_hit(state["left"], at, ds, light, scatter_pdf, kept)
         light *= share
         light *= state["times"]
         if self.classes is not None:
             self.classes.add("met", at.path, class_of(*state["history"]), light, shown)
         return dr.select(shown, light, 0)
 
-    def _keep_hit(self, left, at, light, scatter_pdf, met):
+    def _keep_hit(self, left, at, ds, light, scatter_pdf, met):
         """Keeps the `light` that paths have met behind delta surfaces with the vertex before these,
         which they have `left`."""
-        slot, cosine, throughput = left
+        slot, cosine, kept = left
         write_hit(
             self.store.vertices["hits"],
             slot,
@@ -394,7 +395,7 @@ class QueryVisitor:
             at.si,
             at.ray,
             light,
-            throughput,
+            kept * ds.emitter.eval(at.si, met),
             cosine,
             scatter_pdf,
             met & (dr.max(light) > 0) & (slot < self.store.room),
@@ -554,8 +555,10 @@ class QueryVisitor:
             cosine = dr.abs(dr.dot(at.si.n, at.si.to_world(bs.wo)))
             # Light that reaches places in media is that of volume photons alone.
             slot = dr.select(at.scatters, NO_VERTEX, at.slot) if self.flies else at.slot
-            now = [slot, cosine, channel_mean(at.throughput * weight)]
-            state["left"] = selected(scattered, now, state["left"])
+            *before, kept = state["left"]
+            kept = kept * weight * dr.square(bs.eta)  # radiance falls with the squared index
+            beyond_delta = selected(active & delta, [*before, kept], state["left"])
+            state["left"] = selected(scattered, [slot, cosine, mi.Spectrum(1)], beyond_delta)
         if self.weights is not None:
             state["sums"] = self.weights.scatter(
                 state["sums"], at.si, self._scattering(at), bs, vertex, scattered
@@ -595,7 +598,7 @@ class QueryVisitor:
         whole = weight * bs.pdf
         even = even_part(even_bound(at.bsdf, at.si, active), whole, bs.wo)
         share = dr.select(whole > 0, even * dr.rcp(dr.maximum(whole, 1e-30)), 1)
-        rest = 1 - dr.clip(share, 0, 1)
+        rest = 1 - dr.clip(mi.Spectrum(share), 0, 1)
         largest = dr.max(rest)
         rest = dr.select(rng.next_float32() < largest, rest * dr.rcp(largest), 0)
         return dr.select(active, rest, 1)

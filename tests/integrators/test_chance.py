@@ -258,6 +258,41 @@ def test_who_shares():
     assert shares(world(lamp=lamp(), fog=fog))
     assert not shares(world(lamp=lamp(), shining=shining))
     assert not shares(plugin="bdpm_opt2")
+    assert not shares(plugin="bdpm_opt2", weights="published", denoised=False)
+
+
+@pytest.mark.parametrize("inside", [None, LIQUID], ids=["air", "liquid"])
+def test_hits_know_the_flux_of_photons(inside):
+    """By which disks differ: the lamp's radiance over D, here the same for all photons. Roulette
+    and what the liquid takes away are the path's own. (Photons that have survived roulette have up
+    to 1 / 0.95 of it.)"""
+    from mis_integrators.photons.photon import read_power
+    from mis_integrators.photons.queries import read_queries
+
+    scene = world(inside=inside, lamp=lamp(size=3))
+    session = session_of(scene, bdd=1, denoised=False, rr_depth=1, camera_paths=32)
+    spectral = session._spectral(0)
+    _, power, count, *_ = session.trace_photons(0, 0)
+    flux, _ = read_power(power, dr.arange(mi.UInt32, int(count[0])), mi.Bool(True))
+    usual = np.median(np.array(flux)[0])
+    camera_pass = session.describe_camera_pass(
+        session.sensor,
+        session._sequence(0, 1, 32),
+        dr.arange(mi.UInt32, session.path_count),
+        spectral,
+    )
+    vertices = session._trace_camera(camera_pass, session.vertex_capacity, spectral)[3]
+    hits = read_queries(vertices)["hits"]
+    found = np.array(hits["flux"])[np.array(hits["light"])[0] > 0]
+    assert len(found) > 30
+    np.testing.assert_allclose(found, usual, rtol=0.06)
+
+
+def test_published_weights_know_of_photons_alone():
+    """They render where lights could be met, with a pilot."""
+    plugin = {"type": "bdpm_opt2", "weights": "published", "max_depth": 4}
+    image = mi.render(world(), integrator=mi.load_dict(plugin), spp=1)
+    assert np.all(np.isfinite(np.array(image)))
 
 
 def test_light_is_of_the_class_of_caustics():
@@ -280,9 +315,9 @@ def test_photons_tell_how_noisy_paths_are(name, floor, denoised):
     """The second moment of what a camera path brings that meets lights by chance, of which photons
     know, is that of `path`, to which all light comes through the pane. Three iterations of a pilot
     with 576 pixels know it within a tenth (seen over seeds); what they leave out, that a path
-    chooses at the glass, is 0.05 to 0.1. An error of a cosine or of a factor of two is seen. For a
-    denoiser photons that the camera sees have disks of a pixel's size, and share their light with
-    chance: the moment knows of neither."""
+    chooses at the glass, is 0.05 to 0.1. An error of a cosine or of a factor of two is seen.
+    Photons share their light with chance, and for a denoiser those that the camera sees have disks
+    of a pixel's size: the moment knows of neither."""
     sensor = {"type": "perspective", "fov": 30, "film": film(SIZE)}
     sensor["to_world"] = look((0, -3, 1.6), (0, 0, 0), (0, 0, 1))  # sees the floor and the ball
     scene = world(floor, sensor=sensor, **LIGHTS[name]())

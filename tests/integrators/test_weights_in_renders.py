@@ -265,6 +265,7 @@ def test_one_strategy_is_bdpm(rgb):
             {
                 "type": "bdpm",
                 "bdd": 0,
+                "pass_narrow": False,
                 "initial_radius": RADIUS,
                 "max_depth": 5,
                 "photon_count": 20000,
