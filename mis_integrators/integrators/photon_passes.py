@@ -26,7 +26,6 @@ from ..photons.gather import (
     mean_photon_count,
 )
 from ..photons.grid import PhotonMap, build_photon_map
-from ..photons.hits import meets_one_light
 from ..photons.queries import (
     Queries,
     pixel_disk,
@@ -51,7 +50,7 @@ class PhotonPasses(PilotedSession):
     where that grows."""
 
     judges_chance = False
-    """Whether photons carry what tells how noisy camera paths are that meet their light by chance
+    """Whether the pilot asks photons how noisy camera paths are that meet their light by chance
     (`moment_of_chance`)."""
     follows_curvature = True
     """Whether merge disks of indirect light are smaller where surfaces are bent, if their radius is
@@ -66,8 +65,7 @@ class PhotonPasses(PilotedSession):
 
     def judge_chance(self):
         """Before a pilot: asks it for the noise of camera paths that meet caustics by chance."""
-        self.judges_chance = self.traits.has_light_surfaces and meets_one_light(self.scene)
-        self._freeze()
+        self.judges_chance = self.by_chance
 
     # ------------------------------------------------------------------ room
 
@@ -170,7 +168,7 @@ class PhotonPasses(PilotedSession):
 
     def _light_state(self, spectral):
         """What photons carry for the weights; None where there are none."""
-        return StartDensity(self.lights) if self.by_chance or self.judges_chance else None
+        return StartDensity(self.lights) if self.by_chance else None
 
     def _merge_state(self, spectral):
         """The weights of camera paths (a `mis.state.MergeState`); None where there are none."""
@@ -386,7 +384,7 @@ class PhotonPasses(PilotedSession):
                 return build_volume_map(
                     *in_media[:3], radius, self.volume_capacity, *in_media[3:], density=density
                 )
-        weighted = (kind == "indirect") != (self.by_chance or self.judges_chance)
+        weighted = (kind == "indirect") != self.by_chance
         mis_words = photons[3] if weighted and len(photons) > 3 else None
         return build_photon_map(
             *photons[:3],

@@ -25,8 +25,8 @@ from ..photons.grid import build_photon_map
 from ..photons.pairs import meeting_of, parts, photon_pairs, take
 from ..photons.photon import surface_layout
 from ..photons.queries import DEPTH
-from .bdpm import BDPMSession
 from .purposes import CAMERA, FROZEN, LIGHT
+from .weighted import UnderWeights
 
 STRATEGIES = {2: TwoStrategies, 3: ThreeStrategies}
 """Numbers of strategies for which there are printed weights."""
@@ -39,14 +39,13 @@ PHOTONS_A_PATH = 5
 """Room for photons of a pass; it grows where that is not enough."""
 
 
-class PublishedSession(BDPMSession):
+class PublishedSession(UnderWeights):
     """Iterations of `bdpm_opt` with `weights` = `published`.
 
     The pilot of an automatic radius merges at the first strategy's vertex, unweighted.
     """
 
-    chooses_light_paths = widens_caustics = follows_curvature = leaves_out_hidden = False
-    suits_denoisers = meets_lights = False
+    widens_caustics = False
 
     def __init__(self, integrator, scene, sensor, seed, iterations):
         super().__init__(integrator, scene, sensor, seed, iterations)

@@ -31,12 +31,17 @@ class WeightedBDPM(BDPM):
         return {**settings, "strategies": self.strategies}
 
 
-class WeightedSession(BDPMSession):
-    """Iterations of a `WeightedBDPM`. A subclass makes the weights."""
+class UnderWeights(BDPMSession):
+    """Iterations under weights, which know photons alone: all of those that there are, with one
+    radius."""
 
     chooses_light_paths = narrows_volume = suits_denoisers = meets_lights = False
-    leaves_out_hidden = False
-    follows_curvature = False  # nor do published weights, see `published_optimal`
+    follows_curvature = leaves_out_hidden = False
+
+
+class WeightedSession(UnderWeights):
+    """Iterations of a `WeightedBDPM`. A subclass makes the weights."""
+
     weighted_pilot = False
     """Whether the pilot of the automatic radius renders under the weights, made for
     `usual_radii()`; else it merges at the first vertex."""

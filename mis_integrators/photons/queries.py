@@ -375,19 +375,21 @@ class QueryVisitor:
         kept = mi.Bool(False)
         if self.queries.meets_lights:
             kept = active & met & behind_delta
-        light = at.throughput * ds.emitter.eval(at.si, shown | kept)
+        emitted = ds.emitter.eval(at.si, shown | kept)
         if self.queries.meets_lights:
-            self._keep_hit(state["left"], at, ds, light, scatter_pdf, kept)
+            self._keep_hit(state["left"], at, emitted, scatter_pdf, kept)
+        light = at.throughput * emitted
         light *= share
         light *= state["times"]
         if self.classes is not None:
             self.classes.add("met", at.path, class_of(*state["history"]), light, shown)
         return dr.select(shown, light, 0)
 
-    def _keep_hit(self, left, at, ds, light, scatter_pdf, met):
-        """Keeps the `light` that paths have met behind delta surfaces with the vertex before these,
-        which they have `left`."""
+    def _keep_hit(self, left, at, emitted, scatter_pdf, met):
+        """Keeps the light that paths have met behind delta surfaces, `emitted` there, with the
+        vertex before these, which they have `left`."""
         slot, cosine, kept = left
+        light = at.throughput * emitted
         write_hit(
             self.store.vertices["hits"],
             slot,
@@ -395,7 +397,7 @@ class QueryVisitor:
             at.si,
             at.ray,
             light,
-            kept * ds.emitter.eval(at.si, met),
+            kept * emitted,
             cosine,
             scatter_pdf,
             met & (dr.max(light) > 0) & (slot < self.store.room),
@@ -555,10 +557,11 @@ class QueryVisitor:
             cosine = dr.abs(dr.dot(at.si.n, at.si.to_world(bs.wo)))
             # Light that reaches places in media is that of volume photons alone.
             slot = dr.select(at.scatters, NO_VERTEX, at.slot) if self.flies else at.slot
-            *before, kept = state["left"]
-            kept = kept * weight * dr.square(bs.eta)  # radiance falls with the squared index
-            beyond_delta = selected(active & delta, [*before, kept], state["left"])
-            state["left"] = selected(scattered, [slot, cosine, mi.Spectrum(1)], beyond_delta)
+            now = [slot, cosine, mi.Spectrum(1)]
+            *place, kept = state["left"]
+            sent = kept * weight * dr.square(bs.eta)  # radiance falls with the squared index
+            kept = dr.select(active & delta, sent, kept)
+            state["left"] = selected(scattered, now, [*place, kept])
         if self.weights is not None:
             state["sums"] = self.weights.scatter(
                 state["sums"], at.si, self._scattering(at), bs, vertex, scattered

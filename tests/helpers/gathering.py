@@ -1,7 +1,27 @@
-"""Vertices that gather photons, made by hand."""
+"""Photons, and vertices that gather them, made by hand."""
+
+from mis_integrators.core.packing import pack_direction, pack_surface
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
+
+
+def photons_of(points, flux, up=(0, 0, 1), caustic=True):
+    """Photons at `points` (n, 3) of a floor, straight from above: `(surface, power, count)`.
+    `flux`: (n,), or (n, 3) where it has a colour."""
+    from mis_integrators.photons.photon import new_photons, power_layout, surface_layout
+
+    points, flux = (np.asarray(values, np.float32) for values in (points, flux))
+    surface, power = new_photons(len(points))
+    index, up = dr.arange(mi.UInt32, len(points)), mi.Vector3f(*up)
+    p = mi.Point3f(points.T.copy())
+    word = dr.zeros(mi.UInt32, len(points)) + pack_surface(up, mi.UInt32(2), mi.Bool(caustic))
+    surface_layout().write(surface, {"p": p, "surface": word}, index)
+    towards = dr.zeros(mi.UInt32, len(points)) + pack_direction(up)
+    flux = mi.Spectrum(flux.T.copy() if flux.ndim > 1 else mi.Float(flux))
+    power_layout().write(power, {"flux": flux, "towards": towards}, index)
+    return surface, power, mi.UInt32([len(points)])
 
 
 def vertices_at(scene, ray, count):

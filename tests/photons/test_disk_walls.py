@@ -3,14 +3,12 @@ light."""
 
 import dataclasses
 
-from mis_integrators.core.packing import pack_direction, pack_surface
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 from comparing import agree
-from gathering import vertices_at
+from gathering import photons_of, vertices_at
 from pilots import as_chosen, learned
 from worlds import T, diffuse, film, look, path
 
@@ -156,25 +154,15 @@ def seen_by_many(photons, reflectance, n=4096, below=0.0, wall=1000.0):
     from mis_integrators.photons.disk_walls import DiskWalls
     from mis_integrators.photons.gather import gather_photons, gather_seen
     from mis_integrators.photons.grid import build_photon_map
-    from mis_integrators.photons.photon import new_photons, power_layout, surface_layout
 
     floor = {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": reflectance}}
     place = T().translate([0.05, -1, 0]).rotate([0, 1, 0], 90)
     screen = {"type": "rectangle", "to_world": place}
     scene = mi.load_dict({"type": "scene", "floor": floor, "screen": screen})
-    count, up = len(photons), mi.Vector3f(0, 0, 1)
-    places = np.array([(x, y, -below) for x, y, _ in photons])
-    surface, power = new_photons(count)
-    index = dr.arange(mi.UInt32, count)
-    word = dr.zeros(mi.UInt32, count) + pack_surface(up, mi.UInt32(2), mi.Bool(False))
-    surface_layout().write(surface, {"p": mi.Point3f(vectors(places)), "surface": word}, index)
-    towards = dr.zeros(mi.UInt32, count) + pack_direction(up)
-    flux = mi.Spectrum(vectors([flux for *_, flux in photons]))
-    power_layout().write(power, {"flux": flux, "towards": towards}, index)
-    box, radius = scene.bbox(), dr.opaque(mi.Float, 0.2)
-    photon_map = build_photon_map(
-        surface, power, mi.UInt32([count]), box, radius, count, "indirect"
-    )
+    places, flux = [(x, y, -below) for x, y, _ in photons], [flux for *_, flux in photons]
+    made = photons_of(places, flux, caustic=False)
+    radius = dr.opaque(mi.Float, 0.2)
+    photon_map = build_photon_map(*made, scene.bbox(), radius, len(photons), "indirect")
     ray = mi.Ray3f(mi.Point3f(dr.zeros(mi.Float, n), 0, 0.01), mi.Vector3f(0, 0, -1))
     vertices = vertices_at(scene, ray, n)
     walls = DiskWalls(mi.Vector3f(wall, 0, 0), mi.Vector3f(0), mi.Float(0.02))

@@ -3,34 +3,17 @@ lost."""
 
 import math
 
-from mis_integrators.core.packing import pack_direction, pack_surface
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 from comparing import pictures
-from gathering import vertices_at
+from gathering import photons_of, vertices_at
 from pilots import learned
 
 RADIUS, TIERS = 0.05, 7
 FLOOR = 1.0
 """Half the edge of a floor at z = 0."""
-
-
-def photons_of(points, flux, up=(0, 0, 1)):
-    """Caustic photons on the floor, straight from above: `(surface, power, count)`."""
-    from mis_integrators.photons.photon import new_photons, power_layout, surface_layout
-
-    points, flux = np.asarray(points, np.float32), np.asarray(flux, np.float32)
-    surface, power = new_photons(len(points))
-    index, up = dr.arange(mi.UInt32, len(points)), mi.Vector3f(*up)
-    p = mi.Point3f(points.T.copy())
-    word = dr.zeros(mi.UInt32, len(points)) + pack_surface(up, mi.UInt32(2), mi.Bool(True))
-    surface_layout().write(surface, {"p": p, "surface": word}, index)
-    towards = dr.zeros(mi.UInt32, len(points)) + pack_direction(up)
-    power_layout().write(power, {"flux": mi.Spectrum(mi.Float(flux)), "towards": towards}, index)
-    return surface, power, mi.UInt32([len(points)])
 
 
 def light_around(points, flux, times=1.0, quantum=1 / 16, largest=math.inf):
