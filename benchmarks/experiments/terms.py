@@ -57,7 +57,7 @@ class Mixed:
     def image(self, camera: int, light: int) -> np.ndarray:
         """Mean over the channels, (height, width), of one iteration."""
         self.camera = camera
-        block = np.array(self.session._render(light), dtype=np.float64)
+        block = np.array(self.session._iteration(light), dtype=np.float64)
         border = (block.shape[0] - self.session.sensor.film().crop_size()[1]) // 2
         if border:
             block = block[border:-border, border:-border]

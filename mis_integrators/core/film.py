@@ -180,6 +180,21 @@ def grey_of(colour):
     return (colour[:, :, :1] + colour[:, :, 1:2] + colour[:, :, 2:]) / 3
 
 
+def grey_image(block, film):
+    """Mean of the colours of a block tensor, without its border, 0 where they are not finite:
+    float64 (height, width)."""
+    inside = without_border(film, block).astype(np.float64)
+    grey = inside[..., :3].mean(axis=-1) / np.where(inside[..., -1] == 0, 1, inside[..., -1])
+    return np.where(np.isfinite(grey), grey, 0)
+
+
+def without_border(film, tensor):
+    """A tensor of a block as an array, without the block's border."""
+    border = film.rfilter().border_size()
+    inside = slice(border, -border) if border else slice(None)
+    return np.array(tensor)[inside, inside]
+
+
 def unfinite_pixels(block):
     """One for each pixel of a block tensor that has a value which is not finite, else zero: shape
     (height, width, 1)."""
@@ -363,9 +378,7 @@ class Accumulator:
 
     def _inside(self, tensor):
         """A tensor as an array, without the block's border."""
-        border = self.film.rfilter().border_size()
-        inside = slice(border, -border) if border else slice(None)
-        return np.array(tensor)[inside, inside]
+        return without_border(self.film, tensor)
 
     def put(self, film, variance, layers=()):
         """Writes the accumulated image into a film prepared with matching AOVs: with channels of

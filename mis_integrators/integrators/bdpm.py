@@ -415,7 +415,7 @@ class BDPMSession(PhotonPasses):
         self.direct_light.recall(of_direct_light)
         of_direct_light.finish()
 
-    def _render(self, iteration):
+    def _iteration(self, iteration):
         radii = self.radii_at(iteration)
         spectral = self._spectral(iteration)
         # Before any pass is looked up: they may have to be recorded anew.

@@ -28,6 +28,7 @@ from ..paths.path_length_statistics import mean_segments
 from ..pilot.noise import MEASURES, shrink_to_neighbours, trimmed_mean
 from ..pilot.setting import UNPLANNED_ITERATIONS, neighbourhoods
 from . import costs
+from .film_trial import brightness, first_images, iterations_ahead, noise_of_mean
 from .noise_left import noise_left
 from .unidirectional import PathSession
 
@@ -82,11 +83,17 @@ class Trial:
     """By measure: squared bias, and variance of one iteration."""
     cost: float
     """Of one iteration: its seconds, or a pixel's segments; 1 where nothing else is tried."""
+    done: int = 0
+    """Iterations that are rendered already."""
+
+    def count(self, budget):
+        """Iterations, with those that are done, when `budget` is left."""
+        return self.done + budget / self.cost
 
     def errors(self, budget):
-        """Mean squared errors, by measure, when the cost is `budget`."""
+        """Mean squared errors, by measure, when `budget` is left."""
         return {
-            measure: squared_bias + variance * self.cost / budget
+            measure: squared_bias + variance / self.count(budget)
             for measure, (squared_bias, variance) in self.parts.items()
         }
 
@@ -143,6 +150,8 @@ def choose(integrator, scene, sensor, seed, iterations, seconds):
         photons.start()  # its first iterations tell the time, and are kept
         weighed = contest.weigh(timed=True)
     trials, budget, usual = weighed
+    if not (contest.settled or path_wins(*weighed)):
+        trials, budget = contest.look_at_first_images(trials, budget)
     return decide(trials, [], budget, usual)
 
 
@@ -203,6 +212,41 @@ class Contest:
         alone = _trial_of_path(self.path, values, photons.prediction, budget, cost)
         return [alone, trial_of_photons(PHOTONS, photons, usual)], budget, usual
 
+    def look_at_first_images(self, trials, budget):
+        """The `Trial`s of both and what is left of the budget, once the first iterations of photons
+        have told how noisy they are; and where `path` would win then, so have its own."""
+        alone, photons = trials
+        images = {}
+
+        def look(trial):
+            """Whether there is time to, and there are images then."""
+            nonlocal budget
+            count = iterations_ahead(trial.count(budget))
+            if not count:
+                return False
+            trial.session.start()
+            images[trial.plugin] = first_images(trial.session, count)
+            budget -= (count - trial.done) * trial.cost
+            if self.seconds:
+                budget = self.photons.seconds_left
+            return True
+
+        def seen(trial):
+            """The `Trial` by its images."""
+            done = len(images[trial.plugin])
+            cost = trial.session.iteration_seconds if self.seconds else trial.cost
+            trial = replace(trial, done=done, cost=cost)
+            count = trial.count(budget)
+            noise = noise_of_mean(images[trial.plugin], brightness(*images.values()), count)
+            parts = {name: (bias, count * noise[name]) for name, (bias, _) in trial.parts.items()}
+            return replace(trial, parts=parts)
+
+        if look(photons):
+            photons = seen(photons)
+            if alone.product(budget) < photons.product(budget) and look(alone):
+                alone, photons = seen(alone), seen(photons)
+        return [alone, photons], budget
+
 
 def path_wins(trials, budget, usual):
     """Whether `path` renders even if an iteration of photons is `OVERRATED`; arguments as
@@ -218,7 +262,7 @@ def decide(trials, reasons, budget, usual):
     squared_bias, variance = best.parts["relmse"]
     why = (
         f"{best.plugin}: least predicted error in this time; bias {squared_bias:.2g}, noise "
-        f"{variance * best.cost / budget:.2g} (squared, relative)"
+        f"{variance / best.count(budget):.2g} (squared, relative)"
     )
     for trial in trials:
         if trial is not best:

@@ -24,7 +24,7 @@ class PilotedSession(IterativeSession):
 
     A subclass says which photon maps there are (`kinds`), what the pilot must know of the render
     (`pilot_setting`), how it estimates pixels (`pilot_passes`), and renders an iteration
-    (`_render`). In a render of a given time, the choice is made twice: the first iterations are
+    (`_iteration`). In a render of a given time, the choice is made twice: the first iterations are
     rendered with the first choice, to measure what they take, and are kept unless the second choice
     is another.
     """
@@ -35,12 +35,10 @@ class PilotedSession(IterativeSession):
         self.radii = None  # by kind of photons, once they are known
         self.light_share = 1.0  # of the light sub-paths, those that an iteration has
         self.prediction = None  # a `Prediction`, where a pilot has chosen
-        self.iteration_seconds = math.inf  # what one takes, where that is measured
         self.expected_seconds = math.inf  # what one will take, by the pilot
         self._end = math.inf  # on the clock, of the time for rendering
         self.gathering_seconds = math.inf  # of that, what paths for direct light alone do not take
         self._untimed = None  # arguments of `_choose_by_clock`, until it is called
-        self.kept = {}  # iterations that were rendered to measure their time, by number
 
     def kinds(self):
         """Photon maps that the scene needs."""
@@ -53,10 +51,6 @@ class PilotedSession(IterativeSession):
     def pilot_passes(self, setting, pixels):
         """The `PilotPasses` of this setting on these pixels."""
         raise TypeError(f"{type(self).__name__} does not define pilot_passes")
-
-    def _render(self, iteration):
-        """The block of one iteration."""
-        raise TypeError(f"{type(self).__name__} does not define _render")
 
     def _use_light_share(self):
         """Traces the `light_share` in each iteration from now on."""
@@ -215,24 +209,9 @@ class PilotedSession(IterativeSession):
         one, and those of all."""
         spent = 0.0
         for number in range(2):
-            start = now()
-            block = self._render(number)
-            dr.eval(block)
-            dr.sync_thread()
-            seconds = now() - start
-            self.kept[number] = block
+            seconds = self.render_ahead(number)
             spent += seconds
             share = PILOT_TIME_SHARE if seconds < TOO_SLOW * guess else 0.5
             if spent > share * left:
                 break
         return seconds, spent
-
-    @property
-    def seconds_of_next(self):
-        """As of `core.session.Session`."""
-        return 0.0 if self.iterations in self.kept else self.iteration_seconds
-
-    def _iteration(self, iteration):
-        if iteration in self.kept:
-            return self.kept.pop(iteration)
-        return self._render(iteration)

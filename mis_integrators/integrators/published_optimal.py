@@ -103,10 +103,10 @@ class PublishedSession(UnderWeights):
 
     # ------------------------------------------------------------------ iterations
 
-    def _render(self, iteration):
+    def _iteration(self, iteration):
         radii = self.radii_at(iteration)
         if not radii:
-            return super()._render(iteration)
+            return super()._iteration(iteration)
         with no_garbage_collection():  # as where passes are recorded: these are not
             return self._render_weighted(iteration, radii)
 

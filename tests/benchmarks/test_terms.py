@@ -25,7 +25,7 @@ class KnownSession:
     def _sequence(self, number, purpose, group_size):
         return number
 
-    def _render(self, iteration):
+    def _iteration(self, iteration):
         from mis_integrators.integrators.purposes import CAMERA, LIGHT
 
         c, w = (self._sequence(iteration, purpose, 1) for purpose in (CAMERA, LIGHT))

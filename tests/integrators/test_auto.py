@@ -385,7 +385,7 @@ def test_a_photon_mapper_that_loses_renders_nothing(rgb, monkeypatch):
 
     set_price_of_path(monkeypatch, 1e-4)
     rendered = []
-    monkeypatch.setattr(BDPMSession, "_render", lambda *given: rendered.append(given))
+    monkeypatch.setattr(BDPMSession, "_iteration", lambda *given: rendered.append(given))
     session = auto().session(tray("lambertian", "rectangle"))
     session.plan_time(1.0)
     session.iterate()
