@@ -1090,4 +1090,25 @@ MUTATIONS = [
         "photons behind walls are tested regardless of what they bring",
         "tests/photons/test_disk_walls.py::test_light_of_another_colour",
     ),
+    Mutation(
+        "integrators/film_trial.py",
+        "np.mean(weigh(bright.ravel()) * contrast.ravel())",
+        "np.mean(np.sort(weigh(bright.ravel()) * contrast.ravel())[:-4])",
+        "rare light counts for nothing in the first images",
+        "tests/integrators/test_film_trial.py::test_rare_light_counts",
+    ),
+    Mutation(
+        "integrators/film_trial.py",
+        "window_mean(several.mean(axis=0), NEAR)",
+        "several.mean(axis=0)",
+        "pixels that are bright by chance say so themselves",
+        "tests/integrators/test_film_trial.py::test_rare_light_counts",
+    ),
+    Mutation(
+        "integrators/choice.py",
+        "return self.done + budget / self.cost",
+        "return budget / self.cost",
+        "iterations that are rendered ahead are forgotten",
+        "tests/integrators/test_film_trial.py::test_what_is_rendered_counts",
+    ),
 ]

@@ -146,12 +146,13 @@ def choose(integrator, scene, sensor, seed, iterations, seconds):
         planned = contest.planned
         return decide([trial_of_photons(PHOTONS, photons, 1.0)], [excluded], planned, 1.0)
     weighed = contest.weigh()
-    if seconds and not (contest.settled or path_wins(*weighed)):
-        photons.start()  # its first iterations tell the time, and are kept
-        weighed = contest.weigh(timed=True)
     trials, budget, usual = weighed
     if not (contest.settled or path_wins(*weighed)):
-        trials, budget = contest.look_at_first_images(trials, budget)
+        if seconds:
+            photons.start()  # its first iterations tell the time, and are kept
+            trials, budget, usual = contest.weigh(timed=True)
+        if not integrator.denoised:
+            trials, budget = contest.look_at_first_images(trials, budget)
     return decide(trials, [], budget, usual)
 
 
@@ -214,36 +215,37 @@ class Contest:
 
     def look_at_first_images(self, trials, budget):
         """The `Trial`s of both and what is left of the budget, once the first iterations of photons
-        have told how noisy they are; and where `path` would win then, so have its own."""
+        have told how noisy they are; and where `path` would win then, so have its own. Where
+        they cannot tell more than the pilot, the trials are left as they are."""
         alone, photons = trials
+        pixels, known = film_sample_count(self.path.sensor), self.photons.prediction.pixels.count
+        counts = {
+            trial.plugin: iterations_ahead(trial.count(budget), known / pixels) for trial in trials
+        }
         images = {}
 
         def look(trial):
-            """Whether there is time to, and there are images then."""
             nonlocal budget
-            count = iterations_ahead(trial.count(budget))
-            if not count:
-                return False
             trial.session.start()
-            images[trial.plugin] = first_images(trial.session, count)
-            budget -= (count - trial.done) * trial.cost
+            images[trial.plugin] = first_images(trial.session, counts[trial.plugin])
+            budget -= counts[trial.plugin] * trial.cost
             if self.seconds:
                 budget = self.photons.seconds_left
-            return True
 
         def seen(trial):
             """The `Trial` by its images."""
-            done = len(images[trial.plugin])
             cost = trial.session.iteration_seconds if self.seconds else trial.cost
-            trial = replace(trial, done=done, cost=cost)
+            trial = replace(trial, done=counts[trial.plugin], cost=cost)
             count = trial.count(budget)
             noise = noise_of_mean(images[trial.plugin], brightness(*images.values()), count)
             parts = {name: (bias, count * noise[name]) for name, (bias, _) in trial.parts.items()}
             return replace(trial, parts=parts)
 
-        if look(photons):
+        if all(counts.values()):
+            look(photons)
             photons = seen(photons)
-            if alone.product(budget) < photons.product(budget) and look(alone):
+            if alone.product(budget) < photons.product(budget):
+                look(alone)
                 alone, photons = seen(alone), seen(photons)
         return [alone, photons], budget
 

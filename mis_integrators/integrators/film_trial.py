@@ -1,18 +1,19 @@
 """The noise of a render, by its own first iterations.
 
 A pilot looks at a few thousand pixels, and leaves out the noisiest of them. Where rare bright paths
-make most of the noise, it meets too few of them. The first iterations of the render meet sixteen
-times as many, or more, and cost nothing: they belong to the image.
+make most of the noise, it meets too few of them. The first iterations of the render meet more,
+where the film is larger, and cost nothing: they belong to the image.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from ..core.film import WINDOW, grey_image
+from ..core.film import grey_image
 from ..core.stratified_variance import contrasts, variance_by_power
 from ..core.windows import window_mean
 from ..pilot.noise import MEASURES
+from ..pilot.run import MOST_ITERATIONS
 
 SHARE = 0.1
 """Tuned: share of a render that its first iterations may take until they are looked at."""
@@ -25,22 +26,22 @@ wider than 5, with which relative errors came out at a third to a half in scenes
 with 15 they are 0.5 to 1.1 times those by a reference, in six scenes."""
 
 
-def iterations_ahead(planned):
-    """How many iterations of so many are looked at: a power of two, or 0."""
+def iterations_ahead(planned, pilot_share):
+    """How many iterations of those `planned` are looked at: a power of two; or 0 where so many tell
+    less than a pilot with `pilot_share` of the pixels."""
     affordable = int(min(SHARE * planned, MOST))
-    return 1 << (affordable.bit_length() - 1) if affordable >= FEWEST else 0
+    count = 1 << affordable.bit_length() >> 1
+    return count if count >= max(FEWEST, MOST_ITERATIONS * pilot_share) else 0
 
 
 def first_images(session, count):
     """The first `count` iterations of a session that has not rendered yet, which keeps them: grey,
-    (count, H, W), with the noise that counts. A denoiser is taken for a mean over `WINDOW`, which
-    leaves 1/25 of noise that is independent from pixel to pixel (`pilot.denoiser.LEFT`)."""
+    (count, H, W)."""
     for iteration in range(count):
         if iteration not in session.kept:
             session.iteration_seconds = session.render_ahead(iteration)
     film = session.sensor.film()
-    images = np.array([grey_image(session.kept[number], film) for number in range(count)])
-    return window_mean(images, WINDOW) if session.integrator.denoised else images
+    return np.array([grey_image(session.kept[number], film) for number in range(count)])
 
 
 def brightness(*images):
