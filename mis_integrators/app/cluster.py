@@ -396,8 +396,8 @@ class DistributedSession:
     """A ``Session`` whose iterations the workers of a cluster run: each ``iterate`` adds what has
     come in, several of them or none.
 
-    All but ``iterate`` is that of the session ``opened``, in this process, which renders nothing
-    itself but finds out what must be known before.
+    All but ``iterate`` is that of the session ``opened``, in this process, which finds out what
+    must be known before, and renders nothing but the iterations that it needs for that.
     """
 
     seconds_of_next = math.inf
@@ -448,6 +448,8 @@ class DistributedSession:
     def _begin(self) -> None:
         with dr.suspend_grad():
             self._session.start()
+        for number in list(getattr(self._session, "kept", ())):
+            self._session.iterate(number)
         request = self._opened.request
         self._job = Job(
             f"{os.getpid()}-{time.time_ns()}",

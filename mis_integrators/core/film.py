@@ -180,12 +180,12 @@ def grey_of(colour):
     return (colour[:, :, :1] + colour[:, :, 1:2] + colour[:, :, 2:]) / 3
 
 
-def grey_image(block, film):
-    """Mean of the colours of a block tensor, without its border, 0 where they are not finite:
-    float64 (height, width)."""
-    inside = without_border(film, block).astype(np.float64)
-    grey = inside[..., :3].mean(axis=-1) / np.where(inside[..., -1] == 0, 1, inside[..., -1])
-    return np.where(np.isfinite(grey), grey, 0)
+def grey_and_weight(film, blocks):
+    """The mean of the weighted colours, and the weights, of block tensors, without their border:
+    float64 (blocks, height, width) each; 0 where a block has a value that is not finite."""
+    inside = np.array([without_border(film, block) for block in blocks], np.float64)
+    inside[~np.isfinite(inside).all(axis=-1)] = 0
+    return inside[..., :3].mean(axis=-1), inside[..., -1]
 
 
 def without_border(film, tensor):
@@ -330,12 +330,12 @@ class Accumulator:
         """Variance over that of as many independent iterations, of grey (height, width, 1); one in
         the block's border."""
         n, done = self.iterations, self.sums.done
-        mean, weight = (self._inside(tensor) for tensor in self.mean())
+        mean, weight = (without_border(self.film, tensor) for tensor in self.mean())
         mean = grey_of(mean)
         grey = {
-            "square": self._inside(self.sums["grey_square"]),
-            "cross": grey_of(self._inside(self.sums["cross"])),
-            "weight_square": self._inside(self.sums["weight_square"]),
+            "square": without_border(self.film, self.sums["grey_square"]),
+            "cross": grey_of(without_border(self.film, self.sums["cross"])),
+            "weight_square": without_border(self.film, self.sums["weight_square"]),
         }
         naive = np.maximum(spread(grey, mean), 0) * (n / ((n - 1) * weight * weight))
         ratio = variance_ratio(*self._deviations(0, mean), naive[..., 0], done.below, done.beyond)
@@ -345,9 +345,9 @@ class Accumulator:
     def _deviations(self, channel, mean):
         """Of each segment's mean from the `mean` (H, W, 1) of a channel of the segments: (segments,
         H, W); which segments are complete; their length."""
-        done, weight = self.sums.done, self._inside(self.sums["total"])[..., -1]
+        done, weight = self.sums.done, without_border(self.film, self.sums["total"])[..., -1]
         length, complete = segments.complete(done.below, done.beyond, done.end)
-        sums = np.array([self._inside(self.sums[name]) for name in segments.NAMES])
+        sums = np.array([without_border(self.film, self.sums[name]) for name in segments.NAMES])
         deviations = sums[..., channel] - mean[..., 0] * sums[..., 1]
         scale = self.iterations / (np.where(weight == 0, 1, weight) * length)
         return deviations * scale, complete, length
@@ -359,7 +359,7 @@ class Accumulator:
         Iterations count as independent, though sequences make the mean less noisy than that: a
         rare bright sample is then as large in the variance as it is in the image, whatever is
         around it."""
-        total = self._inside(self.sums["total"])
+        total = without_border(self.film, self.sums["total"])
         mean = grey_of(self._direct(total)) / np.where(total[..., -1:] == 0, 1, total[..., -1:])
         deviations, complete, length = self._deviations(2, mean)
         if np.count_nonzero(complete) < 2:
@@ -370,15 +370,14 @@ class Accumulator:
     def estimate(self):
         """Mean colour and its estimated variance, float64 (height, width, 3) each, without the
         block's border."""
-        return tuple(self._inside(tensor) for tensor in (self.mean()[0], self.variance_of_mean()))
+        return tuple(
+            without_border(self.film, tensor)
+            for tensor in (self.mean()[0], self.variance_of_mean())
+        )
 
     def unfinite_pixels(self):
         """How many pixels of the film had values that are not finite in some iteration."""
-        return int(np.count_nonzero(self._inside(self.sums["left_out"])))
-
-    def _inside(self, tensor):
-        """A tensor as an array, without the block's border."""
-        return without_border(self.film, tensor)
+        return int(np.count_nonzero(without_border(self.film, self.sums["left_out"])))
 
     def put(self, film, variance, layers=()):
         """Writes the accumulated image into a film prepared with matching AOVs: with channels of

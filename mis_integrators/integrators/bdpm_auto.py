@@ -34,7 +34,8 @@ class BDPMAuto(IterativeIntegrator):
 
     Chooses between ``path`` and a photon mapper: ``bdpm`` with ``bdd`` 0, or 1 in renders that will
     be denoised. The photon mapper runs its pilot; a few samples of ``path`` on the same pixels tell
-    what that would bring in the same time. In a render of a given time, the clock tells what an
+    what that would bring in the same time. In raw images the first iterations of the render tell
+    the noise again, where they tell more. In a render of a given time, the clock tells what an
     iteration costs; of a given number of samples, counted events (segments, photons) do, so that
     the choice is the same on all machines. Where ``path`` cannot see all the light of the scene, it
     is not tried.
@@ -114,6 +115,11 @@ class AutoSession(IterativeSession):
         """Why what renders was chosen, and what else the user should know, line by line."""
         reasons = self.decision.reasons if self.decision else []
         return [*(f"{self.integrator.plugin}: {reason}" for reason in reasons), *super().remarks]
+
+    @property
+    def kept(self):
+        """Iterations that have been rendered to make the choice, and are not in the sums yet."""
+        return getattr(self.decision and self.decision.session, "kept", {})
 
     @property
     def seconds_of_next(self):

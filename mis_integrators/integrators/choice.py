@@ -1,6 +1,7 @@
 """The choice of `bdpm_auto`: photons, or camera paths alone.
 
-Both are judged on the same few thousand pixels. Their errors after n iterations are the squared
+Both are judged on the same few thousand pixels, and in raw images by their first iterations where
+these tell more (`film_trial`). Their errors after n iterations are the squared
 bias (the blur of the photons' disks) plus the variance over n (`pilot.radius`); n follows from what
 an iteration costs: its seconds in a render of a given time, else counted events (`costs`). There
 are two measures of error, relative and absolute (`pilot.noise`), and what has the least product of
@@ -28,7 +29,7 @@ from ..paths.path_length_statistics import mean_segments
 from ..pilot.noise import MEASURES, shrink_to_neighbours, trimmed_mean
 from ..pilot.setting import UNPLANNED_ITERATIONS, neighbourhoods
 from . import costs
-from .film_trial import brightness, first_images, iterations_ahead, noise_of_mean
+from .film_trial import first_images, iterations_ahead, noise_of_mean, weights_by
 from .noise_left import noise_left
 from .unidirectional import PathSession
 
@@ -74,7 +75,7 @@ class Decision:
 
 @dataclass
 class Trial:
-    """What the pilot tells of one candidate."""
+    """What the pilot, or its first iterations, tell of one candidate."""
 
     plugin: str
     session: object
@@ -151,7 +152,7 @@ def choose(integrator, scene, sensor, seed, iterations, seconds):
         if seconds:
             photons.start()  # its first iterations tell the time, and are kept
             trials, budget, usual = contest.weigh(timed=True)
-        if not integrator.denoised:
+        if not (integrator.denoised or mi.is_spectral):  # wavelengths are noise of their own
             trials, budget = contest.look_at_first_images(trials, budget)
     return decide(trials, [], budget, usual)
 
@@ -211,33 +212,31 @@ class Contest:
             usual, cost = _counted_costs(self.path, photons, self._segments)
             budget = self.planned * usual
         alone = _trial_of_path(self.path, values, photons.prediction, budget, cost)
-        return [alone, trial_of_photons(PHOTONS, photons, usual)], budget, usual
+        mapper = replace(trial_of_photons(PHOTONS, photons, usual), done=len(photons.kept))
+        return [alone, mapper], budget, usual
 
     def look_at_first_images(self, trials, budget):
         """The `Trial`s of both and what is left of the budget, once the first iterations of photons
         have told how noisy they are; and where `path` would win then, so have its own. Where
         they cannot tell more than the pilot, the trials are left as they are."""
         alone, photons = trials
-        pixels, known = film_sample_count(self.path.sensor), self.photons.prediction.pixels.count
-        counts = {
-            trial.plugin: iterations_ahead(trial.count(budget), known / pixels) for trial in trials
-        }
+        pixels = film_sample_count(self.path.sensor), self.photons.prediction.pixels.count
+        counts = {trial.plugin: iterations_ahead(trial.count(budget), *pixels) for trial in trials}
         images = {}
 
         def look(trial):
             nonlocal budget
             trial.session.start()
             images[trial.plugin] = first_images(trial.session, counts[trial.plugin])
-            budget -= counts[trial.plugin] * trial.cost
-            if self.seconds:
-                budget = self.photons.seconds_left
+            spent = (counts[trial.plugin] - trial.done) * trial.cost
+            budget = self.photons.seconds_left if self.seconds else budget - spent
 
         def seen(trial):
             """The `Trial` by its images."""
             cost = trial.session.iteration_seconds if self.seconds else trial.cost
             trial = replace(trial, done=counts[trial.plugin], cost=cost)
             count = trial.count(budget)
-            noise = noise_of_mean(images[trial.plugin], brightness(*images.values()), count)
+            noise = noise_of_mean(images[trial.plugin], weights_by(*images.values()), count)
             parts = {name: (bias, count * noise[name]) for name, (bias, _) in trial.parts.items()}
             return replace(trial, parts=parts)
 
@@ -268,6 +267,7 @@ def decide(trials, reasons, budget, usual):
     )
     for trial in trials:
         if trial is not best:
+            getattr(trial.session, "kept", {}).clear()
             trial.session = None  # its photons' and kernels' memory is free to go
     errors = {
         f"{measure}.{trial.plugin}": float(error)

@@ -10,7 +10,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.clock import now
 from ..core.film import Accumulator, direct_channels, shared_wavelengths, variance_channels
 from ..core.random import mix, reversed_bits
 from ..core.recording import lanes, settle
@@ -304,8 +303,6 @@ class IterativeSession:
             class_channels=3 * integrator.kept_classes,
             denoised=integrator.denoised,
         )
-        self.kept = {}  # iterations that were rendered ahead of the others, by number
-        self.iteration_seconds = math.inf  # what one takes, where that is measured
         self.variant = mi.variant()
         settle(scene)
 
@@ -477,22 +474,7 @@ class IterativeSession:
 
     def _run(self, iteration):
         """Adds an iteration to the sums."""
-        block = self.kept.pop(iteration, None)
-        self.accumulator.add(self._iteration(iteration) if block is None else block, iteration)
-
-    def render_ahead(self, iteration):
-        """Renders an iteration, to be added to the sums later. Returns the seconds it took."""
-        start = now()
-        block = self._iteration(iteration)
-        dr.eval(block)
-        dr.sync_thread()
-        self.kept[iteration] = block
-        return now() - start
-
-    @property
-    def seconds_of_next(self):
-        """As of `core.session.Session`."""
-        return 0.0 if self.iterations in self.kept else self.iteration_seconds
+        self.accumulator.add(self._iteration(iteration), iteration)
 
     wavelength = WAVELENGTH
     """Purpose of the random seed of an iteration's wavelengths."""

@@ -1,65 +1,84 @@
 """The noise of a render, by its own first iterations.
 
 A pilot looks at a few thousand pixels, and leaves out the noisiest of them. Where rare bright paths
-make most of the noise, it meets too few of them. The first iterations of the render meet more,
-where the film is larger, and cost nothing: they belong to the image.
+make most of the noise, it meets too few of them. The first iterations of the render meet more, and
+those of the candidate that is chosen belong to the image.
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
-from ..core.film import grey_image
+from ..core.film import grey_and_weight
 from ..core.stratified_variance import contrasts, variance_by_power
 from ..core.windows import window_mean
-from ..pilot.noise import MEASURES
+from ..pilot.noise import MEASURES, usual_radiance
 from ..pilot.run import MOST_ITERATIONS
 
 SHARE = 0.1
-"""Tuned: share of a render that its first iterations may take until they are looked at."""
+"""Tuned: share of a render that the first iterations of a candidate may take."""
 FEWEST, MOST = 2, 8
 """Iterations that are looked at: a power of two of them."""
-
+MOST_PIXELS = 1 << 22
+"""Pixels of these iterations at most, unless they are the fewest (bounds memory)."""
 NEAR = 15
-"""Tuned: width in pixels of the windows whose mean tells how bright a pixel is. A photon's disk is
-wider than 5, with which relative errors came out at a third to a half in scenes of rare photons;
-with 15 they are 0.5 to 1.1 times those by a reference, in six scenes."""
+"""Tuned: width in pixels of the windows whose mean tells how bright a pixel is."""
 
 
-def iterations_ahead(planned, pilot_share):
-    """How many iterations of those `planned` are looked at: a power of two; or 0 where so many tell
-    less than a pilot with `pilot_share` of the pixels."""
-    affordable = int(min(SHARE * planned, MOST))
-    count = 1 << affordable.bit_length() >> 1
-    return count if count >= max(FEWEST, MOST_ITERATIONS * pilot_share) else 0
+class FirstImages(NamedTuple):
+    """Iterations of a render, grey."""
+
+    mean: np.ndarray
+    """(H, W): the image that they make."""
+    deviations: np.ndarray
+    """(iterations, H, W): of each from the mean. A mean over some of them is that of their
+    image."""
+    low_discrepancy: bool
+    """Whether iterations share sequences."""
+
+
+def iterations_ahead(planned, pixels, pilot_pixels):
+    """How many iterations of those `planned` are looked at, on a film of so many `pixels`: a power
+    of two; or 0 where so many tell less than a pilot of `pilot_pixels`."""
+    most = min(MOST, max(MOST_PIXELS // pixels, FEWEST), int(SHARE * planned))
+    count = 1 << most.bit_length() >> 1
+    told = count >= FEWEST and count * pixels >= MOST_ITERATIONS * pilot_pixels
+    return count if told else 0
 
 
 def first_images(session, count):
-    """The first `count` iterations of a session that has not rendered yet, which keeps them: grey,
-    (count, H, W)."""
-    for iteration in range(count):
-        if iteration not in session.kept:
-            session.iteration_seconds = session.render_ahead(iteration)
-    film = session.sensor.film()
-    return np.array([grey_image(session.kept[number], film) for number in range(count)])
+    """The `FirstImages`, so many, of a session that has not rendered yet and keeps them."""
+    missing = [iteration for iteration in range(count) if iteration not in session.kept]
+    if missing:
+        session.iteration_seconds = np.median([session.render_ahead(number) for number in missing])
+    blocks = [session.kept[number] for number in range(count)]
+    grey, weight = grey_and_weight(session.sensor.film(), blocks)
+    usual_weight = weight.mean(axis=0)
+    usual_weight[usual_weight == 0] = 1
+    mean = grey.mean(axis=0) / usual_weight
+    deviations = (grey - mean * weight) / usual_weight
+    return FirstImages(mean, deviations, session.integrator.low_discrepancy)
 
 
-def brightness(*images):
-    """Of each pixel (H, W), by the `first_images` of some sessions: what its errors are relative
-    to. A mean over `NEAR`: what is bright by chance must not say so itself."""
-    return np.mean([window_mean(several.mean(axis=0), NEAR) for several in images], axis=0)
+def weights_by(*seen):
+    """Weights (H, W) of the pixels' squared errors, by measure, from the `FirstImages` of some
+    sessions. A pixel is as bright as a window of `NEAR` around it: what is bright by chance must
+    not say so itself."""
+    mean = np.mean([images.mean for images in seen], axis=0)
+    near, usual = window_mean(mean, NEAR), usual_radiance(mean)
+    return {measure: weigh(near, usual) for measure, weigh in MEASURES.items()}
 
 
-def noise_of_mean(images, bright, count):
-    """The variance of the mean of `count` iterations, by measure, from the `first_images` of a
-    session and the pixels' `brightness`. All pixels count: what is rare is all that is looked
-    for."""
-    lengths, found, _ = contrasts(images, np.ones(len(images), bool), 1)
+def noise_of_mean(images, weights, count):
+    """The variance of the mean of `count` iterations, by measure, from `FirstImages` and the
+    pixels' `weights_by` them. All pixels count: what is rare is what is looked for."""
+    if not images.low_discrepancy:
+        variance = images.deviations.var(axis=0, ddof=1) / count
+        return {measure: np.mean(weight * variance) for measure, weight in weights.items()}
+    lengths, found, _ = contrasts(images.deviations, np.ones(len(images.deviations), bool), 1)
     return {
-        measure: variance_by_power(
-            lengths,
-            np.array([np.mean(weigh(bright.ravel()) * contrast.ravel()) for contrast in found]),
-            max(count, 1),
-        )
-        for measure, weigh in MEASURES.items()
+        measure: variance_by_power(lengths, np.mean(weight * found, axis=(1, 2)), count)
+        for measure, weight in weights.items()
     }

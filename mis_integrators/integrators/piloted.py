@@ -12,14 +12,14 @@ from ..core.untrusted import Fields
 from ..pilot.result import Choice
 from ..pilot.run import PILOT_TIME_SHARE, run_pilot
 from ..pilot.setting import LIGHT_SHARES, pilot_pixels
-from .common import IterativeSession
+from .ahead import SessionAhead
 from .schedule import LARGEST_RADIUS, SMALLEST_RADIUS, shrunk
 
 TOO_SLOW = 1.5
 """Tuned: an iteration that takes so many times the guess is not believed to be typical."""
 
 
-class PilotedSession(IterativeSession):
+class PilotedSession(SessionAhead):
     """Runs a pilot, chooses from it, and renders with what was chosen.
 
     A subclass says which photon maps there are (`kinds`), what the pilot must know of the render

@@ -11,7 +11,7 @@ from ..core.recording import recorder
 from ..core.untrusted import Fields
 from ..paths.camera import film_sample_count, start_camera_paths
 from ..paths.setting import CameraPass
-from .common import IterativeSession
+from .ahead import SessionAhead
 
 BUSY = 1 << 19
 """Camera paths that keep the processor busy: twice as many at once are 3 % faster, 65536 a quarter
@@ -46,7 +46,7 @@ class PathSampler(mi.Sampler):
         return mi.Point2f(*self._next(2))
 
 
-class PathSession(IterativeSession):
+class PathSession(SessionAhead):
     """Iterations of `path`: `camera_paths` samples a pixel each, or, if that is 0 and no number of
     iterations is planned, as many as keep the processor busy."""
 

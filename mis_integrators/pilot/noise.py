@@ -22,15 +22,17 @@ def usual_radiance(mean: np.ndarray) -> float:
     return float(np.mean(np.minimum(mean, np.quantile(mean, 0.9))))
 
 
-def relative_weights(mean: np.ndarray) -> np.ndarray:
+def relative_weights(mean: np.ndarray, usual: float | None = None) -> np.ndarray:
     """Weights 1 / (mean^2 + 0.1 usual^2) of squared errors: relative error, without letting dark
-    pixels rule."""
-    return 1 / (mean**2 + 0.1 * usual_radiance(mean) ** 2 + 1e-30)
+    pixels rule. `usual`: the `usual_radiance`, if it is not that of `mean`."""
+    usual = usual_radiance(mean) if usual is None else usual
+    return 1 / (mean**2 + 0.1 * usual**2 + 1e-30)
 
 
-def absolute_weights(mean: np.ndarray) -> np.ndarray:
+def absolute_weights(mean: np.ndarray, usual: float | None = None) -> np.ndarray:
     """Weights 1 / usual^2 of squared errors, the same for all pixels."""
-    return np.full(len(mean), 1 / (usual_radiance(mean) ** 2 + 1e-30))
+    usual = usual_radiance(mean) if usual is None else usual
+    return np.full(mean.shape, 1 / (usual**2 + 1e-30))
 
 
 MEASURES = {"relmse": relative_weights, "mse": absolute_weights}

@@ -673,6 +673,23 @@ def test_overdue_batches_are_handed_to_others_and_duplicates_dropped(fakes):
     np.testing.assert_array_equal(session.sums["count"], [1, 1, 1, 0, 0])
 
 
+def test_what_was_rendered_for_a_choice_is_added(fakes):
+    """And is not asked of workers again."""
+    _, session = fakes
+    opened = session._session
+    opened.kept = {0: "block", 1: "block"}
+
+    def iterate(number):
+        del opened.kept[number]
+        opened.sums.done.add(number)
+
+    opened.iterate = iterate
+    session.iterate()
+    assert not opened.kept and len(opened.sums.done) == 2
+    asked = sorted(number for batch in session._waiting for number in batch.numbers)
+    assert asked == [2, 3, 4]
+
+
 def test_time_in_which_the_gatherer_itself_was_stopped_does_not_count(fakes, monkeypatch):
     _, session = fakes
     session.iterate()
