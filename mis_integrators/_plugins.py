@@ -19,6 +19,7 @@ _PACKAGE = "mis_integrators.integrators"
 # Modules to load anew for a variant, those that others import first.
 MODULES: tuple[str, ...] = (
     "common",
+    "ahead",
     "piloted",
     "photon_passes",
     "bdpm",
