@@ -22,6 +22,8 @@ from common.turns import Contender, take_turns
 WARM_UP = 3
 SIZE_OF_SWEEP = 256
 """Edge of the square film at which the number of light paths is varied."""
+TRIFLE = 0.05
+"""Of the time of the longest kernel: kernels that only number paths take less."""
 COLUMNS = {
     "cost": (
         "size",
@@ -101,11 +103,17 @@ class Parts:
 
     def observe(self, kernels: list[dict], seconds: float) -> None:
         """Sort one iteration's kernels: those of the light pass, of the maps and of the gather are
-        set aside when these are done; of the last, those up to the first one as wide as all camera
-        paths are the camera pass. The rest is direct light alone."""
+        set aside when these are done; of the last, those up to the first one that is as wide as all
+        camera paths, and no trifle, are the camera pass. The rest is direct light alone."""
         mine = self._kernels["rest"]
-        compiled = [i for i, kernel in enumerate(mine) if kernel["type"] == dr.KernelType.JIT]
-        camera = next(i for i in compiled if mine[i]["size"] == self._session.chunk) + 1
+        longest = max(kernel["execution_time"] for kernel in mine)
+        camera = 1 + next(
+            i
+            for i, kernel in enumerate(mine)
+            if kernel["type"] == dr.KernelType.JIT
+            and kernel["size"] == self._session.chunk
+            and kernel["execution_time"] > TRIFLE * longest
+        )
         parts = {
             **{part: self._kernels[part] for part in ("light", "grid")},
             "camera": mine[:camera],
