@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 
 from mis_integrators.app import loading
+from mis_integrators.core.film import grey_and_weight
 from mis_integrators.core.session import Session
 
 import numpy as np
@@ -57,11 +58,9 @@ class Mixed:
     def image(self, camera: int, light: int) -> np.ndarray:
         """Mean over the channels, (height, width), of one iteration."""
         self.camera = camera
-        block = np.array(self.session._iteration(light), dtype=np.float64)
-        border = (block.shape[0] - self.session.sensor.film().crop_size()[1]) // 2
-        if border:
-            block = block[border:-border, border:-border]
-        return block[..., :3].mean(axis=-1) / np.maximum(block[..., -1], 1e-12)
+        blocks = [self.session._iteration(light)]
+        (grey,), (weight,) = grey_and_weight(self.session.sensor.film(), blocks)
+        return grey / np.maximum(weight, 1e-12)
 
 
 def measure(session: Session, rounds: int, label: str) -> tuple[np.ndarray, np.ndarray]:

@@ -35,6 +35,8 @@ class Session(Protocol):
     ``remarks``, a list of lines that the user should read, complete once an iteration is done,
     ``fewest_iterations``, how many its image needs (else one), and ``seconds_of_next``, what
     its next iteration will take: infinite where it does not know, 0 where it is rendered already.
+    ``kept`` has the numbers of iterations that ``start`` has rendered and that are not yet in the
+    sums.
     """
 
     iterations_planned: int | None

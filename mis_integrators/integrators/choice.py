@@ -231,21 +231,22 @@ class Contest:
             spent = (counts[trial.plugin] - trial.done) * trial.cost
             budget = self.photons.seconds_left if self.seconds else budget - spent
 
-        def seen(trial):
+        def seen(trial, weights):
             """The `Trial` by its images."""
             cost = trial.session.iteration_seconds if self.seconds else trial.cost
             trial = replace(trial, done=counts[trial.plugin], cost=cost)
             count = trial.count(budget)
-            noise = noise_of_mean(images[trial.plugin], weights_by(*images.values()), count)
+            noise = noise_of_mean(images[trial.plugin], weights, count)
             parts = {name: (bias, count * noise[name]) for name, (bias, _) in trial.parts.items()}
             return replace(trial, parts=parts)
 
         if all(counts.values()):
             look(photons)
-            photons = seen(photons)
+            photons = seen(photons, weights_by(*images.values()))
             if alone.product(budget) < photons.product(budget):
                 look(alone)
-                alone, photons = seen(alone), seen(photons)
+                weights = weights_by(*images.values())
+                alone, photons = (seen(trial, weights) for trial in (alone, photons))
         return [alone, photons], budget
 
 

@@ -16,7 +16,8 @@ class KnownSession:
 
     def __init__(self, camera, light, both):
         self.deviations = camera, light, both
-        film = types.SimpleNamespace(crop_size=lambda: (SIZE, SIZE))
+        rfilter = types.SimpleNamespace(border_size=lambda: 0)
+        film = types.SimpleNamespace(rfilter=lambda: rfilter)
         self.sensor = types.SimpleNamespace(film=lambda: film)
 
     def start(self):
