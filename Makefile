@@ -5,7 +5,7 @@
 # make bench    set everything up, then compare all methods on all bundled scenes: out/bench/index.html (half an hour to three quarters)
 # make figures set everything up, then measure all figures of docs/results.md anew (two hours)
 # make lint     set everything up, then check style, layout and type hints
-# make gallery  set everything up, then render the pictures of docs/ (minutes)
+# make gallery  set everything up, then render the pictures of docs/ (half an hour)
 # make hero     set everything up, then render the pictures of README.md (half an hour)
 # make docs     set everything up, then build the documentation site: out/site/index.html
 
@@ -35,10 +35,12 @@ lint: $(VENV)/installed-test
 	$(VENV)/bin/python -m mypy
 
 gallery: $(VENV)/installed
+	$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check --editable '.[bench,denoise]'
 	@mkdir -p docs/images out
 	@for scene in scenes/*.xml; do name=$$(basename $$scene .xml); \
 	    $(VENV)/bin/mis-render $$scene -i bdpm_auto --seed 1 --time 60 -o out/$$name.exr && cp out/$$name.png docs/images/ || exit 1; done
 	PYTHON=$(VENV)/bin/python tools/plugin_pictures.sh
+	PYTHON=$(VENV)/bin/python tools/gallery.sh
 
 hero: $(VENV)/installed
 	$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check --editable '.[bench,denoise]'
