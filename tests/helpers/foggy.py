@@ -37,7 +37,7 @@ def view(origin, target=(0, 0, 0), size=SIZE, fov=36.0, kind="perspective", **ex
         "fov": fov,
         "to_world": look(origin, target, (0, 1, 0.01)),
         "film": film(size),
-        "sampler": {"type": "independent"},
+        "sampler": {"type": "multijitter"},
         **extra,
     }
 
@@ -80,7 +80,7 @@ def batch(views, size=SIZE, **film_options):
     return {
         "type": "batch",
         "film": whole,
-        "sampler": {"type": "independent"},
+        "sampler": {"type": "multijitter"},
         **{f"view{i}": v for i, v in enumerate(views)},
     }
 

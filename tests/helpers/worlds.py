@@ -370,7 +370,7 @@ def film(size=SIZE, rfilter="box", **extra):
 
 def sensor(kind="perspective", **film_options):
     pose = look((0, -1.5, 6), (0, 0, 0.4), (0, 1, 0))
-    result = {"type": kind, "film": film(**film_options), "sampler": {"type": "independent"}}
+    result = {"type": kind, "film": film(**film_options), "sampler": {"type": "multijitter"}}
     if kind == "orthographic":
         result["to_world"] = pose @ T().scale([1.65, 1.65, 1])
     else:

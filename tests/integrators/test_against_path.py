@@ -60,7 +60,6 @@ ROWS = [
     ("envmap rotated", "smooth1", 1, PERSPECTIVE, MONO, "box"),
 ]
 BY_DEFAULT = [
-    ("disk", "mixed2", 2, ORTHO, MONO, "tent"),
     ("constant", "mixed0", 1, ORTHO, SPECTRAL, "box"),
 ]
 

@@ -315,9 +315,7 @@ class SmallRadius(SmallRadiusBatches):
         self.sessions = [mi.load_dict(p).session(scene, seed=1, spp=0) for p in plugins]
 
 
-@pytest.mark.parametrize(
-    "name, strategies", one_in_each_row(sorted(SCENES), (2, 3), [("glass", 3)])
-)
+@pytest.mark.parametrize("name, strategies", one_in_each_row(sorted(SCENES), (2, 3)))
 def test_agrees_with_volpath(rgb, name, strategies):
     scene, visible = SCENES[name](), (0.02, 0.06)
     if name in ("sky", "sun"):

@@ -811,7 +811,7 @@ def test_no_light_leaks_around_a_corner(rgb):
     [
         {"type": "bdpm", "bdd": 0},
         {"type": "vcm"},
-        {"type": "bdpm_opt", "weights": "published", "strategies": 2},
+        *extended({"type": "bdpm_opt", "weights": "published", "strategies": 2}),
     ],
     ids=lambda plugin: plugin["type"],
 )

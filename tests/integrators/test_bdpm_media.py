@@ -118,7 +118,7 @@ def test_agrees_in_other_variants(variant_name):
 
 
 @pytest.mark.parametrize(
-    "max_depth, bdd", [(2, 0), *extended((1, 0), (2, 1), (3, 0), (1, 2), (3, 2))]
+    "max_depth, bdd", [*extended((2, 0), (1, 0), (2, 1), (3, 0), (1, 2), (3, 2))]
 )
 def test_depth_is_that_of_volpath(rgb, max_depth, bdd):
     """Boundaries do not count, half transparent ones included; what each depth adds is more than
@@ -217,7 +217,7 @@ def test_single_scattering_in_closed_form(rgb, albedo, g, bdd):
     assert_same(*collect_until(batches, exact, 0.03, 0.08), 0.03, 0.08, slack=2e-3)
 
 
-@pytest.mark.parametrize("bdd", [0, *extended(1, 3)])
+@pytest.mark.parametrize("bdd", extended(0, 1, 3))
 def test_furnace(rgb, bdd):
     """A medium that absorbs nothing cannot be told from an even sky."""
     batches = SmallRadiusBatches(cloud(1.0), 2, max_depth=-1, rr_depth=100, bdd=bdd)

@@ -602,8 +602,8 @@ def test_pyramid_adds_up(rgb):
 # emitter, family, sensor, variant, filter
 ROWS = [
     ("rectangle", "lambertian", "perspective", SPECTRAL, "box"),
-    ("several", "mixed1", "orthographic", RGB, "box"),
     *extended(
+        ("several", "mixed1", "orthographic", RGB, "box"),
         ("envmap rotated", "mixed2", "thinlens", RGB, "gaussian"),
         ("textured", "smooth0", "perspective", MONO, "tent"),
     ),

@@ -340,14 +340,6 @@ MERGING = {"merging": True, "initial_radius": 0.02}
         ("pcbpt", "plastic", "area", "perspective", 3, {"light_tracing": 4}),
         (
             "bdpt_ris",
-            "rough",
-            "area",
-            "thinlens",
-            3,
-            {"weights": "published", "target": "f_y_f_yz", "resamples": 4},
-        ),
-        (
-            "bdpt_ris",
             "bump",
             "constant",
             "perspective",
@@ -356,6 +348,14 @@ MERGING = {"merging": True, "initial_radius": 0.02}
         ),
         ("bdpt_ris", "rough", "area", "perspective", 3, MERGING),
         *extended(
+            (
+                "bdpt_ris",
+                "rough",
+                "area",
+                "thinlens",
+                3,
+                {"weights": "published", "target": "f_y_f_yz", "resamples": 4},
+            ),
             ("pcbpt", "plastic", "point", "thinlens", 2, MERGING),
             ("bdpt_ris", "bump", "constant", "perspective", 2, {}),
             ("bdpt_ris", "plastic", "point", "orthographic", 3, {"light_paths": 1}),
@@ -616,8 +616,10 @@ def test_agrees(name, emitter, family, sensor, variant_name, parameters):
 @pytest.mark.parametrize(
     "name, emitter, family, sensor",
     [
-        ("bdpt_ris", "rectangle", "mixed0", "thinlens"),
-        *extended(("pcbpt", "spot", "smooth1", "perspective")),
+        *extended(
+            ("bdpt_ris", "rectangle", "mixed0", "thinlens"),
+            ("pcbpt", "spot", "smooth1", "perspective"),
+        ),
     ],
 )
 def test_merging_agrees(rgb, name, emitter, family, sensor):

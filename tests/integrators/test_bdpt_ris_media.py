@@ -47,8 +47,8 @@ there."""
 @pytest.mark.parametrize(
     "name, scene, parameters",
     [
-        ("bdpt_ris", "grid", {"target": "f_y_f_yz", "resamples": 2}),
         *extended(
+            ("bdpt_ris", "grid", {"target": "f_y_f_yz", "resamples": 2}),
             ("pcbpt", "coloured", {"light_paths": 50}),
             *(("bdpt_ris", name, {}) for name in ("glass", *MORE)),
             ("pcbpt", "half the light", {"light_paths": 10, "cache_neighbors": 1}),

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from comparing import grey_pictures, in_one_thread
 from pilots import knowing
+from selection import extended
 from worlds import T, film, look
 
 SIZE = 24
@@ -154,11 +155,13 @@ def test_weights_sum_to_one():
 
 CASES = [
     ("diffuse", "lamp", {"bdd": 0}),
-    ("glossy", "lamp", {"bdd": 1}),
     ("glossy", "sky and lamp", {"bdd": 1, "direct_paths": 4}),
-    ("diffuse", "sky", {"bdd": 1, "camera_paths": 2}),
-    ("diffuse", "sky", {"bdd": 0, "denoised": False}),
     ("narrow", "sky and lamp", {"bdd": 0, "denoised": False}),
+    *extended(
+        ("glossy", "lamp", {"bdd": 1}),
+        ("diffuse", "sky", {"bdd": 1, "camera_paths": 2}),
+        ("diffuse", "sky", {"bdd": 0, "denoised": False}),
+    ),
 ]
 BATCHES = 16
 
@@ -180,7 +183,7 @@ def test_means_are_those_of_path(floor, lights, parameters):
 
 @pytest.mark.parametrize(
     ("inside", "lights", "denoised"),
-    [(LIQUID, "lamp", True), (MILK, "sky and lamp", True), (MILK, "lamp", False)],
+    [(LIQUID, "lamp", True), *extended((MILK, "sky and lamp", True), (MILK, "lamp", False))],
 )
 def test_means_are_those_of_volpath(inside, lights, denoised):
     """The same where the ball has a liquid inside."""
@@ -308,9 +311,10 @@ def test_light_is_of_the_class_of_caustics():
     assert layer["c"].mean() > 0.5 * image[..., 0].mean()
 
 
-@pytest.mark.parametrize("floor", ["diffuse", "glossy"])
-@pytest.mark.parametrize("name", ["lamp", "sky and lamp"])
+@pytest.mark.thinned(2, 1, 2)
 @pytest.mark.parametrize("denoised", [False, True])
+@pytest.mark.parametrize("name", ["lamp", "sky and lamp"])
+@pytest.mark.parametrize("floor", ["diffuse", "glossy"])
 def test_photons_tell_how_noisy_paths_are(name, floor, denoised):
     """The second moment of what a camera path brings that meets lights by chance, of which photons
     know, is that of `path`, to which all light comes through the pane. Three iterations of a pilot

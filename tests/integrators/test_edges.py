@@ -54,9 +54,9 @@ HALF_METAL = {
     "objects, more",
     [
         ({}, {"camera_paths": 2}),
-        ({"ball": GLASS}, {}),
         ({"material": HALF_METAL}, {}),
         *extended(
+            ({"ball": GLASS}, {}),
             ({}, {"direct_paths": 3}),
             ({"floor": COAT}, {}),
         ),
@@ -81,6 +81,7 @@ def test_without_it_legs_are_dark(merged):
     assert mean(pass_narrow=False) < 0.95 * mean(pass_narrow=True)
 
 
+@pytest.mark.extended
 def test_in_fog(merged):
     """As of `volpath`: volume photons light the legs, too."""
     fog = {

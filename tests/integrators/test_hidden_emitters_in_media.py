@@ -89,7 +89,7 @@ def test_photons_along_beams(bdd):
     bdpm_agrees(hidden_lamps(), **hiding(bdd=bdd, direct_paths=3))
 
 
-@pytest.mark.parametrize("bdd", [1, *extended(0)])
+@pytest.mark.parametrize("bdd", extended(0, 1))
 def test_photons_joined_with_the_sensor(bdd):
     joined_agrees(hidden_lamps(), **hiding(bdd=bdd))
 
@@ -112,8 +112,10 @@ def alpha(session, iterations):
 @pytest.mark.parametrize(
     "made",
     [
-        lambda scene: bdpt(**hiding()).session(scene, seed=1, spp=0),
-        *extended(lambda scene: bdpm(**hiding(initial_radius=0.1)).session(scene, seed=1, spp=0)),
+        *extended(
+            lambda scene: bdpt(**hiding()).session(scene, seed=1, spp=0),
+            lambda scene: bdpm(**hiding(initial_radius=0.1)).session(scene, seed=1, spp=0),
+        ),
         lambda scene: joined(scene, **hiding()),
     ],
     ids=["bdpt", "beams", "joined"],

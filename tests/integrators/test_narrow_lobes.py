@@ -176,9 +176,12 @@ def narrow_box(coat):
 @pytest.mark.parametrize(
     "coat, bdd, more",
     [
-        ("plastic", 0, {"direct_paths": 3}),
         ("principled", 0, {"camera_paths": 4}),
-        *extended(("plastic", 1, {"camera_paths": 2}), ("principled", 1, {})),
+        *extended(
+            ("plastic", 0, {"direct_paths": 3}),
+            ("plastic", 1, {"camera_paths": 2}),
+            ("principled", 1, {}),
+        ),
     ],
 )
 def test_means(rgb, coat, bdd, more):

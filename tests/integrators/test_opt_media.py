@@ -242,7 +242,7 @@ class SmallRadius(SmallRadiusBatches):
 
 @pytest.mark.parametrize(
     "name, strategies",
-    one_in_each_row(sorted(SCENES), (2, 3), [("glass", 3)]),
+    one_in_each_row(sorted(SCENES), (2, 3)),
 )
 def test_agrees_with_volpath(rgb, name, strategies):
     """The radii are twice those of other tests: a ball of this size has few photons."""

@@ -184,8 +184,8 @@ def test_three_weights_of_a_path_sum_to_one(variant_name, family, emitter):
 @pytest.mark.parametrize(
     "emitter, family, parameters, variant_name",
     [
-        ("rectangle", "mixed0", {"strategies": 2}, RGB),
         *extended(
+            ("rectangle", "mixed0", {"strategies": 2}, RGB),
             # Few light sub-paths: with more the denominators are near zero, and fireflies hide all.
             ("rectangle", "lambertian", {"strategies": 3, "photon_count": 1000}, RGB),
             ("constant", "lambertian", {"strategies": 2, "first_vertex": 1}, SPECTRAL),

@@ -155,6 +155,7 @@ def test_small_balls_are_as_bright_as_they_should_be(corrected):
     assert indirect_light(room_with(ball=ball), 0.4, corrected) == pytest.approx(1, rel=0.14)
 
 
+@pytest.mark.thinned(2, 1, 2)
 @pytest.mark.parametrize("corrected, lacks", [(False, 0.37), (True, 0.0)])
 @pytest.mark.parametrize(
     "bsdf", [{"type": "diffuse"}, {"type": "roughconductor", "alpha": 0.5}], ids=["matte", "metal"]
