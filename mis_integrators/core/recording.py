@@ -5,6 +5,7 @@ import contextlib
 import functools
 import gc
 import sys
+import threading
 import time
 
 import drjit as dr
@@ -34,7 +35,8 @@ def undisturbed():
     """Other threads of Python run before and after, not in between. Dr.Jit 1.5 holds its own lock
     while a recorded call traverses its arguments with Python; a thread that gets its turn then, and
     touches an array (of a finished image, say), never hands it back."""
-    time.sleep(0)  # who waits already has its turn now
+    if threading.active_count() > 1:
+        time.sleep(0)  # who waits already has its turn now
     before = sys.getswitchinterval()
     sys.setswitchinterval(max(before, UNDISTURBED))
     try:

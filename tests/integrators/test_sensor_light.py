@@ -52,7 +52,7 @@ def agree(scene, max_depth=6, whole=0.02, block=0.06, **parameters):
 
 # --- Means ----------------------------------------------------------------------------------------
 
-USUAL = (("coloured", 1),)
+USUAL = ("coloured", 1), ("glass", 1)
 """Of `SCENES` and values of `bdd`, those of the default run."""
 
 
