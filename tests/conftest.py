@@ -8,7 +8,6 @@ from pathlib import Path
 
 import mis_integrators  # noqa: F401  before mitsuba: it chooses the LLVM
 
-import comparing
 import drjit
 import mitsuba as mi
 import pytest
@@ -16,8 +15,6 @@ import pytest
 BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
 LEFT_OUT = "extended", "full"
 """Markers of what the default run leaves out."""
-COARSER = 1.5
-"""The default run sees errors of means from 1.5 % on, where the others see 1 % (`comparing`)."""
 MOST_LANES = 8
 """Numbers that a kernel computes at once, in tests."""
 VARIANTS = ("llvm_ad_rgb", "llvm_ad_mono", "llvm_ad_spectral", "cuda_ad_rgb")
@@ -102,7 +99,6 @@ def pytest_addoption(parser):
 
 
 def pytest_configure(config):
-    comparing.coarser = 1.0 if config.option.markexpr else COARSER
     config.addinivalue_line(
         "markers",
         "strategies(*K): the numbers of strategies of the discrete worlds that a test is for",

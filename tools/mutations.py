@@ -304,7 +304,7 @@ MUTATIONS = [
         "return (alike > 0) & (dr.square(alike)",
         "return (alike == alike) & (dr.square(alike)",
         "sheets back to back share their photons",
-        f"{BDPM}::test_sheets_that_let_light_through_keep_their_photons",
+        "tests/photons/test_curvature.py::test_the_back_of_a_thin_sheet_is_another_surface",
     ),
     Mutation(
         "photons/grid.py",

@@ -12,8 +12,7 @@ always or never.
 Power: `assert_same` refuses to judge with too few samples. It demands that an error of 1 % of the
 energy of the whole image, or of 3 % in a block of it, would be seen with a probability of 0.95
 (`smallest_visible`); `collect_until` renders until that holds. `test_comparing.py` shows it by
-injecting such errors. The default run, `make test`, is content with errors `coarser` times as
-large, in less than half of the rendering.
+injecting such errors.
 
 (This module is not called `statistics`: pytest puts the folder of the tests first on the import
 path.)
@@ -38,8 +37,6 @@ FALSE_ALARM = 1e-6
 POWER = 0.95
 WHOLE, BLOCK = 0.01, 0.03
 """Relative errors that a comparison must see, over the whole image and in a block."""
-coarser = 1.0
-"""Such errors may be so many times larger in this run (`conftest.py` sets it)."""
 
 
 # --- Distributions (no SciPy) -------------------------------------------------
@@ -193,11 +190,9 @@ def differences(a: Estimate, b: Estimate, false_alarm=FALSE_ALARM, slack=1e-5) -
 def assert_powerful(a: Estimate, b: Estimate, whole=WHOLE, block=BLOCK):
     """Fails if the comparison would miss an error of `whole` in the image or of `block` in a
     block."""
-    visible = smallest_visible(a, b) / coarser
-    assert visible[0] <= whole, f"test too weak: sees {coarser * visible[0]:.2%} of the whole image"
-    assert (visible[1:] <= block).all(), (
-        f"test too weak: sees {coarser * visible[1:].max():.2%} of a block"
-    )
+    visible = smallest_visible(a, b)
+    assert visible[0] <= whole, f"test too weak: sees {visible[0]:.2%} of the whole image"
+    assert (visible[1:] <= block).all(), f"test too weak: sees {visible[1:].max():.2%} of a block"
 
 
 def assert_same(a: Estimate, b: Estimate, whole=WHOLE, block=BLOCK, slack=1e-5):
@@ -206,11 +201,6 @@ def assert_same(a: Estimate, b: Estimate, whole=WHOLE, block=BLOCK, slack=1e-5):
     found = differences(a, b, slack=slack)
     assert not found, "\n".join(found[:12])
     assert_powerful(a, b, whole, block)
-
-
-def enough(count: int) -> int:
-    """So many batches for errors as they are to be seen, fewer where they may be `coarser`."""
-    return max(math.ceil(count / coarser**2), 8)
 
 
 # --- Renders ------------------------------------------------------------------
@@ -351,7 +341,7 @@ def collect_until(a, b, whole=WHOLE, block=BLOCK, start=16, most=1024):
             side.add(start)
     while True:
         estimates = [side if isinstance(side, Estimate) else side.estimate() for side in (a, b)]
-        visible = smallest_visible(*estimates) / coarser
+        visible = smallest_visible(*estimates)
         need = max(visible[0] / whole, visible[1:].max(initial=0) / block)
         if need <= 0.97:
             return estimates

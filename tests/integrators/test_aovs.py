@@ -21,7 +21,6 @@ from comparing import (
     assert_same,
     block_means,
     differences,
-    enough,
     in_one_thread,
     pictures,
 )
@@ -361,7 +360,7 @@ def test_split_is_that_of_paths(rgb, of_paths, plugin):
     against camera paths that know nothing but BSDFs. False alarms: 1e-6 a class. What would be
     seen, of direct light, indirect light and caustics: 5, 15 and 10 % in the image."""
     visible = (0.05, 0.12), (0.15, 0.9), (0.1, 0.4)
-    for k, mine in enumerate(split_batches(plugin, tray("delta", "constant"), enough(40))):
+    for k, mine in enumerate(split_batches(plugin, tray("delta", "constant"), 40)):
         assert_same(mine, of_paths[k], *visible[k])
 
 

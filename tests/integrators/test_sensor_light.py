@@ -61,8 +61,6 @@ def test_agrees_with_volpath(name, bdd):
     """Glass: beams behind it, and light that is seen through it. Within the fog: the zone close to
     the sensor. (Of the light sub-paths from a sky, few meet the cube.)"""
     visible, more = (0.02, 0.06), {}
-    if name == "glass":  # what is seen behind it is little
-        visible = (0.013, 0.04)
     if name in ("sky", "sun"):
         visible = (0.05, 0.15)
     if "within" in name:  # all pixels see the few photons that are close to the sensor

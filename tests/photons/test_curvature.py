@@ -1,5 +1,7 @@
 """Merge disks on curved surfaces."""
 
+from types import SimpleNamespace
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -144,6 +146,16 @@ def test_instances_of_meshes_count_as_flat(ball_of_triangles):
     ray = mi.Ray3f(mi.Point3f(0.05, 0.1, 5), mi.Vector3f(0, 0, -1))
     si = scene.ray_intersect_preliminary(ray).compute_surface_interaction(ray, FLAGS)
     assert float(bounded(si, mi.Float(20.0))[0]) == 20
+
+
+def test_the_back_of_a_thin_sheet_is_another_surface(rgb):
+    """Whatever light reaches both sides of one that is bent: photons merge up to 45 degrees."""
+    from mis_integrators.photons.gather import same_surface
+
+    angle = np.radians([0, 44, 46, 90, 150, 180])
+    normals = 3 * mi.Vector3f(np.array([np.sin(angle), 0 * angle, np.cos(angle)], np.float32))
+    alike = same_surface(SimpleNamespace(n=normals), mi.Vector3f(0, 0, 1))
+    np.testing.assert_array_equal(alike, angle < np.pi / 4)
 
 
 @pytest.mark.parametrize("corrected", [False, True])
