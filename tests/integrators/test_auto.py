@@ -447,6 +447,7 @@ def prices_over_seconds():
     """What an iteration of photons and one of `path` are taken to cost in a render of a given time,
     over the seconds that they take (the least of three)."""
     from mis_integrators.core.clock import now
+    from mis_integrators.integrators import choice
 
     scene = tray("lambertian", "rectangle")
 
@@ -460,14 +461,14 @@ def prices_over_seconds():
         return min(taken)
 
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-        session = auto().session(scene)
-        session.plan_time(5.0)
-        session.start()
-        decision = session.decision
-        path = next(trial for trial in decision.trials if trial.plugin == "path")
+        render = auto(), scene, scene.sensors()[0], 0, None
+        path, photons = (choice.new_session(plugin, *render) for plugin in ("path", "bdpm"))
+        photons.plan_time(5.0)
+        photons.predict()
+        (path, _), _, usual = choice.Contest(path, photons, None, 5.0).weigh()
         photons = mi.load_dict({"type": "bdpm", "bdd": 0, "max_depth": 4}).session(scene, spp=0)
         paths = Unidirectional(camera_paths=0).session(scene, 0, 0, None)
-        return decision.usual_cost / seconds_of(photons), path.cost / seconds_of(paths)
+        return usual / seconds_of(photons), path.cost / seconds_of(paths)
 
 
 def test_prices_are_what_candidates_take(rgb):

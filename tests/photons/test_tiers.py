@@ -134,7 +134,7 @@ def test_tiers_bring_what_brute_force_finds(rgb, up, left):
     queries = on_floor(rng, m)[:, axes]
     ray = mi.Ray3f(mi.Point3f((queries + up).T.copy()), -mi.Vector3f(*up))
     vertices = vertices_at(scene, ray, m)
-    first = RADIUS * rng.uniform(0.3, 3.5, m) if left else np.full(m, RADIUS)
+    first = RADIUS * rng.uniform(0.3, 6, m) if left else np.full(m, RADIUS)
     (found,) = gather_tiers(TieredMap(built.arrays(), box, n), vertices, mi.Float(first), 10.0, -1)
     distance = np.linalg.norm(queries[:, None] - points[None], axis=-1)
     radii = np.where(tiers == 0, np.float32(first)[:, None], RADIUS * 2.0**tiers)
