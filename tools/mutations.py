@@ -335,6 +335,20 @@ MUTATIONS = [
         TIERS,
     ),
     Mutation(
+        "paths/ray_cones.py",
+        "refracted = (spread + turned) * inverse - turned",
+        "refracted = (spread + turned) * inverse",
+        "a boundary of glass bends cones as if it was flat behind",
+        f"{PIXEL_DISKS}::test_cones_meet_in_the_focus",
+    ),
+    Mutation(
+        "paths/ray_cones.py",
+        "return dr.select(magnified, 0, plain)",
+        "return plain",
+        "pixels behind a magnifying glass share the photons of narrow disks",
+        f"{PIXEL_DISKS}::test_light_behind_a_magnifying_glass_has_disks_as_wide_as_elsewhere",
+    ),
+    Mutation(
         "photons/tiers.py",
         "disk = dr.select(number > 0, radius, first)",
         "disk = radius",

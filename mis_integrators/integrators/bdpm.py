@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from ..core.film import as_camera_weights, expected_weight, with_colour
 from ..core.recording import recorder
+from ..paths.bent_surfaces import may_magnify
 from ..paths.camera import film_sample_count, film_size
 from ..paths.layers import CHANNELS, SPLIT
 from ..paths.lobes import NarrowSurfaces
@@ -245,7 +246,10 @@ class BDPMSession(PhotonPasses):
         if integrator.pass_narrow and self.has_indirect:
             self.narrow = NarrowSurfaces.of(self.scene)
         self.has_caustics_unseen = self.has_caustics and (
-            self.cones is None or integrator.bdd > 0 or self.narrow is not None
+            self.cones is None
+            or integrator.bdd > 0
+            or self.narrow is not None
+            or may_magnify(self.scene)
         )
         self.by_chance = (
             self.has_caustics

@@ -12,6 +12,7 @@ import mitsuba as mi
 from ..core.film import splat_light, splat_samples
 from ..core.packing import with_reserve
 from ..mis.chance import ChanceWeights, StartDensity, second_moment
+from ..paths.bent_surfaces import FLAGS
 from ..paths.light_classes import LightClasses, by_class_of_photons
 from ..paths.sensor import Lens
 from ..photons.beams import Beams, gather_along, mean_count_along, read_beams
@@ -19,7 +20,6 @@ from ..photons.coverage import Edges, coverage
 from ..photons.curvature import bounded
 from ..photons.disk_walls import read_coverage
 from ..photons.gather import (
-    FLAGS,
     QueryVertices,
     gather_photons,
     gather_seen,

@@ -1,7 +1,9 @@
 """How wide a pixel is where a camera path meets a surface: ray cones.
 
-A path is a thin cone (Amanatides 1984, Ray tracing with cones), as wide as a pixel. It has a
-`width`, and grows by its `spread` per distance. What mirrors and lenses do to it is left out.
+A path is a thin cone (Amanatides 1984, Ray tracing with cones), as wide as a pixel. It has a width,
+and grows by its spread per distance. Mirrors and boundaries of glass that are bent change the
+spread, along each of their two curvatures. So there are three cones: one as if nothing was bent,
+and one along each.
 """
 
 from __future__ import annotations
@@ -9,7 +11,12 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from .bent_surfaces import curvatures
 from .camera_rays import axis_of
+
+MAGNIFIED = 0.8
+"""Tuned: where a pixel is narrower than this share of its width without lenses, as in a pool under
+waves, near pixels would share the photons of any disk. (With 0.5 a pool has rings of blotches.)"""
 
 
 class RayCones:
@@ -31,18 +38,40 @@ class RayCones:
         return [self.axis, self.width, self.spread]
 
     def begin(self):
-        """A cone: its width, and its spread, which the first segment tells."""
-        return [mi.Float(self.width), mi.Float(0)]
+        """Three cones: widths, and spreads, which the first segment tells."""
+        return 3 * [mi.Float(self.width), mi.Float(0)]
 
     def grown(self, cone, d, distance, first, active):
-        """The cone so much further in direction `d`; `first`: along a path's first segment."""
-        width, spread = cone
-        cosine = dr.abs(dr.dot(d, self.axis))
-        spread = dr.select(first, self.spread * _falling_off(cosine), spread)
-        return [dr.select(active, width + spread * distance, width), spread]
+        """The cones so much further in direction `d`; `first`: along a path's first segment."""
+        own = self.spread * _falling_off(dr.abs(dr.dot(d, self.axis)))
+        after = []
+        for width, spread in zip(cone[::2], cone[1::2]):
+            spread = dr.select(first, own, spread)
+            after += [dr.select(active, width + spread * distance, width), spread]
+        return after
+
+    def bent(self, cone, si, towards, bs, active):
+        """The cones behind a mirror or a boundary of glass, seen from `towards`, where a path goes
+        on by the sample `bs`. To first order in their width, at normal incidence: on a curvature k
+        the normals of a width w spread by k w. A mirror adds twice that to the spread s; behind a
+        boundary of relative index e it is (s + k w) / e - k w."""
+        mirrors, inverse = si.wi.z * bs.wo.z > 0, dr.rcp(bs.eta)
+        after = list(cone[:2])
+        for curvature, width, spread in zip(curvatures(si, towards), cone[2::2], cone[3::2]):
+            turned = curvature * width
+            refracted = (spread + turned) * inverse - turned
+            found = dr.select(mirrors, spread + 2 * turned, refracted)
+            after += [width, dr.select(active, found, spread)]
+        return after
+
+    def pixel_width(self, cone):
+        """How wide a pixel is, without what bends its cones; 0 where these are `MAGNIFIED`."""
+        plain, across, along = cone[::2]
+        magnified = dr.abs(across * along) < dr.square(MAGNIFIED * plain)
+        return dr.select(magnified, 0, plain)
 
     def arrived(self, cone, at, active):
-        """The cone at what it has met (a `CameraArrival`)."""
+        """The cones at what they have met (a `CameraArrival`)."""
         return self.grown(cone, at.ray.d, at.si.t, at.depth == 1, active)
 
 

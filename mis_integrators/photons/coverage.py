@@ -15,9 +15,10 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.random import vertex_streams
+from ..paths.bent_surfaces import FLAGS
 from .curvature import LEAST_LEFT, bend, bounded
 from .disk_walls import Coverage, DiskWalls, with_wall
-from .gather import FLAGS, SAME_SURFACE_COSINE, within_disk
+from .gather import SAME_SURFACE_COSINE, within_disk
 
 PROBES = 8
 """Tuned: probe rays of a merge disk."""
@@ -77,7 +78,7 @@ def probed(scene, vertices, si, radius, seed, active):
     """Estimated share of the disk of `radius` around each vertex that lies on surface seen from
     just above the vertex and like its own (same tests as for photons), and the `DiskWalls` there.
     Where the surface is curved, so is the disk. `vertices` as of `read_queries`, `si` their surface
-    interactions, found with `gather.FLAGS`; width as theirs.
+    interactions, found with `bent_surfaces.FLAGS`; width as theirs.
 
     A probe that slips past its place in the disk lands further out, on a step down, say, whose
     photons count. So it stands for the point of that height right above or below its place."""

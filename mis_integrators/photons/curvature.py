@@ -13,6 +13,7 @@ from typing import NamedTuple
 import drjit as dr
 import mitsuba as mi
 
+from ..paths.bent_surfaces import derivatives
 from .gather import SAME_SURFACE_COSINE
 
 LEAST_LEFT = 0.25
@@ -29,31 +30,10 @@ def most_bent():
     return math.sqrt(2 * (1 - SAME_SURFACE_COSINE))
 
 
-def derivatives(si):
-    """Of position and normal, pairs, by each of two parameters of the surface.
-
-    The normals of Mitsuba's meshes are derived by barycentric coordinates, as if they were not
-    flipped, and their positions by coordinates of textures: here these are edges of the triangle,
-    too. An instance of a mesh counts as flat, for its edges are not known in the world.
-    """
-    mesh = si.shape.is_mesh() & si.is_valid()
-    here = mesh & (si.instance == dr.zeros(mi.ShapePtr))
-    triangle = mi.MeshPtr(si.shape)
-    corners = [
-        triangle.vertex_position(index, here)
-        for index in triangle.face_indices(si.prim_index, here)
-    ]
-    edges = [corner - corners[0] for corner in corners[1:]]
-    flipped = here & (dr.dot(dr.cross(*edges), si.n) < 0)
-    sign = dr.select(flipped, -1, dr.select(mesh & ~here, 0, 1))
-    given = ((si.dp_du, si.dn_du), (si.dp_dv, si.dn_dv))
-    return [(dr.select(here, edge, dp), sign * dn) for edge, (dp, dn) in zip(edges, given)]
-
-
 def bounded(si, radius):
     """The radius of a merge disk around surface interactions that know how their normals turn
-    (`gather.FLAGS`): no more than `most_bent` radii of curvature, the least of those along the
-    surface's parameters."""
+    (`bent_surfaces.FLAGS`): no more than `most_bent` radii of curvature, the least of those along
+    the surface's parameters."""
     bent = [
         dr.squared_norm(dn) * dr.rcp(dr.maximum(dr.squared_norm(dp), 1e-30))
         for dp, dn in derivatives(si)

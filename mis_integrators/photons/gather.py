@@ -11,6 +11,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.traits import lookup
+from ..paths.bent_surfaces import FLAGS
 from ..paths.lobes import even_bound, even_part
 from ..paths.subpaths import vertex_bsdf_of
 from ..paths.vertex import SMALLEST_COSINE, per_projected, upright
@@ -31,8 +32,6 @@ OFF_SHEET = 0.1
 """Tuned: photons further from the vertex' sheet than this share of the radius are on another one,
 such as the next slat of a blind, and must be seen. (Without that the blinds of an office are 1.8
 times too bright.)"""
-FLAGS = mi.RayFlags.All | mi.RayFlags.dNSdUV
-"""What is found out about the surface at a vertex: how its normals turn, too."""
 LARGEST_COSINE_RATIO = 4.0
 """Tuned: bound on shading over geometric cosine of a photon's direction, which grazing light on
 smoothed meshes would exceed."""

@@ -15,6 +15,7 @@ from ..core.power_heuristic import mis_power
 from ..core.recording import lanes
 from ..core.records import Layout
 from ..core.spectra import channel_mean
+from ..paths.bent_surfaces import FLAGS
 from ..paths.camera import trace_camera, whole_or_nothing
 from ..paths.light_classes import class_of, scattered_history, start_of_camera_path
 from ..paths.lobes import EVEN, even_bound, even_part
@@ -88,9 +89,10 @@ def new_vertex_buffer(capacity, weighted=False, split=False, cones=False, hits=F
     """Room for `capacity` camera vertices, a dictionary: `words` (records of `query_layout`; unused
     ones are zero), if `weighted`, `weights` (records of `weight_layout`), and if light is `split`
     into classes, `first`: whether the path has scattered smoothly nowhere before. With `cones`,
-    `pixel`: how wide a pixel is there; 0 where the path has scattered smoothly before. With `hits`,
-    those of lights that are met by chance (records of `hits.chance_layout`; zero: none). With
-    `edges`, `coverage`: that of the merge disk (records of `disk_walls.coverage_layout`)."""
+    `pixel`: how wide a pixel is there; 0 where the path has scattered smoothly before, or lenses
+    magnify (`RayCones.pixel_width`). With `hits`, those of lights that are met by chance (records
+    of `hits.chance_layout`; zero: none). With `edges`, `coverage`: that of the merge disk (records
+    of `disk_walls.coverage_layout`)."""
     buffer = {"words": dr.zeros(mi.UInt32, query_layout().words * capacity)}
     if weighted:
         buffer["weights"] = weight_layout().room(capacity)
@@ -536,7 +538,7 @@ class QueryVisitor:
         if self.classes is not None:
             dr.scatter(store.vertices["first"], state["history"][0] == 0, slot, wants)
         if state["cone"]:
-            width = dr.select(state["met"], 0, state["cone"][0])
+            width = dr.select(state["met"], 0, queries.cones.pixel_width(state["cone"]))
             dr.scatter(store.vertices["pixel"], width, slot, wants)
         if queries.edges is not None:
             share, walls = at.coverage
@@ -553,6 +555,10 @@ class QueryVisitor:
         elif self.passes_masks:
             active &= vertex <= self.bdd
         scattered = active & ~delta
+        if state["cone"]:
+            specular = active & delta & ~state["met"]
+            si = at.hit.compute_surface_interaction(at.ray, FLAGS, specular)
+            state["cone"] = self.queries.cones.bent(state["cone"], si, at.towards, bs, specular)
         if state["left"]:
             cosine = dr.abs(dr.dot(at.si.n, at.si.to_world(bs.wo)))
             # Light that reaches places in media is that of volume photons alone.

@@ -95,6 +95,56 @@ def test_cones_are_as_wide_as_pixels(kind):
         np.testing.assert_allclose(np.array(cone[0] + 0 * x), np.sqrt(area), rtol=0.01)
 
 
+@pytest.mark.parametrize("outside", [True, False])
+def test_curvatures_are_those_of_a_cylinder(outside):
+    """Along it none, and around it one over its radius: convex from outside, concave within."""
+    from mis_integrators.paths.bent_surfaces import FLAGS, curvatures
+
+    scene = mi.load_dict({"type": "scene", "rod": {"type": "cylinder", "radius": 0.5}})
+    ray = mi.Ray3f([3, 0, 0.3] if outside else [0, 0, 0.3], [-1, 0, 0])
+    si = scene.ray_intersect(ray, FLAGS, mi.Bool(True))
+    found = sorted(float(k[0]) for k in curvatures(si, -ray.d))
+    np.testing.assert_allclose(found, [0, 2] if outside else [-2, 0], atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "eta, radius, focus", [(1.0, -2.0, 1.0), (1.5, 1.0, 3.0), (1.33, 4.0, 4 * 1.33 / 0.33)]
+)
+def test_cones_meet_in_the_focus(eta, radius, focus):
+    """Of a concave mirror, at half its radius; and behind a boundary of glass, at
+    radius e / (e - 1). What is in between is magnified, but the first fifth of the way."""
+    from mis_integrators.paths import ray_cones
+    from mis_integrators.paths.bent_surfaces import FLAGS
+
+    sensor = mi.load_dict(sensor_of("orthographic", 64, 80))
+    cones = ray_cones.RayCones(sensor)
+    ball = mi.load_dict({"type": "scene", "ball": {"type": "sphere", "radius": abs(radius)}})
+    ray = mi.Ray3f([0, 0, 0] if radius < 0 else [9, 0, 0], [-1, 0, 0])
+    si = ball.ray_intersect(ray, FLAGS, mi.Bool(True))
+    bs = mi.BSDFSample3f()
+    bs.eta, mirrors = mi.Float(eta), eta == 1
+    bs.wo = mi.Vector3f(0, 0, si.wi.z if mirrors else -si.wi.z)
+    cone = cones.bent(cones.begin(), si, -ray.d, bs, mi.Bool(True))
+    for share, seen in ((0.1, True), (0.3, False), (1.0, False), (1.7, False), (1.9, True)):
+        far = cones.grown(cone, ray.d, share * focus, mi.Bool(False), mi.Bool(True))
+        plain, across, along = (float(width[0]) for width in far[::2])
+        np.testing.assert_allclose([across, along], (1 - share) * plain, atol=1e-3 * plain)
+        assert (cones.pixel_width(far)[0] > 0) == seen
+
+
+def test_light_behind_a_magnifying_glass_has_disks_as_wide_as_elsewhere():
+    """A ball of glass close to the floor: what is seen through it asks for caustic photons of the
+    usual radius, not for those of pixels."""
+    glass = {"type": "sphere", "center": [0, 0, 0.7], "radius": 0.6}
+    glass |= {"bsdf": {"type": "dielectric"}}
+    scene = caustic_scene(leaf=glass, fov=5)  # sees nothing beside it
+    session = session_of(scene, 1000, radii=0.1, max_depth=6)
+    assert session.kinds() == ["seen_caustic", "caustic", "indirect"]
+    setting = session.pilot_setting()
+    trace = session.pilot_passes(setting, pilot_pixels(setting)).trace
+    assert np.mean(np.array(read_queries(trace(0).vertices)["pixel"]) == 0) > 0.5
+
+
 def test_widths_grow_through_boundaries():
     """Those of media, and masks that are passed: widths are as without them."""
     null = {"type": "cube", "to_world": mi.ScalarTransform4f().scale([9, 9, 4])}

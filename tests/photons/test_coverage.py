@@ -22,8 +22,8 @@ def scene_with(**shapes):
 def share_at(scene, x, height=0.5):
     """Covered shares of `COUNT` disks around the floor's point (x, 0, 0), seen from so high above
     it."""
+    from mis_integrators.paths.bent_surfaces import FLAGS
     from mis_integrators.photons.coverage import coverage  # of the active variant
-    from mis_integrators.photons.gather import FLAGS
 
     ray = mi.Ray3f(mi.Point3f(dr.full(mi.Float, x, COUNT), 0, height), mi.Vector3f(0, 0, -1))
     si = scene.ray_intersect_preliminary(ray).compute_surface_interaction(ray, FLAGS)

@@ -25,8 +25,8 @@ def _rgb(rgb):
     ],
 )
 def test_disks_are_no_wider_than_surfaces_are_bent(shape, radius):
+    from mis_integrators.paths.bent_surfaces import FLAGS
     from mis_integrators.photons.curvature import LEAST_LEFT, bounded, most_bent
-    from mis_integrators.photons.gather import FLAGS
 
     scene = mi.load_dict({"type": "scene", "shape": shape})
     ray = mi.Ray3f(mi.Point3f(0.05, 0.1, 5), mi.Vector3f(0, 0, -1))
@@ -116,8 +116,8 @@ def ball_of_triangles(tmp_path_factory):
 @pytest.mark.parametrize("kind", ["ply", "sphere"])
 def test_balls_are_bent_as_balls(ball_of_triangles, kind, flipped, height):
     """Whatever their texture coordinates, seen from outside and from within."""
+    from mis_integrators.paths.bent_surfaces import FLAGS
     from mis_integrators.photons.curvature import bend, bounded, most_bent
-    from mis_integrators.photons.gather import FLAGS
 
     radius = 0.5
     ball = {"type": kind, "flip_normals": flipped, "to_world": T().scale(radius)}
@@ -137,8 +137,8 @@ def test_balls_are_bent_as_balls(ball_of_triangles, kind, flipped, height):
 
 
 def test_instances_of_meshes_count_as_flat(ball_of_triangles):
+    from mis_integrators.paths.bent_surfaces import FLAGS
     from mis_integrators.photons.curvature import bounded
-    from mis_integrators.photons.gather import FLAGS
 
     group = {"type": "shapegroup", "ball": {"type": "ply", "filename": ball_of_triangles}}
     instance = {"type": "instance", "group": {"type": "ref", "id": "group"}}
