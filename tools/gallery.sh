@@ -10,10 +10,5 @@ grep '^    mis-render ' docs/gallery.md | while read -r _ arguments; do
     [ $# -eq 0 ] || [[ " $* " == *" $name "* ]] || continue
     # shellcheck disable=SC2086  # the arguments are words
     "$python" -m mis_integrators render $arguments --seed 1 </dev/null
-    "$python" -c "
-import sys
-from PIL import Image
-picture = Image.open(sys.argv[1]).convert('RGB')
-picture.save(sys.argv[2], quality=88, optimize=True, progressive=True)
-" "out/$name.denoised.png" "docs/images/gallery/$name.jpg"
+    "$python" tools/as_jpeg.py "out/$name.denoised.png" "docs/images/gallery/$name.jpg"
 done

@@ -12,12 +12,7 @@ compared() { # NAME OTHER SECONDS [OPTION...]
     shift 3
     "$python" -m mis_integrators render "$scenes/$name.xml" -i bdpm_auto --compare "$other" --denoise --time "$time" \
         -o "$out/$name.exr" "$@"
-    "$python" -c "
-import sys
-from PIL import Image
-picture = Image.open(sys.argv[1]).convert('RGB')
-picture.save(sys.argv[2], quality=88, optimize=True, progressive=True)
-" "$out/$name.compare.png" "docs/images/$name.jpg"
+    "$python" tools/as_jpeg.py "$out/$name.compare.png" "docs/images/$name.jpg"
 }
 
 # Photons within a distance of two pixels: path does not converge on caustics, seen through glass or not.

@@ -1000,7 +1000,7 @@ MUTATIONS = [
         "tests/integrators/test_bdpm.py::test_no_light_through_curved_sheets",
     ),
     Mutation(
-        "photons/curvature.py",
+        "paths/bent_surfaces.py",
         "(uu * v - uv * u) * dn_dv",
         "(uu * v - uv * u) * dn_du",
         "probes of covered disks look beside surfaces that are bent one way only",

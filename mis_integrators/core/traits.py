@@ -45,6 +45,13 @@ def scene_objects(root):
     return list(seen.values())
 
 
+def is_specular(bsdf):
+    """Whether a BSDF reflects or refracts into single directions. (What only lets light pass does
+    not.)"""
+    flag = mi.BSDFFlags
+    return bool(int(bsdf.flags()) & (int(flag.DeltaReflection) | int(flag.DeltaTransmission)))
+
+
 def used_shapes(scene):
     """Every shape of a scene, those of shape groups and what Mitsuba's loader has merged them into
     among them, each once."""
@@ -214,12 +221,12 @@ class MediaTraits:
     def __init__(self, scene, sensors):
         flag = mi.BSDFFlags
         others = (int(flag.Delta) | int(flag.Smooth)) & ~int(flag.Null)
-        flags = [int(bsdf.flags()) for bsdf in used_bsdfs(scene)]
+        bsdfs = used_bsdfs(scene)
+        flags = [int(bsdf.flags()) for bsdf in bsdfs]
         self.has_null_vertices = any(f & int(flag.Null) and f & others for f in flags)
         # Where all boundaries are plain, neither textures nor shading frames matter there.
         self.boundary_flags = mi.RayFlags.All if self.has_null_vertices else mi.RayFlags.Minimal
-        specular = int(flag.DeltaReflection) | int(flag.DeltaTransmission)
-        self.has_delta = any(f & specular for f in flags)
+        self.has_delta = any(map(is_specular, bsdfs))
         self.media = all_media(scene, sensors)
         self.has_grids = any(not m.is_homogeneous() for m in self.media)
         self.has_null_media = self.has_grids or any(_is_coloured(m) for m in self.media)

@@ -1,7 +1,9 @@
-"""How surfaces are bent: the derivatives of position and normal, and the curvatures."""
+"""How surfaces are bent: the second fundamental form, and the curvatures."""
 
 import drjit as dr
 import mitsuba as mi
+
+from ..core.traits import is_specular, used_shapes
 
 SAME_NORMAL = 1e-4
 """Normals that differ by less are the same, but for rounding."""
@@ -22,15 +24,9 @@ def may_magnify(scene):
         first, *others = [shape.vertex_normal(corner) for corner in corners]
         return all(dr.all(dr.norm(first - other) < SAME_NORMAL)[0] for other in others)
 
-    def is_specular(shape):
-        flags = 0 if shape.bsdf() is None else shape.bsdf().flags()
-        return mi.has_flag(flags, mi.BSDFFlags.DeltaReflection) or mi.has_flag(
-            flags, mi.BSDFFlags.DeltaTransmission
-        )
-
     return any(
-        shape.class_name() == "Instance" or (is_specular(shape) and not is_flat(shape))
-        for shape in scene.shapes()
+        shape.bsdf() is not None and is_specular(shape.bsdf()) and not is_flat(shape)
+        for shape in used_shapes(scene)
     )
 
 
@@ -55,17 +51,34 @@ def derivatives(si):
     return [(dr.select(here, edge, dp), sign * dn) for edge, (dp, dn) in zip(edges, given)]
 
 
+def second_form(si, frame):
+    """The second fundamental form (ss, st, tt) in a `frame` whose normal is that of the surface, or
+    its opposite: positive where the surface bends away from the side that the frame's normal points
+    to. `si` knows how normals turn (`FLAGS`); zero where its parameters are degenerate (do Carmo,
+    Differential Geometry of Curves and Surfaces, sections 3.2 and 3.3)."""
+    (dp_du, dn_du), (dp_dv, dn_dv) = derivatives(si)
+    uu, uv, vv = dr.squared_norm(dp_du), dr.dot(dp_du, dp_dv), dr.squared_norm(dp_dv)
+    determinant = uu * vv - dr.square(uv)
+    scale = dr.select(determinant > 0, dr.rcp(determinant), 0)
+
+    def turn(tangent):
+        u, v = dr.dot(tangent, dp_du), dr.dot(tangent, dp_dv)
+        return ((vv * u - uv * v) * dn_du + (uu * v - uv * u) * dn_dv) * scale
+
+    by_s, by_t = turn(frame.s), turn(frame.t)
+    forms = (
+        dr.dot(frame.s, by_s),
+        0.5 * (dr.dot(frame.s, by_t) + dr.dot(frame.t, by_s)),
+        dr.dot(frame.t, by_t),
+    )
+    side = dr.dot(frame.n, si.sh_frame.n)  # derivatives are those of the shading normal
+    return [dr.mulsign(form, side) for form in forms]
+
+
 def curvatures(si, towards):
-    """Both principal curvatures of a surface that knows how its normals turn (`RayFlags.dNSdUV`),
-    positive where it is convex as seen from `towards`; zero where its parameters are degenerate."""
-    (pu, nu), (pv, nv) = derivatives(si)
-    uu, uv, vv = dr.dot(pu, pu), dr.dot(pu, pv), dr.dot(pv, pv)
-    turn_uu, turn_vv = dr.dot(pu, nu), dr.dot(pv, nv)
-    turn_uv = 0.5 * (dr.dot(pu, nv) + dr.dot(pv, nu))
-    area = uu * vv - dr.square(uv)
-    inverse = dr.select(area > 0, dr.rcp(area), 0)
-    mean = 0.5 * inverse * (turn_uu * vv - 2 * turn_uv * uv + turn_vv * uu)
-    gaussian = inverse * (turn_uu * turn_vv - dr.square(turn_uv))
-    apart = dr.safe_sqrt(dr.square(mean) - gaussian)
-    facing = dr.sign(dr.dot(si.n, towards))
-    return facing * (mean + apart), facing * (mean - apart)
+    """Both principal curvatures, positive where the surface is convex as seen from `towards`;
+    `si` as of `second_form`."""
+    n = dr.mulsign(si.n, dr.dot(si.n, towards))
+    ss, st, tt = second_form(si, mi.Frame3f(n))
+    mean, apart = 0.5 * (ss + tt), dr.sqrt(dr.square(0.5 * (ss - tt)) + dr.square(st))
+    return mean + apart, mean - apart

@@ -39,7 +39,7 @@ class RayCones:
 
     def begin(self):
         """Three cones: widths, and spreads, which the first segment tells."""
-        return 3 * [mi.Float(self.width), mi.Float(0)]
+        return [mi.Float(value) for _ in range(3) for value in (self.width, 0)]
 
     def grown(self, cone, d, distance, first, active):
         """The cones so much further in direction `d`; `first`: along a path's first segment."""

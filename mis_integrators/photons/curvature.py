@@ -13,7 +13,7 @@ from typing import NamedTuple
 import drjit as dr
 import mitsuba as mi
 
-from ..paths.bent_surfaces import derivatives
+from ..paths.bent_surfaces import derivatives, second_form
 from .gather import SAME_SURFACE_COSINE
 
 LEAST_LEFT = 0.25
@@ -65,22 +65,5 @@ class Bend(NamedTuple):
 
 
 def bend(si, frame):
-    """The `Bend` at surface interactions as of `bounded`, whose normal that of the `frame` is, or
-    its opposite (do Carmo, Differential Geometry of Curves and Surfaces, sections 3.2 and 3.3)."""
-    (dp_du, dn_du), (dp_dv, dn_dv) = derivatives(si)
-    uu, uv, vv = dr.squared_norm(dp_du), dr.dot(dp_du, dp_dv), dr.squared_norm(dp_dv)
-    determinant = uu * vv - dr.square(uv)
-    scale = dr.select(determinant > 0, dr.rcp(determinant), 0)
-
-    def turn(tangent):
-        u, v = dr.dot(tangent, dp_du), dr.dot(tangent, dp_dv)
-        return ((vv * u - uv * v) * dn_du + (uu * v - uv * u) * dn_dv) * scale
-
-    by_s, by_t = turn(frame.s), turn(frame.t)
-    forms = (
-        dr.dot(frame.s, by_s),
-        0.5 * (dr.dot(frame.s, by_t) + dr.dot(frame.t, by_s)),
-        dr.dot(frame.t, by_t),
-    )
-    side = dr.dot(frame.n, si.sh_frame.n)  # derivatives are those of the shading normal
-    return Bend(frame, *(dr.mulsign(form, side) for form in forms))
+    """The `Bend` at surface interactions in a `frame`, both as of `second_form`."""
+    return Bend(frame, *second_form(si, frame))

@@ -12,6 +12,7 @@ from ..core.traits import (
     check_media,
     check_polarisation,
     check_variant,
+    is_specular,
     used_bsdfs,
 )
 from ..lights.environment_guide import infinite_emitters
@@ -24,11 +25,8 @@ class VolumeTraits(MediaTraits):
 
     def __init__(self, scene, sensors):
         super().__init__(scene, sensors)
-        flag = mi.BSDFFlags
-        bsdfs = used_bsdfs(scene)
-        flags = [int(b.flags()) for b in bsdfs]
-        specular = int(flag.DeltaReflection) | int(flag.DeltaTransmission)
-        self.has_mixed = any(f & specular and f & int(flag.Smooth) for f in flags)
+        bsdfs, smooth = used_bsdfs(scene), int(mi.BSDFFlags.Smooth)
+        self.has_mixed = any(is_specular(b) and int(b.flags()) & smooth for b in bsdfs)
         self.has_masks = any(b.class_name() == "MaskBSDF" for b in bsdfs)
         self.has_infinite_lights = bool(infinite_emitters(scene))
         media = self.media

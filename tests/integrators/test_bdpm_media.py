@@ -117,9 +117,7 @@ def test_agrees_in_other_variants(variant_name):
     agree_with_volpath(scene)
 
 
-@pytest.mark.parametrize(
-    "max_depth, bdd", [*extended((2, 0), (1, 0), (2, 1), (3, 0), (1, 2), (3, 2))]
-)
+@pytest.mark.parametrize("max_depth, bdd", extended((2, 0), (1, 0), (2, 1), (3, 0), (1, 2), (3, 2)))
 def test_depth_is_that_of_volpath(rgb, max_depth, bdd):
     """Boundaries do not count, half transparent ones included; what each depth adds is more than
     what is compared."""
