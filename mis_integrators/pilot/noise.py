@@ -102,13 +102,36 @@ def noise_by_radius(
     """
     variance = _means(weights * variance_left(samples))
     disks = np.count_nonzero(samples.mean(axis=2), axis=(0, 2)) if alike else None
-    floor = 0.0
-    if not photons_only:
-        told_apart = samples.shape[2] == GROUPS
-        own = _means(weights * own_variance_left(samples)) if told_apart else variance
-        floor = min(own.min(), variance.min())
-    photons = bounded_by_larger_disks(radii, variance, floor, disks) - floor
+    if photons_only:
+        return Noise(bounded_by_larger_disks(radii, variance, 0.0, disks) / light_paths, 0.0)
+    shared = np.zeros(len(radii))
+    if samples.shape[2] == GROUPS:
+        own = _means(weights * own_variance_left(samples))
+        shared, variance = shared_noise(radii, variance - own, own), own
+    floor = variance.min()
+    photons = bounded_by_larger_disks(radii, variance, floor, disks) - floor + shared
     return Noise(photons / light_paths, filter_share * floor)
+
+
+def shared_noise(radii: np.ndarray, shared: np.ndarray, own: np.ndarray) -> np.ndarray:
+    """F(R), the noise that near pixels share, by the law a + b / R^2 with no negative part.
+
+    What a pilot measures of it, `shared`, is the difference of two variances: its error is in
+    proportion to the noise of camera paths, `own`, and often larger than F itself. Taken as it is,
+    the error at large radii would count at small ones by the ratio of areas. So all radii tell of
+    the law, each by as much as it knows. The noise of photons that the camera sees falls with the
+    area of their disks (b); seen one vertex further, a pixel's paths meet so many disks that their
+    size matters little (a).
+    """
+    error = np.maximum(own, 1e-30)
+    terms = np.stack([np.ones(len(radii)), (radii[-1] / radii) ** 2], axis=-1)
+    fits = []
+    for used in ([0, 1], [0], [1]):
+        part, *_ = np.linalg.lstsq(terms[:, used] / error[:, None], shared / error, rcond=None)
+        if np.all(part >= 0):
+            fitted = terms[:, used] @ part
+            fits.append((np.sum(((shared - fitted) / error) ** 2), fitted))
+    return min(fits, key=lambda fit: fit[0])[1] if fits else np.zeros(len(radii))
 
 
 def _means(values: np.ndarray) -> np.ndarray:

@@ -123,7 +123,7 @@ def test_choice_is_nearly_the_best(edges, curvature, most, count):
     for seed in range(12):
         samples = of_one_group(pilot(3, seed, edges, noise, curvature))
         chosen = radius.best_radius(
-            [radius.error_by_radius(RADII, samples, np.ones(PIXELS), corrected=edges == 0)],
+            [radius.error_by_radius(RADII, samples, np.ones(PIXELS), smooth=edges == 0)],
             lambda r: count * np.ones_like(r),
         )
         ratios.append(true_error(chosen) / best)
