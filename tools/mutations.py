@@ -1125,4 +1125,18 @@ MUTATIONS = [
         "iterations that are rendered ahead are forgotten",
         "tests/integrators/test_film_trial.py::test_what_is_rendered_counts",
     ),
+    Mutation(
+        "pilot/noise.py",
+        "shared, variance = shared_noise(radii, variance - own, own), own",
+        "pass",
+        "the error of shared noise at large disks counts at small ones by the ratio of areas",
+        "tests/pilot/test_denoiser.py::test_few_iterations_tell_the_noise",
+    ),
+    Mutation(
+        "pilot/noise.py",
+        "for used in ([0, 1], [0], [1]):",
+        "for used in ([1],):",
+        "noise that near pixels share falls with the area of disks, wherever these are",
+        "tests/pilot/test_denoiser.py::test_few_iterations_tell_the_noise",
+    ),
 ]

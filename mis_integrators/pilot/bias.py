@@ -17,10 +17,12 @@ LEAST_BIAS, MOST_BIAS = 0.003, 1.0
 """Tuned: squared relative bias that disks of the ladder's largest radius can have, however little
 of it a short pilot sees. (In Cornell boxes, a corridor, rooms lit through a door or a window it is
 0.002 to 0.04.)"""
-LEAST_SMOOTH = 3e-4
-"""Tuned: the same of indirect light, whose estimates are corrected at edges (1e-4 to 1.6e-3 in
-Cornell boxes), or are made one vertex further, where blur averages out (1e-4 to 5e-4 in two Cornell
-boxes, a corridor, rooms lit through a door or a window)."""
+LEAST_CORRECTED = 1e-4
+"""Tuned: the same of estimates that are corrected at edges (1e-4 to 1.6e-3 in Cornell boxes)."""
+LEAST_DEEPER = 3e-4
+"""Tuned: the same of indirect light that is gathered one vertex further than the camera sees, where
+blur averages out (1e-4 to 5e-4 in two Cornell boxes, a corridor, rooms lit through a door or a
+window)."""
 MISFIT_OF_LAW = 0.15
 """Tuned: relative error of the law itself, beyond the noise of Q."""
 

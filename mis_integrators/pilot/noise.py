@@ -164,11 +164,13 @@ def bounded_by_larger_disks(
 
 
 def direct_variance(direct: np.ndarray, weights: np.ndarray) -> float:
-    """Variance, in an iteration, of light that does not come from photons; infinite where one
-    iteration tells nothing of it. `direct`: (iterations, groups, pixels)."""
+    """Variance, in an iteration, of light that near pixels do not share, as that of camera paths
+    alone; infinite where one iteration tells nothing of it. `direct`: (iterations, groups,
+    pixels)."""
     if len(direct) < 2:
         return trimmed_mean(weights * np.full(direct.shape[-1], np.inf))
-    return max(trimmed_mean(weights * variance_left(direct)), 0.0)
+    left = own_variance_left if direct.shape[-2] == GROUPS else variance_left
+    return trimmed_mean(weights * left(direct))
 
 
 def trimmed_mean(values: np.ndarray) -> float:

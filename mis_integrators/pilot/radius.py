@@ -14,11 +14,11 @@ Fitted
     bias^2(R) = c R^q, with q between 1 (the bias sits in strips of width R along edges) and 4 (it
     is curvature). Then Q is c R^q over a known constant. Few iterations do not tell c and q: all
     laws count, by how well they explain Q (`bias.expected_squared_bias`).
-Smooth light
-    At edges part of the disk holds no surface, and a plain estimate is too dark. Where the camera
-    sees indirect light, it is divided by the share of the disk that probe rays find covered. One
-    vertex further a pixel sees many disks, and their blur averages out. So little of its bias may
-    show: the laws begin at a smaller one.
+Indirect light
+    At edges part of the disk holds no surface, and a plain estimate is too dark. The corrected one
+    divides by the share of the disk that probe rays find covered. Where the camera does not see the
+    vertices that gather, a pixel has many disks, and their blur averages out. Little of the bias
+    may show then: the laws begin at a smaller one.
 Minimised
     bias^2(R) + V(R) / n(R) over R, where n(R) is the number of iterations that there will be:
     larger disks make an iteration dearer (`cost.py`). Where the camera sees the vertices that
@@ -33,7 +33,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .bias import LEAST_BIAS, LEAST_SMOOTH, expected_squared_bias, squared_difference
+from .bias import LEAST_BIAS, expected_squared_bias, squared_difference
 from .noise import Noise, noise_by_radius
 
 LADDER_STEPS = 7
@@ -106,7 +106,7 @@ def error_by_radius(
     alike: bool = False,
     light_paths: float = 1.0,
     filter_share: float = 1.0,
-    smooth: bool = False,
+    least_bias: float | None = None,
 ) -> ErrorByRadius:
     """The `ErrorByRadius` of estimates at the `radii` of the ladder. A ladder of one radius is
     given: its disks are so small that they do not blur.
@@ -119,8 +119,8 @@ def error_by_radius(
         Of the pixels' squared errors, see `noise.MEASURES`.
     photons_only, alike, light_paths, filter_share
         See `noise.noise_by_radius`.
-    smooth
-        Whether they are of indirect light.
+    least_bias
+        Squared, at the largest radius: `bias.LEAST_BIAS`, or another one.
     """
     fine = np.exp(np.linspace(np.log(radii[0]), np.log(radii[-1]), 16 * len(radii)))
     if not np.any(samples):
@@ -128,8 +128,8 @@ def error_by_radius(
     noise = noise_by_radius(radii, samples, weights, photons_only, alike, light_paths, filter_share)
     blur = np.zeros(len(fine))
     if len(radii) > 1:
-        least = LEAST_SMOOTH if smooth else LEAST_BIAS
         difference, error = squared_difference(samples.mean(axis=2), weights)
+        least = LEAST_BIAS if least_bias is None else least_bias
         blur = expected_squared_bias(radii, difference, error, len(samples), fine, least)
     return ErrorByRadius(radii, fine, blur, noise)
 

@@ -266,7 +266,7 @@ def measure(
                 kind == "caustic",
                 setting.light_paths,
                 setting.filter_share,
-                kind == "indirect",
+                setting.least_bias(kind),
             )
     caustics = sum(np.mean(middle[kind]) for kind in ("seen_caustic", "caustic") if kind in middle)
     return PilotResult(

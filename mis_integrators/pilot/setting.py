@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from .bias import LEAST_BIAS, LEAST_CORRECTED, LEAST_DEEPER
 from .denoiser import GROUPS
 
 PILOT_PATHS = 4096
@@ -80,6 +81,12 @@ class PilotSetting:
     def corrects(self, kind: str) -> bool:
         """Whether the render corrects estimates at edges."""
         return corrects(kind, self.at_first_vertex)
+
+    def least_bias(self, kind: str) -> float:
+        """The squared bias that the laws of a kind begin at, see `bias.LEAST_BIAS`."""
+        if kind != "indirect":
+            return LEAST_BIAS
+        return LEAST_CORRECTED if self.at_first_vertex else LEAST_DEEPER
 
 
 def corrects(kind: str, at_first_vertex: bool) -> bool:

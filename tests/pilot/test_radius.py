@@ -1,6 +1,6 @@
 """The pilot's arithmetic, on made-up pilots whose squared bias and noise are known exactly."""
 
-from mis_integrators.pilot import radius
+from mis_integrators.pilot import bias, radius
 from mis_integrators.pilot.bias import (
     AT_EDGES,
     BY_CURVATURE,
@@ -119,11 +119,11 @@ def test_choice_is_nearly_the_best(edges, curvature, most, count):
         return np.mean(bias**2) + (noise * RADII[-1] / r) ** 2 / count
 
     best = min(true_error(r) for r in np.geomspace(RADII[0], RADII[-1], 60))
-    ratios = []
+    ratios, least = [], bias.LEAST_CORRECTED if edges == 0 else bias.LEAST_BIAS
     for seed in range(12):
         samples = of_one_group(pilot(3, seed, edges, noise, curvature))
         chosen = radius.best_radius(
-            [radius.error_by_radius(RADII, samples, np.ones(PIXELS), smooth=edges == 0)],
+            [radius.error_by_radius(RADII, samples, np.ones(PIXELS), least_bias=least)],
             lambda r: count * np.ones_like(r),
         )
         ratios.append(true_error(chosen) / best)
