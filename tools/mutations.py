@@ -1139,4 +1139,11 @@ MUTATIONS = [
         "noise that near pixels share falls with the area of disks, wherever these are",
         "tests/pilot/test_denoiser.py::test_few_iterations_tell_the_noise",
     ),
+    Mutation(
+        "lights/environment_guide.py",
+        "last if last <= high + margin else high",
+        "high",
+        "photons of light that falls at the end of a room are as heavy as hundreds of others",
+        "tests/lights/test_focus.py::test_a_room_is_in_focus_to_its_end",
+    ),
 ]
