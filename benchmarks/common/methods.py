@@ -191,7 +191,9 @@ class SessionMaker:
 
     def _seconds_of_pass(self, spp: int) -> float:
         """Seconds that the second of two passes takes."""
-        session = MitsubaSession(self._integrator, self.opened.scene, self._sensor, 0, spp)
+        session = MitsubaSession(
+            self._integrator, self.opened.scene, self._sensor, 0, spp, at_once=True
+        )
         session.iterate()
         start = time.perf_counter()
         session.iterate()
