@@ -1127,8 +1127,8 @@ MUTATIONS = [
     ),
     Mutation(
         "pilot/noise.py",
-        "shared, variance = shared_noise(radii, variance - own, own), own",
-        "pass",
+        "bounded_by_larger_disks(radii, own, floor, disks)",
+        "bounded_by_larger_disks(radii, variance, floor, disks)",
         "the error of shared noise at large disks counts at small ones by the ratio of areas",
         "tests/pilot/test_denoiser.py::test_few_iterations_tell_the_noise",
     ),

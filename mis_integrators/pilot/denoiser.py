@@ -42,7 +42,10 @@ def variance_left(samples: np.ndarray) -> np.ndarray:
 
 
 def own_variance_left(samples: np.ndarray) -> np.ndarray:
-    """LEFT B, the part of `variance_left` that camera paths make; of two groups."""
+    """LEFT B, the part of `variance_left` that camera paths make; of one group all of it, which
+    nothing tells apart."""
+    if samples.shape[-2] != GROUPS:
+        return variance_left(samples)
     return 2 * LEFT * _half_of_own(samples)
 
 

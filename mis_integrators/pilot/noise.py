@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .denoiser import GROUPS, own_variance_left, variance_left
+from .denoiser import own_variance_left, variance_left
 
 FEW_DISKS = 64
 """Tuned: merge disks that found photons, fewer than which tell nothing of the noise of that
@@ -104,12 +104,10 @@ def noise_by_radius(
     disks = np.count_nonzero(samples.mean(axis=2), axis=(0, 2)) if alike else None
     if photons_only:
         return Noise(bounded_by_larger_disks(radii, variance, 0.0, disks) / light_paths, 0.0)
-    shared = np.zeros(len(radii))
-    if samples.shape[2] == GROUPS:
-        own = _means(weights * own_variance_left(samples))
-        shared, variance = shared_noise(radii, variance - own, own), own
-    floor = variance.min()
-    photons = bounded_by_larger_disks(radii, variance, floor, disks) - floor + shared
+    own = _means(weights * own_variance_left(samples))
+    floor = own.min()
+    photons = bounded_by_larger_disks(radii, own, floor, disks) - floor
+    photons += shared_noise(radii, variance - own, own)
     return Noise(photons / light_paths, filter_share * floor)
 
 
@@ -169,8 +167,7 @@ def direct_variance(direct: np.ndarray, weights: np.ndarray) -> float:
     pixels)."""
     if len(direct) < 2:
         return trimmed_mean(weights * np.full(direct.shape[-1], np.inf))
-    left = own_variance_left if direct.shape[-2] == GROUPS else variance_left
-    return trimmed_mean(weights * left(direct))
+    return trimmed_mean(weights * own_variance_left(direct))
 
 
 def trimmed_mean(values: np.ndarray) -> float:
