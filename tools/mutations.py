@@ -279,8 +279,8 @@ MUTATIONS = [
     ),
     Mutation(
         "paths/lobes.py",
-        "concentration(rest_of(looks, has_even_part)) > NARROW",
-        "concentration(looks) > NARROW",
+        "concentration(rest_of(lobed.looks, has_even_part)) > NARROW",
+        "concentration(lobed.looks) > NARROW",
         "a coat on a bright ground does not count as narrow",
         LOBES,
     ),
@@ -350,7 +350,7 @@ MUTATIONS = [
     ),
     Mutation(
         "photons/tiers.py",
-        "disk = dr.select(number > 0, radius, first)",
+        "disk = disk_of(number, radius, first, lobe_width)",
         "disk = radius",
         "well lit photons that the camera sees have no disks of a pixel's size",
         TIERS,
@@ -1145,5 +1145,19 @@ MUTATIONS = [
         "high",
         "photons of light that falls at the end of a room are as heavy as hundreds of others",
         "tests/lights/test_focus.py::test_a_room_is_in_focus_to_its_end",
+    ),
+    Mutation(
+        "photons/tiers.py",
+        "dr.maximum(lobe_width * radius, first)",
+        "mi.Float(radius)",
+        "photons that lie apart have wide disks on glossy floors, too",
+        "tests/photons/test_tiers.py::test_tiers_bring_what_brute_force_finds",
+    ),
+    Mutation(
+        "integrators/photon_passes.py",
+        "[radius * self._lobe_width(vertices) for radius in radii]",
+        "[radius for radius in radii]",
+        "glossy floors show blurred images of lamps behind glass",
+        "tests/integrators/test_narrow_lobes.py::test_glossy_floors_show_sharp_images",
     ),
 ]

@@ -7,7 +7,7 @@ from ..core.recording import recorder
 from ..paths.bent_surfaces import may_magnify
 from ..paths.camera import film_sample_count, film_size
 from ..paths.layers import CHANNELS, SPLIT
-from ..paths.lobes import NarrowSurfaces
+from ..paths.lobes import LobedBSDFs, LobeWidths, NarrowSurfaces
 from ..paths.ray_cones import cones_of
 from ..paths.sensor import Lens
 from ..photons.hits import meets_one_light
@@ -242,15 +242,6 @@ class BDPMSession(PhotonPasses):
         self.cones = None  # where the camera sees caustics in disks of a pixel's size, `RayCones`
         if for_denoiser and self.has_caustics and (lens.connects or not self.has_volume):
             self.cones = cones_of(sensor)
-        self.narrow = None
-        if integrator.pass_narrow and self.has_indirect:
-            self.narrow = NarrowSurfaces.of(self.scene)
-        self.has_caustics_unseen = self.has_caustics and (
-            self.cones is None
-            or integrator.bdd > 0
-            or self.narrow is not None
-            or may_magnify(self.scene)
-        )
         self.by_chance = (
             self.has_caustics
             and self.traits.has_delta
@@ -258,6 +249,17 @@ class BDPMSession(PhotonPasses):
             and not integrator.initial_radius
             and self.traits.has_light_surfaces
             and meets_one_light(self.scene)
+        )
+        passes = self.has_indirect and integrator.pass_narrow
+        meets_all = self.by_chance and not self.traits.has_unmet_lights
+        lobed = LobedBSDFs.of(self.scene) if passes or meets_all else None
+        self.narrow = NarrowSurfaces.of(self.scene, lobed) if passes else None
+        self.lobe_widths = LobeWidths.of(lobed) if meets_all else None
+        self.has_caustics_unseen = self.has_caustics and (
+            self.cones is None
+            or integrator.bdd > 0
+            or self.narrow is not None
+            or may_magnify(self.scene)
         )
         self.parted = self.narrow is not None and self.narrow.parted
         self.passes_edges = (

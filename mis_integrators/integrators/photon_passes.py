@@ -150,6 +150,8 @@ class PhotonPasses(PilotedSession):
         ]
         if self.narrow is not None:
             self._tables += self.narrow.tables()
+        if self.lobe_widths is not None:
+            self._tables.append(self.lobe_widths.table)
         if self.cones is not None:
             self._tables += self.cones.tables()
         if self.near_zone is not None:
@@ -268,13 +270,14 @@ class PhotonPasses(PilotedSession):
             chance = ChanceWeights(self.lights, light_paths, vertices, record["hits"])
         if isinstance(photon_map, TieredMap):
             first, weigher = radii[0], chance and chance.weigher
+            width = self._lobe_width(vertices)
             found = gather_tiers(
-                photon_map, vertices, first, light_paths, max_depth, weigher, marked
+                photon_map, vertices, first, width, light_paths, max_depth, weigher, marked
             )
             if chance is not None:
                 flux, left = chance.hits["flux"], self._tiers_left
                 active = vertices.active & (flux > 0)
-                radii = [photon_map.radii_of(vertices.p, flux, first, left, active)]
+                radii = [photon_map.radii_of(vertices.p, flux, first, width, left, active)]
         else:
             if chance is not None:
                 weigh = chance.weigher(photon_map, radii)
@@ -301,9 +304,18 @@ class PhotonPasses(PilotedSession):
         vertices = QueryVertices(self.traits, record, spectral["wavelengths"], takes, scale, parted)
         if kind == "seen_caustic":
             radii = [dr.minimum(radius, pixel_disk(record)) for radius in radii]
+        elif kind == "caustic":
+            radii = [radius * self._lobe_width(vertices) for radius in radii]
         elif kind == "indirect" and self._bounds_disks:
             radii = [bounded(vertices.si, radius) for radius in radii]
         return vertices, radii
+
+    def _lobe_width(self, vertices):
+        """As of `LobeWidths.at`, where camera paths meet all lights by chance: these bring what
+        narrower disks miss."""
+        if self.lobe_widths is None:
+            return 1
+        return self.lobe_widths.at(vertices.bsdf, vertices.si, vertices.active)
 
     @property
     def _bounds_disks(self):
@@ -321,7 +333,7 @@ class PhotonPasses(PilotedSession):
         return gather_photons(
             photon_map,
             asking,
-            [radius],
+            [radius * self._lobe_width(asking)],
             self._light_paths,
             self.integrator.max_depth,
             second_moment(self.lights, photon_map, asking),

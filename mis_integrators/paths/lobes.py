@@ -1,5 +1,6 @@
-"""Whether photons that arrive at a surface are of use there: how narrow the lobes of its BSDF are,
-and whether it is a curve, narrower itself than the disks in which photons are merged.
+"""Whether photons that arrive at a surface are of use there, and from how far away: how narrow the
+lobes of its BSDF are, and whether it is a curve, narrower itself than the disks in which photons
+are merged.
 
 Of a BSDF with a narrow lobe that scatters evenly, too, as plastic does, photons bring the light of
 an even part, and paths go on for the rest: f = f_e + (f - f_e). The even part f_e is what f has in
@@ -31,6 +32,8 @@ EVEN_SHARE = 0.15
 """Tuned: of the light that a BSDF scatters, what its even part has at least."""
 LEAST_REST = 1e-3
 """Albedo of what a BSDF has besides its even part, less than which is rounding."""
+FINENESS = 8
+"""Steps of a factor of two in which concentrations are kept."""
 OFF_LOBE = 0.7
 """Cosine of the direction off the lobe."""
 EVEN = int(mi.BSDFFlags.DiffuseReflection | mi.BSDFFlags.DiffuseTransmission)
@@ -48,9 +51,9 @@ class NarrowSurfaces:
     parted: bool
 
     @classmethod
-    def of(cls, scene):
-        """Those of a scene; ``None`` where there are none."""
-        bsdfs = narrow_bsdfs(scene)
+    def of(cls, scene, lobed):
+        """Those of a scene with these `LobedBSDFs`; ``None`` where there are none."""
+        bsdfs = narrow_bsdfs(lobed)
         parted = bsdfs is not None and bool(np.any(np.array(bsdfs) & PARTED))
         found = cls(bsdfs, curves(scene), parted)
         return found if found.tables() else None
@@ -104,23 +107,74 @@ def curves(scene):
     return registry_table(shapes, mi.ShapePtr, found, mi.Bool) if any(found) else None
 
 
-def narrow_bsdfs(scene):
-    """A registry table: of each BSDF of the scene a bit for each of the `COSINES`, whether the
-    `concentration` of what paths would go on for is above `NARROW` there; and where it is so,
-    whether the BSDF is one of the `parted` ones. None where there is no narrow BSDF."""
-    bsdfs = used_bsdfs(scene)  # all have a place in the table: any may be asked for
-    smooth = [b for b in bsdfs if mi.has_flag(b.flags(), mi.BSDFFlags.Smooth)]
-    rough = [b for b in smooth if int(b.flags()) & ~_WITHOUT_LOBES]
-    if not rough:
+@dataclass(frozen=True)
+class LobedBSDFs:
+    """The BSDFs of a scene: `all` of them, those `with_lobes`, and the `Looks` at these (None where
+    there are none)."""
+
+    all: list
+    with_lobes: list
+    looks: Any
+
+    @classmethod
+    def of(cls, scene):
+        bsdfs = used_bsdfs(scene)
+        smooth = [b for b in bsdfs if mi.has_flag(b.flags(), mi.BSDFFlags.Smooth)]
+        found = [b for b in smooth if int(b.flags()) & ~_WITHOUT_LOBES]
+        return cls(bsdfs, found, look_at(found) if found else None)
+
+    def table(self, values):
+        """A registry table of unsigned integers, one for each of those with lobes; zero for all
+        others, which have a place in it, too: any may be asked for. None where all are zero."""
+        if not np.any(values):
+            return None
+        known = dict(zip((b.ptr for b in self.with_lobes), values))
+        found = [known.get(b.ptr, 0) for b in self.all]
+        return registry_table(self.all, mi.BSDFPtr, found, mi.UInt32)
+
+
+def narrow_bsdfs(lobed):
+    """A registry table: of each BSDF a bit for each of the `COSINES`, whether the `concentration`
+    of what paths would go on for is above `NARROW` there; and where it is so, whether the BSDF is
+    one of the `parted` ones. None where there is no narrow BSDF."""
+    if lobed.looks is None:
         return None
-    looks = look_at(rough)
-    has_even_part = parted(looks)
-    narrow = concentration(rest_of(looks, has_even_part)) > NARROW
+    has_even_part = parted(lobed.looks)
+    narrow = concentration(rest_of(lobed.looks, has_even_part)) > NARROW
     seen = narrow @ (1 << np.arange(len(COSINES)))
     seen |= np.where(narrow.any(axis=1) & has_even_part, PARTED, 0)
-    bits = dict(zip((b.ptr for b in rough), seen))
-    values = [bits.get(b.ptr, 0) for b in bsdfs]
-    return registry_table(bsdfs, mi.BSDFPtr, values, mi.UInt32) if narrow.any() else None
+    return lobed.table(seen)
+
+
+@dataclass(frozen=True)
+class LobeWidths:
+    """How wide the lobes of BSDFs are: a registry `table` with a byte for each of the `COSINES`,
+    log2 of the `concentration` in units of 1 / `FINENESS`."""
+
+    table: Any
+
+    @classmethod
+    def of(cls, lobed):
+        """Those of `LobedBSDFs`; ``None`` where all scatter evenly, or have an even part: what this
+        scatters needs the light of wide disks."""
+        if lobed.looks is None:
+            return None
+        octaves = np.log2(np.maximum(concentration(lobed.looks), 1))
+        octaves = np.where(parted(lobed.looks)[:, None], 0, octaves)
+        parts = np.clip(np.rint(FINENESS * octaves), 0, 255).astype(np.int64)
+        table = lobed.table(parts @ (1 << 8 * np.arange(len(COSINES))))
+        return None if table is None else cls(table)
+
+    def at(self, bsdf, si, active):
+        """The width of the lobes, 1 where the BSDF scatters evenly or has an even part: the root of
+        the solid angle that counts, c^(-1/2) with the `concentration` c, between the two nearest
+        `COSINES`."""
+        parts = lookup(self.table, bsdf, mi.UInt32, active)
+        place = dr.clip(dr.abs(si.wi.z) * len(COSINES) - 1, 0, len(COSINES) - 1)
+        low = mi.UInt32(place)
+        high = dr.minimum(low + 1, len(COSINES) - 1)
+        before, after = (mi.Float(parts >> 8 * number & 255) for number in (low, high))
+        return dr.exp2(dr.lerp(before, after, place - mi.Float(low)) * (-0.5 / FINENESS))
 
 
 _WITHOUT_LOBES = EVEN | int(

@@ -59,12 +59,12 @@ class TieredMap:
         photon_map = PhotonMap(grid, start, surface, power, *words)
         return photon_map, tier_radius(radius, number), count
 
-    def radii_of(self, p, flux, first, left, active):
+    def radii_of(self, p, flux, first, lobe_width, left, active):
         """Radii of the disks of photons of that `flux`, would they land at `p` (of a map whose
         photons carry something); other arguments as of `gather_tiers` and `tiers_of`."""
         radius, around = self._arrays["tier_radius"], self._arrays["around"]
         number = tiers_of(around, p, flux, radius, left, active)
-        return dr.select(number > 0, tier_radius(radius, number), first)
+        return disk_of(number, tier_radius(radius, number), first, lobe_width)
 
 
 def tier_table(capacity):
@@ -75,6 +75,13 @@ def tier_table(capacity):
 def tier_grid(bbox, table, radius, number):
     """The grid of a tier; `radius`: of the first."""
     return Grid(bbox, tier_radius(radius, number), table, table.first_entry(number))
+
+
+def disk_of(number, radius, first, lobe_width):
+    """The radius of the disk in which a vertex gathers photons of the tier `number`, whose `radius`
+    suits those that scatter evenly: where lobes are narrower by `lobe_width`, so is the disk, down
+    to the `first`. A glossy floor would else show a blurred image of what the photons come from."""
+    return dr.select(number > 0, dr.maximum(lobe_width * radius, first), first)
 
 
 def tiers_of(around, p, flux, radius, left, active):
@@ -100,17 +107,26 @@ def build_tiered_map(surface, power, count, bbox, radius, capacity, around, left
     return TieredMap(arrays, bbox, capacity)
 
 
-def gather_tiers(tiered, vertices, first, light_path_count, max_depth, weigher=None, marked=False):
-    """`gather_photons` of all tiers, each with its radius, but the first with the radius `first`
-    (of width one, or one a vertex). `weigher(photon_map, radii)`: what makes `weigh` of a tier's
-    map (None: no weights). Other arguments and result as there, but that there is one estimate, not
-    one for each radius."""
+def gather_tiers(
+    tiered,
+    vertices,
+    first,
+    lobe_width,
+    light_path_count,
+    max_depth,
+    weigher=None,
+    marked=False,
+):
+    """`gather_photons` of all tiers, each with its `disk_of` the vertices: those of the first tier
+    have the radius `first` (of width one, or one a vertex). `weigher(photon_map, radii)`: what
+    makes `weigh` of a tier's map (None: no weights). Other arguments and result as there, but that
+    there is one estimate, not one for each radius."""
 
     def step(number, totals):
         photon_map, radius, count = tiered.tier(number)
         there = copy.copy(vertices)
         there.active = vertices.active & (count > 0)
-        disk = dr.select(number > 0, radius, first)
+        disk = disk_of(number, radius, first, lobe_width)
         parts = gather_photons(
             photon_map,
             there,

@@ -96,13 +96,13 @@ def test_order_of_photons_does_not_matter(rgb):
     )
 
 
-@pytest.mark.parametrize("left", [0, 1])
+@pytest.mark.parametrize("left, lobe_width", [(0, 1), (1, 1), (0, 0.3)])
 @pytest.mark.parametrize("up", [(0, 0, 1), (0, 1, 0)], ids="zy")
-def test_tiers_bring_what_brute_force_finds(rgb, up, left):
+def test_tiers_bring_what_brute_force_finds(rgb, up, left, lobe_width):
     """Sum over the photons within their own radii, of BSDF x flux over the area of their disks.
     Where photons of a few tiers are `left` to a denoiser, these are all in the first, and each
-    vertex has its own radius there. The scene is a floor: flat along one axis or another, where
-    wide disks reach beyond the grid."""
+    vertex has its own radius there. Disks are smaller where lobes are narrow. The scene is a floor:
+    flat along one axis or another, where wide disks reach beyond the grid."""
     from mis_integrators.photons.tiers import TieredMap, build_tiered_map, gather_tiers
 
     rng, n, m = np.random.default_rng(7), 3000, 700
@@ -135,9 +135,11 @@ def test_tiers_bring_what_brute_force_finds(rgb, up, left):
     ray = mi.Ray3f(mi.Point3f((queries + up).T.copy()), -mi.Vector3f(*up))
     vertices = vertices_at(scene, ray, m)
     first = RADIUS * rng.uniform(0.3, 6, m) if left else np.full(m, RADIUS)
-    (found,) = gather_tiers(TieredMap(built.arrays(), box, n), vertices, mi.Float(first), 10.0, -1)
+    tiered = TieredMap(built.arrays(), box, n)
+    (found,) = gather_tiers(tiered, vertices, mi.Float(first), lobe_width, 10.0, -1)
     distance = np.linalg.norm(queries[:, None] - points[None], axis=-1)
-    radii = np.where(tiers == 0, np.float32(first)[:, None], RADIUS * 2.0**tiers)
+    least = np.float32(first)[:, None]
+    radii = np.where(tiers == 0, least, np.maximum(lobe_width * RADIUS * 2.0**tiers, least))
     assert np.abs(distance / radii - 1).min() > 1e-6  # what single precision tells apart
     lit = (distance < radii) * flux / (np.pi * radii**2)
     expected = lit.sum(axis=1) * 0.5 / np.pi / 10
