@@ -279,7 +279,7 @@ MUTATIONS = [
     ),
     Mutation(
         "paths/lobes.py",
-        "concentration(rest_of(lobed.looks, has_even_part)) > NARROW",
+        "concentration(rest_of(lobed.looks, lobed.parted)) > NARROW",
         "concentration(lobed.looks) > NARROW",
         "a coat on a bright ground does not count as narrow",
         LOBES,
@@ -350,7 +350,7 @@ MUTATIONS = [
     ),
     Mutation(
         "photons/tiers.py",
-        "disk = disk_of(number, radius, first, lobe_width)",
+        "disk = disk_of(number, radius, first, vertices.lobe_width)",
         "disk = radius",
         "well lit photons that the camera sees have no disks of a pixel's size",
         TIERS,
@@ -1155,7 +1155,7 @@ MUTATIONS = [
     ),
     Mutation(
         "integrators/photon_passes.py",
-        "[radius * self._lobe_width(vertices) for radius in radii]",
+        "[radius * vertices.lobe_width for radius in radii]",
         "[radius for radius in radii]",
         "glossy floors show blurred images of lamps behind glass",
         "tests/integrators/test_narrow_lobes.py::test_glossy_floors_show_sharp_images",

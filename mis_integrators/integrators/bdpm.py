@@ -251,6 +251,7 @@ class BDPMSession(PhotonPasses):
             and meets_one_light(self.scene)
         )
         passes = self.has_indirect and integrator.pass_narrow
+        # Camera paths bring what narrower disks miss, if they meet all lights.
         meets_all = self.by_chance and not self.traits.has_unmet_lights
         lobed = LobedBSDFs.of(self.scene) if passes or meets_all else None
         self.narrow = NarrowSurfaces.of(self.scene, lobed) if passes else None

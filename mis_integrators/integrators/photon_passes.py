@@ -270,12 +270,12 @@ class PhotonPasses(PilotedSession):
             chance = ChanceWeights(self.lights, light_paths, vertices, record["hits"])
         if isinstance(photon_map, TieredMap):
             first, weigher = radii[0], chance and chance.weigher
-            width = self._lobe_width(vertices)
             found = gather_tiers(
-                photon_map, vertices, first, width, light_paths, max_depth, weigher, marked
+                photon_map, vertices, first, light_paths, max_depth, weigher, marked
             )
             if chance is not None:
                 flux, left = chance.hits["flux"], self._tiers_left
+                width = vertices.lobe_width
                 active = vertices.active & (flux > 0)
                 radii = [photon_map.radii_of(vertices.p, flux, first, width, left, active)]
         else:
@@ -301,21 +301,17 @@ class PhotonPasses(PilotedSession):
         """The `QueryVertices` that gather photons of a kind, and the radii of their disks."""
         takes = takes_photons(record, kind)
         parted = kind == "indirect" and self.parted
-        vertices = QueryVertices(self.traits, record, spectral["wavelengths"], takes, scale, parted)
+        widths = None if kind == "indirect" else self.lobe_widths
+        vertices = QueryVertices(
+            self.traits, record, spectral["wavelengths"], takes, scale, parted, widths
+        )
         if kind == "seen_caustic":
             radii = [dr.minimum(radius, pixel_disk(record)) for radius in radii]
         elif kind == "caustic":
-            radii = [radius * self._lobe_width(vertices) for radius in radii]
+            radii = [radius * vertices.lobe_width for radius in radii]
         elif kind == "indirect" and self._bounds_disks:
             radii = [bounded(vertices.si, radius) for radius in radii]
         return vertices, radii
-
-    def _lobe_width(self, vertices):
-        """As of `LobeWidths.at`, where camera paths meet all lights by chance: these bring what
-        narrower disks miss."""
-        if self.lobe_widths is None:
-            return 1
-        return self.lobe_widths.at(vertices.bsdf, vertices.si, vertices.active)
 
     @property
     def _bounds_disks(self):
@@ -329,11 +325,12 @@ class PhotonPasses(PilotedSession):
         takes = takes_photons(record, "caustic")
         if self.cones is not None:  # wide disks tell it better than those of a pixel's size
             takes |= takes_photons(record, "seen_caustic")
-        asking = QueryVertices(self.traits, record, spectral["wavelengths"], takes)
+        wavelengths, widths = spectral["wavelengths"], self.lobe_widths
+        asking = QueryVertices(self.traits, record, wavelengths, takes, lobe_widths=widths)
         return gather_photons(
             photon_map,
             asking,
-            [radius * self._lobe_width(asking)],
+            [radius * asking.lobe_width],
             self._light_paths,
             self.integrator.max_depth,
             second_moment(self.lights, photon_map, asking),

@@ -9,6 +9,7 @@ a direction off the lobe, but nowhere more than f.
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -123,6 +124,11 @@ class LobedBSDFs:
         found = [b for b in smooth if int(b.flags()) & ~_WITHOUT_LOBES]
         return cls(bsdfs, found, look_at(found) if found else None)
 
+    @functools.cached_property
+    def parted(self):
+        """As of `parted`, of those with lobes."""
+        return parted(self.looks)
+
     def table(self, values):
         """A registry table of unsigned integers, one for each of those with lobes; zero for all
         others, which have a place in it, too: any may be asked for. None where all are zero."""
@@ -139,10 +145,9 @@ def narrow_bsdfs(lobed):
     one of the `parted` ones. None where there is no narrow BSDF."""
     if lobed.looks is None:
         return None
-    has_even_part = parted(lobed.looks)
-    narrow = concentration(rest_of(lobed.looks, has_even_part)) > NARROW
+    narrow = concentration(rest_of(lobed.looks, lobed.parted)) > NARROW
     seen = narrow @ (1 << np.arange(len(COSINES)))
-    seen |= np.where(narrow.any(axis=1) & has_even_part, PARTED, 0)
+    seen |= np.where(narrow.any(axis=1) & lobed.parted, PARTED, 0)
     return lobed.table(seen)
 
 
@@ -160,7 +165,7 @@ class LobeWidths:
         if lobed.looks is None:
             return None
         octaves = np.log2(np.maximum(concentration(lobed.looks), 1))
-        octaves = np.where(parted(lobed.looks)[:, None], 0, octaves)
+        octaves = np.where(lobed.parted[:, None], 0, octaves)
         parts = np.clip(np.rint(FINENESS * octaves), 0, 255).astype(np.int64)
         table = lobed.table(parts @ (1 << 8 * np.arange(len(COSINES))))
         return None if table is None else cls(table)

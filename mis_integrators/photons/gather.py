@@ -44,10 +44,13 @@ class QueryVertices:
     and in scenes that have no others none is evaluated for a photon.
 
     `takes`: which of them take photons; `scale` (a spectrum): a weight that all photons of a vertex
-    have; `parted`: the even part of the BSDF scatters alone, where the vertices say so.
+    have; `parted`: the even part of the BSDF scatters alone, where the vertices say so;
+    `lobe_widths` (a `LobeWidths`): tells their `lobe_width`, else one.
     """
 
-    def __init__(self, traits, record, wavelengths, takes=True, scale=1, parted=False):
+    def __init__(
+        self, traits, record, wavelengths, takes=True, scale=1, parted=False, lobe_widths=None
+    ):
         throughput, depth = record["throughput"], record["depth"]
         active = (dr.max(throughput) > 0) & takes
         ray = mi.Ray3f(record["ray_o"], record["ray_d"], 0, wavelengths)
@@ -59,6 +62,7 @@ class QueryVertices:
         self.side = dr.dot(si.n, -ray.d)
         self.first = record.get("first")
         self.factor = mi.Spectrum(throughput) * scale
+        self.lobe_width = 1 if lobe_widths is None else lobe_widths.at(self.bsdf, si, active)
         self.even = self.even_bound = None
         if parted:
             self.even = (depth & EVEN_PART) != 0

@@ -107,16 +107,7 @@ def build_tiered_map(surface, power, count, bbox, radius, capacity, around, left
     return TieredMap(arrays, bbox, capacity)
 
 
-def gather_tiers(
-    tiered,
-    vertices,
-    first,
-    lobe_width,
-    light_path_count,
-    max_depth,
-    weigher=None,
-    marked=False,
-):
+def gather_tiers(tiered, vertices, first, light_path_count, max_depth, weigher=None, marked=False):
     """`gather_photons` of all tiers, each with its `disk_of` the vertices: those of the first tier
     have the radius `first` (of width one, or one a vertex). `weigher(photon_map, radii)`: what
     makes `weigh` of a tier's map (None: no weights). Other arguments and result as there, but that
@@ -126,7 +117,7 @@ def gather_tiers(
         photon_map, radius, count = tiered.tier(number)
         there = copy.copy(vertices)
         there.active = vertices.active & (count > 0)
-        disk = disk_of(number, radius, first, lobe_width)
+        disk = disk_of(number, radius, first, vertices.lobe_width)
         parts = gather_photons(
             photon_map,
             there,

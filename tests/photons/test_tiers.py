@@ -136,7 +136,8 @@ def test_tiers_bring_what_brute_force_finds(rgb, up, left, lobe_width):
     vertices = vertices_at(scene, ray, m)
     first = RADIUS * rng.uniform(0.3, 6, m) if left else np.full(m, RADIUS)
     tiered = TieredMap(built.arrays(), box, n)
-    (found,) = gather_tiers(tiered, vertices, mi.Float(first), lobe_width, 10.0, -1)
+    vertices.lobe_width = lobe_width
+    (found,) = gather_tiers(tiered, vertices, mi.Float(first), 10.0, -1)
     distance = np.linalg.norm(queries[:, None] - points[None], axis=-1)
     least = np.float32(first)[:, None]
     radii = np.where(tiers == 0, least, np.maximum(lobe_width * RADIUS * 2.0**tiers, least))
