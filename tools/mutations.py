@@ -1160,4 +1160,11 @@ MUTATIONS = [
         "glossy floors show blurred images of lamps behind glass",
         "tests/integrators/test_narrow_lobes.py::test_glossy_floors_show_sharp_images",
     ),
+    Mutation(
+        "integrators/choice.py",
+        "values = np.where(np.isfinite(values), values, 0)",
+        "values = np.asarray(values)",
+        "`path` renders where one of its samples is not a number",
+        "tests/integrators/test_auto.py::test_samples_that_are_not_finite",
+    ),
 ]

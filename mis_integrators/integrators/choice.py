@@ -420,7 +420,9 @@ def parts_of_samples(session, values, prediction, samples, share):
     of the pilot's pixels, where a render has so many `samples` a pixel; `share`: what counts of
     their noise. A pixel is as bright as they and the photons of the `prediction` say: where these
     alone came out dark by chance, the noise of others would count too much. (That of photons, which
-    is then small, hardly does.)"""
+    is then small, hardly does.) Values that are not finite count as none: renders leave them
+    out."""
+    values = np.where(np.isfinite(values), values, 0)
     cells = neighbourhoods(film_size(session.sensor)[0], prediction.pixels)
     mean = (shrink_to_neighbours(values, cells) + prediction.mean) / 2
     samples = max(round(samples), 1)

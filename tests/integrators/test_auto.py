@@ -170,6 +170,29 @@ def test_noise_of_path_is_what_its_renders_have(rgb, rfilter):
         assert 0.45 < predicted / true < 1.6, measure
 
 
+@pytest.mark.parametrize("sampler", ["sobol", "independent"])
+def test_samples_that_are_not_finite(sampler):
+    """`path` has some on bent surfaces. They count as none: the errors predicted are those of zeros
+    in their place, for camera paths on surfaces and in media."""
+    from mis_integrators.integrators import choice
+
+    session = SimpleNamespace(
+        integrator=SimpleNamespace(low_discrepancy=sampler == "sobol"),
+        sensor=box_scene().sensors()[0],
+    )
+    pixels = PilotPixels(1, 256, 1)
+    values = np.random.default_rng(0).exponential(size=(32, 256))
+    without, broken = values.copy(), values.copy()
+    without[[3, 17], [200, 5]] = 0
+    broken[[3, 17], [200, 5]] = np.nan, np.inf
+    prediction = SimpleNamespace(mean=np.ones(256), pixels=pixels)
+
+    def parts(values):
+        return choice.parts_of_samples(session, values, prediction, 64, 1.0)
+
+    assert parts(broken) == parts(without) != parts(values)
+
+
 @pytest.mark.parametrize("sampler", ["sobol", *extended("independent")])
 def test_path_in_parts(rgb, monkeypatch, sampler):
     """Large films are traced in parts, and iterations in any order: it makes no difference. (What
