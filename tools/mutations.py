@@ -1167,4 +1167,18 @@ MUTATIONS = [
         "`path` renders where one of its samples is not a number",
         "tests/integrators/test_auto.py::test_samples_that_are_not_finite",
     ),
+    Mutation(
+        "integrators/piloted.py",
+        "self._left(OVERTIME * self.gathering_seconds)",
+        "self._left(self.gathering_seconds)",
+        "a single iteration has no more paths for direct light: lamps have ragged edges",
+        "tests/integrators/test_direct_paths.py::test_none_where_there_is_no_time",
+    ),
+    Mutation(
+        "integrators/bdpm.py",
+        "self.accumulator.direct_noise = self.direct_light.noise_of_iteration",
+        "self.accumulator.direct_noise = None",
+        "direct light of a single iteration is denoised as if it were all noise",
+        "tests/integrators/test_direct_paths.py::test_noise_of_an_iteration",
+    ),
 ]

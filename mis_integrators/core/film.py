@@ -235,6 +235,10 @@ class Accumulator:
     `grey_square` and the segments (see `segments`) of grey and weight, too; grey is the mean of the
     colours. Images that will be `denoised` need the segments for direct light: its grey is their
     last channel.
+
+    `direct_noise` may be a function that tells the variance of direct light in one iteration, grey:
+    (height, width) without the block's border. It is asked where the iterations are too few to tell
+    it.
     """
 
     def __init__(
@@ -248,6 +252,7 @@ class Accumulator:
         self.film, self.with_variance, self.stratified = film, with_variance, stratified
         self.class_channels, self.denoised = class_channels, denoised
         self.technique_channels = 0
+        self.direct_noise = None
         self.sums = Sums(mi.TensorXd)
 
     @property
@@ -363,7 +368,9 @@ class Accumulator:
         mean = grey_of(self._direct(total)) / np.where(total[..., -1:] == 0, 1, total[..., -1:])
         deviations, complete, length = self._deviations(2, mean)
         if np.count_nonzero(complete) < 2:
-            return np.square(mean[..., 0])
+            if self.direct_noise is None:
+                return np.square(mean[..., 0])
+            return window_mean(self.direct_noise() / max(self.iterations, 1), WINDOW)
         of_segments = deviations[complete].var(axis=0, ddof=1)
         return window_mean(of_segments * (length / self.iterations), WINDOW)
 

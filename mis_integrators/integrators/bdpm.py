@@ -212,6 +212,7 @@ class BDPMSession(PhotonPasses):
             self.radii = dict.fromkeys(self.kinds(), integrator.initial_radius)
         self.recorded = recorder()
         self.direct_light = DirectLight(self)
+        self.accumulator.direct_noise = self.direct_light.noise_of_iteration
         self.caustic_radii = CausticRadii(self)
         self._volume_density = None
         self._freeze()

@@ -16,7 +16,7 @@ from ..core.packing import from_numpy
 from ..core.recording import lanes
 from ..core.sequences import SampleSequence
 from ..core.spectra import channel_mean
-from ..paths.camera import film_sample_count, film_size
+from ..paths.camera import border_size, film_sample_count, film_size
 from ..paths.light_classes import by_class, class_of
 from ..paths.setting import CameraPass
 from ..photons.queries import Queries, trace_camera_paths
@@ -142,6 +142,18 @@ class DirectLight:
             noise = DirectNoise(*(values[nearest] for values in found))
             self.noise = noise.times(noise_left(self.session.integrator, self.session.sensor))
         return self.noise
+
+    def noise_of_iteration(self):
+        """Variance of the direct light of an iteration in each pixel of the crop window, by the
+        trials, grey: (height, width)."""
+        session = self.session
+        if self.mean_paths is None:
+            self.choose_paths()
+        of_path = self.measured().own / noise_left(session.integrator, session.sensor)
+        width, height = film_size(session.sensor)
+        border = border_size(session.sensor.film())
+        inside = slice(border, -border) if border else slice(None)
+        return (of_path / self._paths).reshape(height, width)[inside, inside]
 
     def _trials(self, pixels):
         """Direct light of `TRIALS` independent paths through each of these pixels, mean over the

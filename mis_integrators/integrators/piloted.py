@@ -18,6 +18,10 @@ from .schedule import LARGEST_RADIUS, SMALLEST_RADIUS, shrunk
 TOO_SLOW = 1.5
 """Tuned: an iteration that takes so many times the guess is not believed to be typical."""
 
+OVERTIME = 2.0
+"""Tuned: what the last iteration may take, over one without paths for direct light alone, however
+little time is left: where it is the only one, lamps have ragged edges without these paths."""
+
 
 class PilotedSession(SessionAhead):
     """Runs a pilot, chooses from it, and renders with what was chosen.
@@ -189,11 +193,11 @@ class PilotedSession(SessionAhead):
 
     @property
     def most_cost(self):
-        """What an iteration may take, in seconds of one without paths for direct light alone: at
-        least those, and all that is left."""
+        """What an iteration may take, in seconds of one without paths for direct light alone: all
+        that is left, and `OVERTIME` at least."""
         if self.seconds is None:
             return math.inf
-        return self._left(self.gathering_seconds) / self.gathering_seconds
+        return self._left(OVERTIME * self.gathering_seconds) / self.gathering_seconds
 
     def direct_cost(self):
         """What an iteration takes, over one without paths for direct light alone."""

@@ -1,5 +1,6 @@
 """Camera paths that see direct light alone: means stay, and the noise of direct light falls."""
 
+from mis_integrators.core.film import direct_channels
 from mis_integrators.integrators.direct_light import CHEAPEST
 
 import mitsuba as mi
@@ -118,12 +119,16 @@ def test_sessions_of_a_render_send_the_same_paths(rgb):
     np.testing.assert_allclose(one.image(), other.image(), rtol=1e-5)
 
 
-def test_none_where_there_is_no_time(rgb):
-    """Iterations take no longer for these paths than there is time left, and what one is expected
-    to take counts them."""
+def test_none_where_there_is_no_time(rgb, monkeypatch):
+    """Iterations take no longer for these paths than there is time left, or than the last one may,
+    and what one is expected to take counts them."""
     scene, means = tray("lambertian", "rectangle"), []
     plugin = {"type": "bdpm", "bdd": 0, "max_depth": 4, "sampler": "independent"}
-    for seconds in (1e-6, 20.0):
+    for seconds, overtime in ((1e-6, 1.0), (1e-6, None), (20.0, None)):
+        if overtime:
+            monkeypatch.setattr("mis_integrators.integrators.piloted.OVERTIME", overtime)
+        else:
+            monkeypatch.undo()
         session = mi.load_dict(plugin).session(scene, 0, 1, 0)
         session.plan_time(seconds)
         session.predict()
@@ -133,7 +138,26 @@ def test_none_where_there_is_no_time(rgb):
         assert light.cost == pytest.approx(1 + min(max(cost, CHEAPEST), 1) * light.mean_paths)
         expected = session.gathering_seconds * light.cost
         assert session.expected_seconds == pytest.approx(expected)
-    assert means[0] == 0 and means[1] > 0.05
+    assert means[0] == 0 and means[1] > 0.05 and means[2] > 0.05
+
+
+def test_noise_of_an_iteration(rgb):
+    """The variance of direct light that an image of one iteration tells: that of forty renders of
+    other seeds, the mean over all pixels, which the trials and they know to a tenth (one seed
+    each)."""
+    scene = tray("rough", "rectangle")
+    images = []
+    for seed in range(40):
+        session = integrator(bdd=1, direct_paths=2, denoised=True, sampler="independent").session(
+            scene, 0, seed
+        )
+        session.iterate()
+        images.append(session.image())
+    *direct, variance = (session.channels.index(name) for name in direct_channels())
+    images = np.array(images)
+    truth = images[..., direct].mean(axis=-1).var(axis=0, ddof=1)
+    assert np.mean(images[-1, ..., variance]) == pytest.approx(truth.mean(), rel=0.3)
+    assert truth.mean() < 0.5 * np.mean(images[..., direct] ** 2)
 
 
 def test_purposes_differ():
