@@ -370,7 +370,7 @@ class Accumulator:
         if np.count_nonzero(complete) < 2:
             if self.direct_noise is None:
                 return np.square(mean[..., 0])
-            return window_mean(self.direct_noise() / max(self.iterations, 1), WINDOW)
+            return window_mean(self.direct_noise() / self.iterations, WINDOW)
         of_segments = deviations[complete].var(axis=0, ddof=1)
         return window_mean(of_segments * (length / self.iterations), WINDOW)
 

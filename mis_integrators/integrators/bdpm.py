@@ -383,8 +383,7 @@ class BDPMSession(PhotonPasses):
 
     def start(self):
         super().start()
-        if self.direct_light.mean_paths is None:
-            self.direct_light.choose_paths()
+        self.direct_light.find_paths()
 
     def _take(self, choice):
         super()._take(choice)

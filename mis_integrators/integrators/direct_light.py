@@ -3,6 +3,7 @@ worth."""
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import NamedTuple
 
@@ -64,13 +65,13 @@ class Beside(NamedTuple):
 class DirectLight:
     """The passes of a `BDPMSession` that see emission, and direct light at the first smooth vertex.
 
-    `mean_paths`: of these paths, a pixel and iteration (None until that is known); `noise`: the
-    `DirectNoise` by which they are chosen (None until it is measured); `path_seconds`: what one of
-    them takes; `cost`: what an iteration takes, over one without them.
+    `mean_paths`: of these paths, a pixel and iteration (None until that is known); `path_seconds`:
+    what one of them takes, once their `noise` is measured; `cost`: what an iteration takes, over
+    one without them.
     """
 
     def __init__(self, session):
-        self.session, self.noise = session, None
+        self.session = session
         self.path_seconds, self.cost = 0.0, 1.0
         self.mean_paths = self._paths = self._beside = None
         self._lists = None  # what `_listed` has made
@@ -85,6 +86,11 @@ class DirectLight:
         """Takes over what another session of the same render has `learned` (a `Fields`)."""
         if fields.names():
             self._beside = Beside(**{name: fields.number(name, LARGEST) for name in Beside._fields})
+
+    def find_paths(self):
+        """Chooses the paths, unless they are chosen."""
+        if self.mean_paths is None:
+            self.choose_paths()
 
     def choose_paths(self):
         """Chooses the paths by what is known of those that gather. Where nothing is gathered there
@@ -132,28 +138,27 @@ class DirectLight:
         seconds = self.path_seconds * film_sample_count(self.session.sensor)
         return min(max(seconds / gathering, CHEAPEST), 1.0)
 
+    @functools.cached_property
+    def noise(self):
+        """The `DirectNoise` of a path, measured when it is first asked for."""
+        width, height = film_size(self.session.sensor)
+        rows, columns, nearest = coarser(width, height)
+        pixels = (rows[:, None] * width + columns).ravel()
+        found = measure(self._trials(pixels), len(columns))
+        return DirectNoise(*(values[nearest] for values in found))
+
     def measured(self):
-        """The `noise`, which is measured if need be."""
-        if self.noise is None:
-            width, height = film_size(self.session.sensor)
-            rows, columns, nearest = coarser(width, height)
-            pixels = (rows[:, None] * width + columns).ravel()
-            found = measure(self._trials(pixels), len(columns))
-            noise = DirectNoise(*(values[nearest] for values in found))
-            self.noise = noise.times(noise_left(self.session.integrator, self.session.sensor))
-        return self.noise
+        """The `noise`, what counts of it: by this the paths are chosen."""
+        return self.noise.times(noise_left(self.session.integrator, self.session.sensor))
 
     def noise_of_iteration(self):
         """Variance of the direct light of an iteration in each pixel of the crop window, by the
         trials, grey: (height, width)."""
-        session = self.session
-        if self.mean_paths is None:
-            self.choose_paths()
-        of_path = self.measured().own / noise_left(session.integrator, session.sensor)
-        width, height = film_size(session.sensor)
-        border = border_size(session.sensor.film())
-        inside = slice(border, -border) if border else slice(None)
-        return (of_path / self._paths).reshape(height, width)[inside, inside]
+        self.find_paths()
+        width, height = film_size(self.session.sensor)
+        border = border_size(self.session.sensor.film())
+        variance = (self.noise.own / self._paths).reshape(height, width)
+        return variance[border : height - border, border : width - border]
 
     def _trials(self, pixels):
         """Direct light of `TRIALS` independent paths through each of these pixels, mean over the

@@ -142,9 +142,9 @@ def test_none_where_there_is_no_time(rgb, monkeypatch):
 
 
 def test_noise_of_an_iteration(rgb):
-    """The variance of direct light that an image of one iteration tells: that of forty renders of
-    other seeds, the mean over all pixels, which the trials and they know to a tenth (one seed
-    each)."""
+    """The variance of direct light that an image of one iteration tells: that of forty renders,
+    within 0.3 in the mean over all pixels (the ratio's deviation is 0.054: false alarms below
+    1e-6)."""
     scene = tray("rough", "rectangle")
     images = []
     for seed in range(40):
