@@ -1,6 +1,7 @@
 # make render   set everything up, then render a bundled scene into out/
-# make test     set everything up, then run the tests (a quarter of an hour on two cores)
-# make test-all the same with all extended cases (an hour and a half)
+# make test     set everything up, then run the tests (ten minutes on two cores)
+# make test-long the tests that take longest (ten minutes)
+# make test-all all of these, and all extended cases (an hour and a half)
 # make mutants  set everything up, then see how many of more than a hundred errors the tests find (twenty minutes)
 # make bench    set everything up, then compare all methods on all bundled scenes: out/bench/index.html (half an hour to three quarters)
 # make figures set everything up, then measure all figures of docs/results.md anew (two hours)
@@ -13,7 +14,7 @@ PYTHON ?= python3
 VENV := .venv
 SETUP := tools/setup.sh
 
-.PHONY: render test test-all mutants lint bench figures gallery hero docs clean
+.PHONY: render test test-long test-all mutants lint bench figures gallery hero docs clean
 .DELETE_ON_ERROR:
 
 render: $(VENV)/installed
@@ -22,6 +23,9 @@ render: $(VENV)/installed
 
 test: $(VENV)/installed-test
 	$(VENV)/bin/python -m pytest -n 2 --dist worksteal
+
+test-long: $(VENV)/installed-test
+	$(VENV)/bin/python -m pytest -n 2 --dist worksteal -m "long and not extended and not full"
 
 test-all: $(VENV)/installed-test
 	$(VENV)/bin/python -m pytest -n 2 --dist worksteal -m "not full"

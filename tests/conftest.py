@@ -13,10 +13,10 @@ import mitsuba as mi
 import pytest
 
 BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
-LEFT_OUT = "extended", "full"
+LEFT_OUT = "extended", "long", "full"
 """Markers of what the default run leaves out."""
-MOST_LANES = 8
-"""Numbers that a kernel computes at once, in tests."""
+MOST_LANES = 4
+"""Numbers that a kernel computes at once, in tests: the fewest that Embree has."""
 VARIANTS = ("llvm_ad_rgb", "llvm_ad_mono", "llvm_ad_spectral", "cuda_ad_rgb")
 
 
@@ -56,8 +56,8 @@ def _activate(variant: str) -> str:
 
 @pytest.fixture(scope="session", autouse=True)
 def narrow_vectors():
-    """Kernels are at most `MOST_LANES` wide: where there are wider vectors, they compile in 0.7 of
-    the time then, and run as fast on small images. (Nothing happens without LLVM, or where a
+    """Kernels are at most `MOST_LANES` wide: where there are wider vectors, they compile in less
+    time then (0.6 of that of eight), and small images take little more. (Nothing happens without LLVM, or where a
     version of Dr.Jit does not have these functions of its C interface.)"""
     try:
         mi.set_variant("llvm_ad_rgb")
@@ -113,6 +113,11 @@ def pytest_configure(config):
         "markers",
         "extended: more cases of the same kind, an hour of them; left out unless asked for, as "
         "`make test-all` does (-m 'not full')",
+    )
+    config.addinivalue_line(
+        "markers",
+        "long: takes ten seconds and more with no kernel in the cache; left out unless asked for, as "
+        "`make test-long` and continuous integration do (-m 'long and not extended and not full')",
     )
     config.addinivalue_line(
         "markers",

@@ -46,6 +46,7 @@ def run(arguments: list[str], folder: Path) -> subprocess.CompletedProcess:
     )
 
 
+@pytest.mark.long
 def test_notebook_runs(tmp_path):
     """Its cells one after the other, as Jupyter would run them; the tutorial's page has the same
     blocks."""

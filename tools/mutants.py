@@ -27,8 +27,12 @@ from pathlib import Path
 from mutations import MUTATIONS, Mutation
 
 ROOT = Path(__file__).resolve().parents[1]
-SELECTIONS = {"default": [], "all": ["-m", "not full"]}
-"""Arguments of pytest: what `make test` and `make test-all` run."""
+SELECTIONS = {
+    "quick": [],
+    "default": ["-m", "not extended and not full"],
+    "all": ["-m", "not full"],
+}
+"""Arguments of pytest: what `make test`, continuous integration, and `make test-all` run."""
 CAUGHT, SURVIVED, LATE = "caught", "SURVIVED", "TOO LONG"
 VERDICTS = {0: SURVIVED, 1: CAUGHT}
 """By pytest's exit code."""

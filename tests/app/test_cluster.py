@@ -167,6 +167,7 @@ def test_error_of_a_worker_leaves_nothing_half_summed(scene, client, monkeypatch
     np.testing.assert_allclose(arrays["total"], expected, rtol=1e-4, atol=1e-6)
 
 
+@pytest.mark.long
 def test_processes_of_this_machine_and_ctrl_c(scene, tmp_path):
     """Ctrl-C in a terminal reaches the workers, too: what they have rendered is written, and one
     process can go on from it."""

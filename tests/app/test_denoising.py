@@ -288,6 +288,7 @@ def test_direct_light_is_the_layer_of_that_name(rgb, plugin):
     assert 0.2 < direct.mean() / image[..., :3].mean() < 0.95
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("sampler, most", [("sobol", 16), *extended(("independent", 1.5))])
 @in_one_thread
 def test_noise_of_direct_light_is_measured(rgb, sampler, most):

@@ -606,6 +606,7 @@ def test_images_combined_by_their_true_errors(module):
     assert found == pytest.approx(least, rel=5 * (2 / (64 * 64 * 3)) ** 0.5)
 
 
+@pytest.mark.long
 def test_whether_methods_should_share_the_time(tmp_path, module, capsys):
     """One row a share and method beside the best; a method is at most as good as the best alone in
     the product of both errors."""
@@ -628,6 +629,7 @@ def test_whether_methods_should_share_the_time(tmp_path, module, capsys):
     assert "1.5 is not a number below 1" in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_whether_bdpm_auto_is_behind(tmp_path, module):
     """A row a scene and time, random rooms among them, with what was chosen; shares over all."""
     scene = tmp_path / "tiny.xml"
@@ -684,6 +686,7 @@ def test_random_rooms_are_the_same_each_time(module):
     assert rooms.room(3) == rooms.room(3) != rooms.room(4)
 
 
+@pytest.mark.long
 def test_published_forms_change_what_they_name(module):
     """Every form of the ladder: its plugin takes its parameters, and while it renders the
     integrator has the values that it names."""

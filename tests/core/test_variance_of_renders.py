@@ -56,6 +56,7 @@ def blocks(image):
     return image.reshape(height // 8, 8, width // 8, 8, channels).mean(axis=(1, 3, 4))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "name, width, height, radius, rfilter, counts",
     [

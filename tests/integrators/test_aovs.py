@@ -351,6 +351,7 @@ def of_paths():
     return [Estimate.of([block_means(image[:, :, k], 3) for image in images]) for k in range(3)]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "plugin",
     ["bdpm", *extended("bdpm_opt3", "bdpm_balance", "bdpt", "vcm", "pcbpt", "bdpt_ris")],
@@ -374,6 +375,7 @@ def test_split_without_delta_surfaces(rgb, plugin):
     assert_same(direct, reference(path(max_depth=2), scene), whole=0.04, block=0.2)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("plugin", ["bdpm", *extended("vcm")])
 def test_direct_light_of_photons_alone(rgb, plugin):
     """Light that neither a camera path can meet nor next-event estimation can sample: photons that
@@ -559,6 +561,7 @@ def before_fog(**more):
     return {"type": "perspective", "to_world": look, "film": film(12, "gaussian"), **more}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("plugin", ["volpath_multiview", "bdpm_auto"])
 def test_layers_of_scenes_with_media_are_those_of_bdpm(rgb, plugin):
     scene, images = foggy(before_fog()), []

@@ -112,6 +112,7 @@ class Renders:
         return Estimate.of(self.batches)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("sampler", ["sobol", *extended("independent")])
 def test_mean_of_whole_renders(rgb, sampler):
     """A few iterations together, with whatever their random numbers share, have the mean of `path`
@@ -122,6 +123,7 @@ def test_mean_of_whole_renders(rgb, sampler):
         assert_same(*collect_until(ours, theirs, block=0.08), block=0.08)
 
 
+@pytest.mark.long
 @in_one_thread
 def test_sequences_lower_the_variance_of_path(rgb):
     """The variance of 32 paths a pixel, over 24 seeds, is much less than that of independent
@@ -494,6 +496,7 @@ def prices_over_seconds():
         return usual / seconds_of(photons), path.cost / seconds_of(paths)
 
 
+@pytest.mark.long
 def test_prices_are_what_candidates_take(rgb):
     """By the clock of the pilot an iteration takes 0.5 to 2 times what it does, on so small a film
     3 times, and a sample of `path` 1 to 1.8 times. Beside other work all of that varies: the median
@@ -549,6 +552,7 @@ def test_a_photon_mapper_learns_once(rgb, monkeypatch):
     assert len(pilots) == 1
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("sampler", ["sobol", *extended("independent")])
 def test_prediction_is_checked(rgb, sampler):
     """The error that is predicted for `path` is what twelve renders have: within a factor of two,

@@ -102,6 +102,7 @@ def test_few_photons_tell_nothing(rgb, monkeypatch):
     assert "choice.relmse.bdpm" not in session.settings
 
 
+@pytest.mark.long
 def test_the_cheaper_wins(rgb, monkeypatch):
     """The same scene, the same pilot: what is chosen follows the cost."""
     found = {}

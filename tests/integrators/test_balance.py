@@ -419,6 +419,7 @@ def storeys(emitter, pane):
     return mi.load_dict(scene)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "emitter, pane, beta", [("area", True, 1.0), *extended(("directionalarea", False, 2.0))]
 )

@@ -124,6 +124,7 @@ def test_strategies_agree(rgb, first, second):
     assert_same(*collect_until(a, b, block=0.05, most=600), block=0.05)
 
 
+@pytest.mark.long
 @in_one_thread
 def test_bias_falls_with_the_square_of_the_radius(rgb):
     """Where irradiance is curved, E'' R^2 / 8: the bias at R over that at R / 2 is 4, and R -> 0 is
@@ -806,6 +807,7 @@ def test_no_light_leaks_around_a_corner(rgb):
     assert render(scene, bdd=0, initial_radius=0.3, spp=32).max() == 0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "plugin, spp",
     [
@@ -837,6 +839,7 @@ def test_no_light_through_curved_sheets(rgb, plugin, spp):
     assert np.array(mi.render(scene, integrator=integrator, spp=spp, seed=1))[..., :3].max() == 0
 
 
+@pytest.mark.long
 def test_sheets_that_let_light_through_keep_their_photons(rgb):
     """Two thin diffusers back to back, far closer than R, pass light on in all directions: each
     gathers its own photons, not both."""

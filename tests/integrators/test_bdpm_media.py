@@ -134,6 +134,7 @@ MATT = {"type": "diffuse", "reflectance": 0.7}
 COATED = {"type": "blendbsdf", "weight": 0.3, "a": MATT, "b": {**METAL, "alpha": 0.03}}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "surface, bdd", [(COATED, 0), *extended((METAL, 0), (METAL, 1), (COATED, 1))]
 )
@@ -146,6 +147,7 @@ def test_narrow_lobes_are_passed(rgb, surface, bdd):
     agree_with_volpath(scene, bdd=bdd, direct_paths=3)
 
 
+@pytest.mark.long
 def test_a_mask_gathers_and_what_is_behind_it(rgb):
     """A half transparent screen: paths that go through it have asked for photons there."""
     mask = {"type": "mask", "opacity": 0.5, "nested": {"type": "twosided", "nested": MATT}}
@@ -154,6 +156,7 @@ def test_a_mask_gathers_and_what_is_behind_it(rgb):
     agree_with_volpath(fog_scene(homogeneous(0.2), screen=screen), 5, bdd=0)
 
 
+@pytest.mark.long
 def test_light_through_a_half_transparent_ceiling(rgb):
     """Half of what the floor gets comes through a mask, from a sky that camera paths meet as often
     as next-event estimation finds it."""
@@ -224,6 +227,7 @@ def test_furnace(rgb, bdd):
     assert_same(*collect_until(batches, exact, 0.01, 0.02), 0.01, 0.02, slack=2e-3)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "boundary, radius, left", [("null", 0.1, 0.03), ("dielectric", 0.25, 0.022)]
 )
@@ -250,6 +254,7 @@ def small_scene():
     return fog_scene(homogeneous(2.0), ball=ball({"type": "dielectric"}, exterior=FOG))
 
 
+@pytest.mark.long
 def test_buffers_that_overflow_grow(rgb):
     """Nothing is lost: the image is that of a session with room enough."""
     images = []
@@ -264,6 +269,7 @@ def test_buffers_that_overflow_grow(rgb):
     np.testing.assert_allclose(images[0], images[1], rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.long
 def test_radii_are_found_and_recalled(rgb):
     """Volume photons have a radius of their own, which another session of the render takes over."""
     session = bdpm(camera_paths=1).session(small_scene(), seed=1, spp=32)
@@ -284,6 +290,7 @@ def test_radius_without_surfaces(rgb):
     assert session.prediction is not None and 0.005 < session.radii["volume"] < 0.5
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("bdd", [1, *extended(0)])
 def test_classes_of_light_are_those_of_bdpt(rgb, bdd):
     """Direct, indirect and caustic light sum to the image, and have the shares that `bdpt`

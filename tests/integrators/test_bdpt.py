@@ -733,6 +733,7 @@ def test_shading_normals_seen_from_the_light(rgb, tilt):
 # --- Film ---------------------------------------------------------------------
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("rfilter, border", [("mitchell", True), *extended(("gaussian", False))])
 def test_filters_and_crops(rgb, rfilter, border):
     """Means of the outermost rows and columns of a crop window and of the whole agree with `path`,
@@ -918,6 +919,7 @@ def thin_lens_box(rgb):
     )
 
 
+@pytest.mark.long
 def test_seeds_and_iterations(thin_lens_box):
     """Same seed, same image, as a whole or as iterations; other seeds and iterations are
     uncorrelated."""

@@ -158,6 +158,7 @@ BY_DEFAULT = ("many kinds",)
 plugins."""
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "name", [*BY_DEFAULT, *extended(*(name for name in SCENES if name not in BY_DEFAULT))]
 )
@@ -302,6 +303,7 @@ def test_furnace(rgb):
     assert_same(*collect_until(batches, exact, 0.005, 0.01), 0.005, 0.01, slack=1e-4)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("of_flakes", [True, *extended(False)])
 def test_each_technique_alone(rgb, of_flakes):
     """Paths of two and three segments bring the same whether they meet the sky, find it by
@@ -338,6 +340,7 @@ def foggy_room(light, sensor="perspective"):
     )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "light, sensor, length, beta, eta",
     [

@@ -723,6 +723,7 @@ def test_bundled_scenes(rgb, scene):
 # --- Where resampling could fail ----------------------------------------------
 
 
+@pytest.mark.long
 def test_nothing_is_visible(rgb):
     """A lamp in a box of its own: no cache point sees any light vertex, every pmf falls back, and
     the image is black and finite."""
@@ -874,6 +875,7 @@ def test_iterations_in_any_order(rgb, parameters):
     np.testing.assert_allclose(*images, rtol=1e-3, atol=1e-5)
 
 
+@pytest.mark.long
 def test_replays_are_what_was_recorded(monkeypatch):
     """The pass that makes the pmfs has a size that Dr.Jit, left alone, would take for a multiple of
     its virtual calls' data, and get wrong (`core.recording.lanes`): 192 cache points times 520

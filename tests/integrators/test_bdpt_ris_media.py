@@ -111,6 +111,7 @@ def test_strengths_in_an_infinite_medium(rgb):
     np.testing.assert_allclose(strength, 4 * np.pi * 0.5 ** (depth - 1.0), rtol=1e-4)
 
 
+@pytest.mark.long
 def test_half_transparent_surfaces(rgb):
     """Most light comes through a mask: steps of camera paths go on beyond it as if it were not
     there. An error of 2 % of the image and of 4 % of a quarter is seen."""
@@ -122,6 +123,7 @@ def test_half_transparent_surfaces(rgb):
     )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "name, light, sensor, length, parameters",
     [

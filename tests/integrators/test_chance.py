@@ -181,6 +181,7 @@ def test_means_are_those_of_path(floor, lights, parameters):
     compare_means(world(floor, **LIGHTS[lights]()), "path", parameters)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("inside", "lights", "denoised"),
     [(LIQUID, "lamp", True), *extended((MILK, "sky and lamp", True), (MILK, "lamp", False))],
@@ -227,6 +228,7 @@ def test_both_bring_light(monkeypatch):
     assert rest.min() > -1e-4 * whole.max()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("floor", ["diffuse", "glossy"])
 def test_noise_is_less(monkeypatch, floor):
     """That of an iteration over that of photons alone, with disks as small as pixels (fixed seeds;
@@ -311,6 +313,7 @@ def test_light_is_of_the_class_of_caustics():
     assert layer["c"].mean() > 0.5 * image[..., 0].mean()
 
 
+@pytest.mark.long
 @pytest.mark.thinned(2, 1, 2)
 @pytest.mark.parametrize("denoised", [False, True])
 @pytest.mark.parametrize("name", ["lamp", "sky and lamp"])

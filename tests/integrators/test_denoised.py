@@ -63,6 +63,7 @@ def test_noise_moves_from_near_pixels_together_to_each_apart(scene):
     assert relative_variance(after) > 1.2 * relative_variance(before)
 
 
+@pytest.mark.long
 def test_what_is_chosen_knows_of_the_denoiser(scene):
     """Two groups of paths in the pilot; a predicted error that is less, as it is that which a
     denoiser leaves; fewer paths for direct light, whose noise it takes away; and optimal weights

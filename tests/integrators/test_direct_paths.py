@@ -141,6 +141,7 @@ def test_none_where_there_is_no_time(rgb, monkeypatch):
     assert means[0] == 0 and means[1] > 0.05 and means[2] > 0.05
 
 
+@pytest.mark.long
 def test_noise_of_an_iteration(rgb):
     """The variance of direct light that an image of one iteration tells: that of forty renders,
     within 0.3 in the mean over all pixels (the ratio's deviation is 0.054: false alarms below

@@ -61,6 +61,7 @@ def test_agrees_with_bdpt(rgb, plugin, kind):
     agree(integrator, bdpt(), fog_scene(MEDIA[kind]()), blocks=2, whole=0.03, block=0.1, spp=256)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["even", *extended("grid")])
 def test_views_agree_with_bdpt(rgb, kind):
     """Each view has its own extinction at what it shares."""
@@ -68,6 +69,7 @@ def test_views_agree_with_bdpt(rgb, kind):
     views_agree(multiview(max_depth=6), bdpt(), world, whole=0.05, block=0.15)
 
 
+@pytest.mark.long
 def test_furnace(rgb):
     """A medium of flakes that absorbs nothing cannot be told from an even sky: flakes take from
     each direction as much light as they send there."""

@@ -277,6 +277,7 @@ def picture(plugin, seed=0, scene=None, spp=4):
     )
 
 
+@pytest.mark.long
 def test_variants_in_turn(rgb):
     """Three times to and fro: the same image each time, and none of a session that was begun under
     another variant."""

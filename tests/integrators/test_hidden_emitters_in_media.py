@@ -59,6 +59,7 @@ def test_agrees_with_volpath_before_the_fog():
     agree(bdpt(**hiding()), oracle, scene, blocks=2, whole=0.01, block=0.03, spp=512)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["bdpt", *extended("bdpt_ris", "pcbpt", "vcm")])
 def test_connections(name):
     """(Wider balls of `vcm` lose light at the lamps.)"""
@@ -109,6 +110,7 @@ def alpha(session, iterations):
     return session.image()[:, :, 3]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "made",
     [

@@ -188,6 +188,7 @@ def glass_on_metal():
     )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("denoised", [False, True], ids=["raw", "denoised"])
 def test_glossy_floors_show_sharp_images(rgb, denoised):
     """Of a lamp in a ball of glass: light has other directions a little further, so that wide disks
@@ -224,6 +225,7 @@ def bristles(folder, **objects):
     return mi.load_dict(under_a_lamp(2, brush=brush, **objects))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("bdd", [0, *extended(1)])
 def test_no_photons_are_gathered_on_curves(rgb, tmp_path, bdd):
     """They are thinner than disks: with photons the image is 13 % too dark."""
@@ -245,6 +247,7 @@ def narrow_box(coat):
     return box(**{"small-box": FROSTED, "large-box": {**METAL, "alpha": 0.05}}, floor=coat)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "coat, bdd, more",
     [

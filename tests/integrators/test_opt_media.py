@@ -254,6 +254,7 @@ def test_agrees_with_volpath(rgb, name, strategies):
     assert_same(*collect_until(mine, oracle, *visible, most=600), *visible, slack=2 * SLACK)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("variant_name", ["llvm_ad_mono", *extended("llvm_ad_rgb")])
 def test_agrees_beyond_the_first_vertex(variant_name):
     """The first strategy is that of the second vertex: direct light at the first is next-event
@@ -343,6 +344,7 @@ def variance_in_sphere(iterations, strategies, **parameters):
     return float(noise.mean()), float(noise.std(ddof=1) / 4)
 
 
+@pytest.mark.long
 def test_least_noise_in_a_sphere_full_of_fog(rgb):
     """Balls in the fog and disks on the wall, against quadrature. The noise of merging at z_0 alone
     and at z_1 alone is what the noise functional says, A = V sigma and pi R^2 in it (5 % for what

@@ -146,6 +146,7 @@ def test_two_weights_of_a_path_sum_to_one(variant_name, family, emitter, first):
         assert_sums_to_one(w0 + w1, (w0, w1), paths.valid)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "variant_name, family, emitter",
     [(RGB, "rough", "rectangle"), *extended((SPECTRAL, "lambertian", "point"))],
@@ -324,6 +325,7 @@ def test_least_noise_of_one_weight(rgb, strategies, settings):
     )
 
 
+@pytest.mark.long
 def test_gain_of_weights_apart(rgb):
     """Where direct light and photons at z_1 have weights of their own (those of the cells): half of
     the noise of gathering at z_1 alone, within 5 %; under one weight it is 0.68."""

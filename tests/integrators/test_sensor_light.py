@@ -56,6 +56,7 @@ USUAL = ("coloured", 1), ("glass", 1)
 """Of `SCENES` and values of `bdd`, those of the default run."""
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name, bdd", one_in_each_row(sorted(SCENES), (0, 1, 2), USUAL))
 def test_agrees_with_volpath(name, bdd):
     """Glass: beams behind it, and light that is seen through it. Within the fog: the zone close to
@@ -137,6 +138,7 @@ def test_films_that_sample_their_border():
     assert abs(np.median(ratio) - 1) < 0.01 and 0.9 < np.quantile(ratio, 0.01)
 
 
+@pytest.mark.long
 def test_random_numbers_are_those_of_the_photon():
     """The same seed twice: photons lie in another order in their buffer, which chance decides, but
     are joined with the same points of the lens."""
@@ -150,6 +152,7 @@ def test_random_numbers_are_those_of_the_photon():
     np.testing.assert_allclose(images[1], images[0], rtol=1e-3, atol=1e-5)
 
 
+@pytest.mark.long
 def test_what_the_zone_brings_is_what_joined_photons_bring():
     """Within fog all of the same photons are joined, or those of a wide zone gathered along beams:
     the image's mean is the same within 4.9 standard errors of the difference (a false alarm in a
@@ -181,6 +184,7 @@ def test_the_zone_is_that_of_what_is_seen():
     assert 0 < depths[1] < 0.25 / 4 < 0.08 < depths[0]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("bdd", [1, *extended(0)])
 def test_classes_of_light_are_those_without(bdd):
     """Direct, indirect and caustic light sum to the image, and have the shares that beams find."""
@@ -235,6 +239,7 @@ def test_near_pixels_share_no_noise():
     assert alike[0] < 0.1 and alike[1] > 0.5
 
 
+@pytest.mark.long
 def test_photons_close_to_the_sensor_are_no_dots(monkeypatch):
     """Within fog, the largest pixel of images is many times brighter without the zone; the zone is
     a quarter of the median depth of the light."""
@@ -276,6 +281,7 @@ def test_beams_reach_to_the_end_of_the_zone():
     assert zone.reach(mi.Ray3f(mi.Point3f(1, 2, 1), mi.Vector3f(0, 0, -1)))[0] == 0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("variant_name", ["llvm_ad_rgb", "llvm_ad_spectral"])
 def test_the_pilot_counts_little_of_their_noise(variant_name):
     """What it predicts of them is a denoiser's share of the noise of pixels, measured over

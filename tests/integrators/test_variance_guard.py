@@ -114,6 +114,7 @@ def ratios(groups):
     return found
 
 
+@pytest.mark.long
 def test_advantage_is_what_it_was(measured, request):
     """Against the record; a tolerance above 25 % would be no guard and fails, too."""
     name, groups = measured

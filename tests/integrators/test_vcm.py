@@ -95,6 +95,7 @@ def assert_merged(scene, expected, whole, block, integrator=None):
     assert_same(*collect_until(batches, exact, whole, block), whole, block, 1e-3)
 
 
+@pytest.mark.long
 def test_light_that_only_merging_makes_in_media(rgb):
     """The floor of a tank without refraction, full of what only absorbs: L = rho E / pi, less what
     is lost on the way down and up."""
@@ -109,6 +110,7 @@ def test_light_that_only_merging_makes_in_media(rgb):
     assert_merged(scene, 0.6 / np.pi * np.exp(-2 * height * sigma_t), 0.02, 0.05)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "plugin", [{"type": "vcm"}, *extended({"type": "bdpt_ris", "merging": True})]
 )

@@ -124,6 +124,7 @@ def mark_of(tray, kind):
     return pytest.mark.full if (tray + kind) % 3 else pytest.mark.extended
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "variant_name, family, emitter, mix, kind, strategies",
     [
@@ -576,6 +577,7 @@ def test_presets_fix_the_number_of_strategies(rgb, plugin, strategies):
         mi.load_dict({"type": plugin, "strategies": 2})
 
 
+@pytest.mark.long
 def test_what_the_cache_knows_of_direct_light():
     """Cells that a lamp shines upon know it, and so do their surroundings; in spectral variants no
     less than in rgb."""

@@ -859,6 +859,7 @@ def test_direct_light_is_looked_for_at_windows(sky):
     assert_same_mean_less_noise(aimed, own, seen=0.1, left=0.3)
 
 
+@pytest.mark.long
 def test_a_wide_sun_is_found_at_windows():
     """As above, with a sun that its own sampler misses: three ways to choose a direction have one
     density (20 % are seen)."""

@@ -158,6 +158,7 @@ def test_the_back_of_a_thin_sheet_is_another_surface(rgb):
     np.testing.assert_array_equal(alike, angle < np.pi / 4)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("corrected", [False, True])
 def test_small_balls_are_as_bright_as_they_should_be(corrected):
     """Indirect light on a ball that is no wider than the merge disks, against `path`: within 14 %
@@ -167,6 +168,7 @@ def test_small_balls_are_as_bright_as_they_should_be(corrected):
     assert indirect_light(room_with(ball=ball), 0.4, corrected) == pytest.approx(1, rel=0.14)
 
 
+@pytest.mark.long
 @pytest.mark.thinned(2, 1, 2)
 @pytest.mark.parametrize("corrected, lacks", [(False, 0.37), (True, 0.0)])
 @pytest.mark.parametrize(

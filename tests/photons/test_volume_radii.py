@@ -195,6 +195,7 @@ class Extrapolated(SmallRadiusBatches):
         return session_of(scene, radius, **parameters)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("bdd", [0, *extended(1)])
 def test_single_scattering_in_closed_form(rgb, bdd):
     """Radii differ by thirty times, and the light is right. (False-alarm rate 1e-6; errors of 3 %

@@ -115,6 +115,7 @@ def test_one_view_is_volpath(variant_name):
     views_agree(multiview(), volpath("volpathmis" if mi.is_spectral else "volpath"), smoky(sensor))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("sky", ["constant", *extended("wide sun")])
 def test_a_sky_and_a_picture_that_shines(rgb, sky):
     """Lamps whose own samplers are not used, or not alone, together."""
@@ -309,6 +310,7 @@ def flat(origin, half, target=(0, 0, 0), depth=1.0, **extra):
     return sensor
 
 
+@pytest.mark.long
 def test_orthographic_views(rgb):
     """Beside a perspective one, media and surfaces at the pivots; one has its third axis scaled and
     a near plane that cuts off the lamp."""
@@ -376,6 +378,7 @@ def test_three_media(rgb, shift):
     assert batches.statistics["reached"] > 0.03 * batches.statistics["tried"]
 
 
+@pytest.mark.long
 def test_stretches_differ_where_majorants_do(rgb):
     """The same paths under two stretches: other densities in three media, the same in a single
     one, where both are one function."""
