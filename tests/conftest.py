@@ -57,8 +57,8 @@ def _activate(variant: str) -> str:
 @pytest.fixture(scope="session", autouse=True)
 def narrow_vectors():
     """Kernels are at most `MOST_LANES` wide: where there are wider vectors, they compile in less
-    time then (0.6 of that of eight), and small images take little more. (Nothing happens without LLVM, or where a
-    version of Dr.Jit does not have these functions of its C interface.)"""
+    time then (0.6 of that of eight), and small images take little more. (Nothing happens without
+    LLVM, or where a version of Dr.Jit does not have these functions of its C interface.)"""
     try:
         mi.set_variant("llvm_ad_rgb")
         library = ctypes.CDLL(str(next(Path(drjit.__file__).parent.glob("libdrjit-core.*"))))
@@ -116,8 +116,8 @@ def pytest_configure(config):
     )
     config.addinivalue_line(
         "markers",
-        "long: takes ten seconds and more with no kernel in the cache; left out unless asked for, as "
-        "`make test-long` and continuous integration do (-m 'long and not extended and not full')",
+        "long: takes ten seconds and more with no kernel in the cache; left out unless asked for, "
+        "as `make test-long` does (-m 'long and not extended and not full')",
     )
     config.addinivalue_line(
         "markers",

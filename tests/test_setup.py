@@ -15,6 +15,7 @@ from mis_integrators.llvm import library_directories
 
 import mitsuba as mi
 import pytest
+from conftest import LEFT_OUT
 
 ROOT = Path(__file__).parent.parent
 MULTIARCH = sysconfig.get_config_var("MULTIARCH") or "lib"
@@ -462,6 +463,17 @@ def test_files_that_are_no_modules_are_declared():
     }
     data = {file for file in package_files() if file.suffix != ".py"}
     assert data and data <= named
+
+
+def test_continuous_integration_runs_all_but_the_extended_and_the_full():
+    """The default tests, and the long ones that these leave out."""
+    targets = re.search(r"exec make ([-\w ]+)", ROOT.joinpath(".ci/run").read_text())[1].split()
+    make = subprocess.run(
+        ["make", "--dry-run", *targets], cwd=ROOT, capture_output=True, text=True, timeout=60
+    )
+    runs = re.findall(r"-m pytest -n 2 --dist worksteal(.*)", make.stdout)
+    assert runs == ["", ' -m "long and not extended and not full"']
+    assert sorted(LEFT_OUT) == ["extended", "full", "long"]
 
 
 @pytest.mark.parametrize("command", [("check",), ("format", "--check")], ids=" ".join)
