@@ -136,6 +136,7 @@ def test_advantage_is_what_it_was(measured, request):
         )
 
 
+@pytest.mark.long
 def test_optimal_weights_beat_single_strategies(measured):
     name, groups = measured
     t = t_quantile(2 * FALSE_ALARM / TESTS, 2 * (GROUPS - 1))
