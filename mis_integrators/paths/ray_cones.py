@@ -14,9 +14,9 @@ import mitsuba as mi
 from .bent_surfaces import curvatures
 from .camera_rays import axis_of
 
-MAGNIFIED = 0.8
-"""Tuned: where a pixel is narrower than this share of its width without lenses, as in a pool under
-waves, near pixels would share the photons of any disk. (With 0.5 a pool has rings of blotches.)"""
+NARROWEST = 0.25
+"""Tuned: share of its width without lenses that a pixel has at least where disks are as wide as it
+is. Narrower ones, near the focus of a lens, would hardly meet a photon."""
 
 
 class RayCones:
@@ -65,10 +65,11 @@ class RayCones:
         return after
 
     def pixel_width(self, cone):
-        """How wide a pixel is, without what bends its cones; 0 where these are `MAGNIFIED`."""
+        """How wide a pixel is, where lenses magnify, and else without them: what they make smaller
+        on the film may be of any width. 0 where it would be below the `NARROWEST`."""
         plain, across, along = cone[::2]
-        magnified = dr.abs(across * along) < dr.square(MAGNIFIED * plain)
-        return dr.select(magnified, 0, plain)
+        width = dr.minimum(dr.sqrt(dr.abs(across * along)), plain)
+        return dr.select(width < NARROWEST * plain, 0, width)
 
     def arrived(self, cone, at, active):
         """The cones at what they have met (a `CameraArrival`)."""

@@ -89,10 +89,10 @@ def new_vertex_buffer(capacity, weighted=False, split=False, cones=False, hits=F
     """Room for `capacity` camera vertices, a dictionary: `words` (records of `query_layout`; unused
     ones are zero), if `weighted`, `weights` (records of `weight_layout`), and if light is `split`
     into classes, `first`: whether the path has scattered smoothly nowhere before. With `cones`,
-    `pixel`: how wide a pixel is there; 0 where the path has scattered smoothly before, or lenses
-    magnify (`RayCones.pixel_width`). With `hits`, those of lights that are met by chance (records
-    of `hits.chance_layout`; zero: none). With `edges`, `coverage`: that of the merge disk (records
-    of `disk_walls.coverage_layout`)."""
+    `pixel`: how wide a pixel is there; 0 where the path has scattered smoothly before, or a lens
+    has its focus (`RayCones.pixel_width`). With `hits`, those of lights that are met by chance
+    (records of `hits.chance_layout`; zero: none). With `edges`, `coverage`: that of the merge disk
+    (records of `disk_walls.coverage_layout`)."""
     buffer = {"words": dr.zeros(mi.UInt32, query_layout().words * capacity)}
     if weighted:
         buffer["weights"] = weight_layout().room(capacity)

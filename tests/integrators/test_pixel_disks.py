@@ -112,7 +112,8 @@ def test_curvatures_are_those_of_a_cylinder(outside):
 )
 def test_cones_meet_in_the_focus(eta, radius, focus):
     """Of a concave mirror, at half its radius; and behind a boundary of glass, at
-    radius e / (e - 1). What is in between is magnified, but the first fifth of the way."""
+    radius e / (e - 1). On the way there and as far beyond it a pixel is as narrow as they are, but
+    not close to the focus."""
     from mis_integrators.paths import ray_cones
     from mis_integrators.paths.bent_surfaces import FLAGS
 
@@ -125,24 +126,47 @@ def test_cones_meet_in_the_focus(eta, radius, focus):
     bs.eta, mirrors = mi.Float(eta), eta == 1
     bs.wo = mi.Vector3f(0, 0, si.wi.z if mirrors else -si.wi.z)
     cone = cones.bent(cones.begin(), si, -ray.d, bs, mi.Bool(True))
-    for share, seen in ((0.1, True), (0.3, False), (1.0, False), (1.7, False), (1.9, True)):
+    for share in (0.1, 0.3, 0.7, 0.8, 1.0, 1.2, 1.3, 1.9, 3.0):
         far = cones.grown(cone, ray.d, share * focus, mi.Bool(False), mi.Bool(True))
         plain, across, along = (float(width[0]) for width in far[::2])
         np.testing.assert_allclose([across, along], (1 - share) * plain, atol=1e-3 * plain)
-        assert (cones.pixel_width(far)[0] > 0) == seen
+        width = min(abs(1 - share), 1)
+        expected = width * plain if width > ray_cones.NARROWEST else 0
+        np.testing.assert_allclose(float(cones.pixel_width(far)[0]), expected, atol=2e-3 * plain)
 
 
-def test_light_behind_a_magnifying_glass_has_disks_as_wide_as_elsewhere():
-    """A ball of glass close to the floor: what is seen through it asks for caustic photons of the
-    usual radius, not for those of pixels."""
-    glass = {"type": "sphere", "center": [0, 0, 0.7], "radius": 0.6}
-    glass |= {"bsdf": {"type": "dielectric"}}
-    scene = caustic_scene(leaf=glass, fov=5)  # sees nothing beside it
+def refracted(d, n, eta):
+    """Direction of a ray behind a boundary of this relative index: Snell's law. `n` is turned
+    against `d`."""
+    cosine = -d @ n
+    return d / eta + (cosine / eta - np.sqrt(1 - (1 - cosine**2) / eta**2)) * n
+
+
+def where_it_lands(angle, center, radius, eta):
+    """On the floor, beside the axis, a ray of the camera that goes through a ball of glass."""
+    o, d, middle = np.array([0, FAR]), np.array([np.sin(angle), -np.cos(angle)]), [0, center]
+    for index, side in ((eta, -1), (1 / eta, 1)):
+        to = o - middle
+        o = o + d * (-(to @ d) + side * np.sqrt((to @ d) ** 2 - to @ to + radius**2))
+        d = refracted(d, -side * (o - middle) / radius, index)
+    return o[0] - o[1] * d[0] / d[1]
+
+
+@pytest.mark.parametrize("height", [0.7, 2.0])
+def test_pixels_behind_a_magnifying_glass_are_narrow(height):
+    """As narrow as the rays' places on the floor, before the focus of a ball of glass and behind
+    it. (Few paths are thrown back at the glass and wander.)"""
+    ball = {"type": "sphere", "center": [0, 0, height], "radius": 0.6}
+    ball |= {"bsdf": {"type": "dielectric", "int_ior": 1.4, "ext_ior": 1.0}}
+    scene = caustic_scene(leaf=ball, fov=1)  # sees nothing beside it
     session = session_of(scene, 1000, radii=0.1, max_depth=6)
-    assert session.kinds() == ["seen_caustic", "caustic", "indirect"]
     setting = session.pilot_setting()
     trace = session.pilot_passes(setting, pilot_pixels(setting)).trace
-    assert np.mean(np.array(read_queries(trace(0).vertices)["pixel"]) == 0) > 0.5
+    widths = np.array(read_queries(trace(0).vertices)["pixel"])
+    pixel = 2 * np.tan(np.radians(0.5)) / SIZE
+    expected = 2 * abs(where_it_lands(pixel / 2, height, 0.6, 1.4))
+    assert 0.25 < expected / (pixel * FAR) < 0.8
+    np.testing.assert_allclose(np.median(widths), expected, rtol=0.03)
 
 
 def test_widths_grow_through_boundaries():
