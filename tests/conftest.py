@@ -58,7 +58,8 @@ def _activate(variant: str) -> str:
 def narrow_vectors():
     """Kernels are at most `MOST_LANES` wide: where there are wider vectors, they compile in less
     time then (0.6 of that of eight), and small images take little more. (Nothing happens without
-    LLVM, or where a version of Dr.Jit does not have these functions of its C interface.)"""
+    LLVM, or where a version of Dr.Jit does not have these functions of its C interface.) Returns
+    the width of this machine, and a function that sets another."""
     try:
         mi.set_variant("llvm_ad_rgb")
         library = ctypes.CDLL(str(next(Path(drjit.__file__).parent.glob("libdrjit-core.*"))))
@@ -72,10 +73,26 @@ def narrow_vectors():
             )
         )
     except (ImportError, OSError, AttributeError, StopIteration):
-        return
+        return MOST_LANES, lambda lanes: None
     cpu.restype = features.restype = ctypes.c_char_p
-    if width() > MOST_LANES:
-        set_target(cpu(), features(), MOST_LANES)
+    usual = width()
+
+    def narrow(lanes):
+        if usual > MOST_LANES:
+            set_target(cpu(), features(), lanes)
+
+    narrow(MOST_LANES)
+    return usual, narrow
+
+
+@pytest.fixture(scope="module")
+def usual_vectors(narrow_vectors):
+    """Kernels are as wide as those of other processes, with whose images a module compares its own:
+    else rounding would send a path in a thousand elsewhere."""
+    usual, narrow = narrow_vectors
+    narrow(usual)
+    yield
+    narrow(MOST_LANES)
 
 
 def pytest_addoption(parser):

@@ -65,8 +65,8 @@ class RayCones:
         return after
 
     def pixel_width(self, cone):
-        """How wide a pixel is, where lenses magnify, and else without them: what they make smaller
-        on the film may be of any width. 0 where it would be below the `NARROWEST`."""
+        """How wide a pixel is: where lenses magnify, by what they do, else as without them. 0 where
+        it is below the `NARROWEST`."""
         plain, across, along = cone[::2]
         width = dr.minimum(dr.sqrt(dr.abs(across * along)), plain)
         return dr.select(width < NARROWEST * plain, 0, width)

@@ -27,9 +27,7 @@ pytest.importorskip(
 )
 
 
-WIDER = 0.02
-"""Share of the pixels whose paths may be others in a worker: its kernels are wider than those of
-tests (`conftest.py`), and rounding sends a path in a thousand elsewhere (0.2 % of the pixels)."""
+pytestmark = pytest.mark.usefixtures("usual_vectors")
 
 
 @pytest.fixture
@@ -94,7 +92,7 @@ def test_image_is_that_of_one_process(scene, tmp_path, client):
         header["iterations"] == one_header["iterations"] == 12
         and header["radius.indirect"] == one_header["radius.indirect"]
     )
-    assert same(one, image, but=WIDER)
+    assert same(one, image)
     assert checkpoint.read(tmp_path / "two.checkpoint").done == Iterations(12)
 
 
@@ -121,7 +119,7 @@ def test_killed_worker_costs_its_iterations_only(scene, client, monkeypatch):
         session.iterate()
     assert in_hand > 0 and before < 60
     assert session.sums.done == Iterations(60)
-    assert same(whole.image(), session.image(), but=WIDER)
+    assert same(whole.image(), session.image())
     client.wait_for_workers(2, timeout=60)
     assert pids[victims[0]] not in client.run(os.getpid).values()
 
@@ -148,8 +146,9 @@ def test_workers_are_told_what_a_pilot_found(scene, client):
     arrays, done, _ = client.submit(
         cluster.run, cluster.Job("told", request, told, identity, False, 1), [2], pure=False
     ).result()
-    expected = opened.session.sums.arrays()["total"]
-    assert done == Iterations(0, (2,)) and same(expected, arrays["total"], but=WIDER)
+    assert done == Iterations(0, (2,)) and same(
+        opened.session.sums.arrays()["total"], arrays["total"]
+    )
 
 
 def test_error_of_a_worker_leaves_nothing_half_summed(scene, client, monkeypatch):
@@ -227,7 +226,7 @@ def test_processes_of_this_machine_and_ctrl_c(scene, tmp_path):
         )
         == 0
     )
-    assert same(read(tmp_path / "b.exr")[1], read(tmp_path / "a.exr")[1], but=WIDER)
+    assert same(read(tmp_path / "b.exr")[1], read(tmp_path / "a.exr")[1])
 
 
 def test_scheduler_that_is_not_there(scene, tmp_path, monkeypatch, capsys):
@@ -322,7 +321,7 @@ def test_stopped_worker_costs_its_iterations_only(scene, client, impatient):
     finally:
         os.kill(pids[victim], signal.SIGCONT)
     assert session.sums.done == Iterations(60)
-    assert same(whole.image(), session.image(), but=WIDER)
+    assert same(whole.image(), session.image())
     # a worker that is heard of again counts again
     iterate_for(session, 20, lambda: not session._watch.silent)
     assert set(session._watch.present) == set(pids)

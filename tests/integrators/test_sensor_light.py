@@ -53,7 +53,7 @@ def agree(scene, max_depth=6, whole=0.02, block=0.06, **parameters):
 # --- Means ----------------------------------------------------------------------------------------
 
 USUAL = ("coloured", 1), ("glass", 1)
-"""Of `SCENES` and values of `bdd`, those of the default run."""
+"""Of `SCENES` and values of `bdd`, those that are not `extended`."""
 
 
 @pytest.mark.long

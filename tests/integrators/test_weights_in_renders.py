@@ -115,7 +115,7 @@ TRAYS = [
 ]
 """Variant, family, emitter, and whether diffuse surfaces mix."""
 USUAL = (1, 2), (2, 1)
-"""Pairs of them that the default run has."""
+"""Pairs of them that are not `extended`."""
 
 
 def mark_of(tray, kind):
