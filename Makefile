@@ -1,5 +1,5 @@
 # make render   set everything up, then render a bundled scene into out/
-# make test     set everything up, then run the tests (10 to 20 minutes on two cores)
+# make test     set everything up, then run the tests (10 to 25 minutes on two cores)
 # make test-long the tests that take longest (ten minutes)
 # make test-all all of these, and all extended cases (an hour and a half)
 # make mutants  set everything up, then see how many of more than a hundred errors the tests find (twenty minutes)
