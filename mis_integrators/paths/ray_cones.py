@@ -14,7 +14,7 @@ import mitsuba as mi
 from .bent_surfaces import curvatures
 from .camera_rays import axis_of
 
-NARROWEST = 0.25
+NARROWEST = 0.5
 """Tuned: share of its width without lenses that a pixel has at least where disks are as wide as it
 is. Narrower ones, near the focus of a lens, would hardly meet a photon."""
 

@@ -152,15 +152,15 @@ def where_it_lands(angle, center, radius, eta):
     return o[0] - o[1] * d[0] / d[1]
 
 
-@pytest.mark.parametrize("height", [0.7, 1.4, 2.0])
-def test_pixels_behind_a_magnifying_glass_are_narrow(height):
+@pytest.mark.parametrize("height, index", [(0.7, 1.2), (1.4, 1.4), (2.1, 1.4)])
+def test_pixels_behind_a_magnifying_glass_are_narrow(height, index):
     """As narrow as the rays' places on the floor, before the focus of a ball of glass and behind
     it; close to it what is seen asks for photons of the usual radius. (Few paths are thrown back at
     the glass and wander.)"""
     from mis_integrators.paths.ray_cones import NARROWEST
 
     ball = {"type": "sphere", "center": [0, 0, height], "radius": 0.6}
-    ball |= {"bsdf": {"type": "dielectric", "int_ior": 1.4, "ext_ior": 1.0}}
+    ball |= {"bsdf": {"type": "dielectric", "int_ior": index, "ext_ior": 1.0}}
     scene = caustic_scene(leaf=ball, fov=1)  # sees nothing beside it
     session = session_of(scene, 1000, radii=0.1, max_depth=6)
     assert session.kinds() == ["seen_caustic", "caustic", "indirect"]
@@ -168,7 +168,7 @@ def test_pixels_behind_a_magnifying_glass_are_narrow(height):
     trace = session.pilot_passes(setting, pilot_pixels(setting)).trace
     widths = np.array(read_queries(trace(0).vertices)["pixel"])
     pixel = 2 * np.tan(np.radians(0.5)) / SIZE
-    expected = 2 * abs(where_it_lands(pixel / 2, height, 0.6, 1.4))
+    expected = 2 * abs(where_it_lands(pixel / 2, height, 0.6, index))
     assert expected < 0.8 * pixel * FAR
     if expected < NARROWEST * pixel * FAR:
         expected = 0
