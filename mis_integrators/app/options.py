@@ -24,11 +24,11 @@ MOST_WORKERS = 2**10
 
 _EXIT_CODES = """exit codes:
   0    rendered and written
-  1    error in the scene or in a parameter, or while rendering
-  2    wrong usage of this command
+  1    error in the scene, in a parameter or in the image of --like, or while rendering
+  2    wrong usage of this command, or a package that --denoise or --compare needs is missing
   3    the image cannot be written
   4    the checkpoint cannot be used: damaged, or of another scene or other settings
-  5    the workers cannot be reached, or fail
+  5    the workers cannot be reached, or fail, or dask.distributed is missing
   130  interrupted (Ctrl-C, SIGTERM): what had been rendered was written, if an iteration was done
 """
 
@@ -50,7 +50,9 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
         help="in the end, say what rendered and why: predicted errors of the candidates, merge "
         "radii, what the scene had no use for",
     )
-    parser.add_argument("--quiet", action="store_true", help="print errors only")
+    parser.add_argument(
+        "--quiet", action="store_true", help="print errors, and what --explain says"
+    )
     parser.add_argument("--version", action="version", version=versions())
     options = parser.parse_args(arguments)
     if options.scene.is_dir():
@@ -142,7 +144,7 @@ def _which_image(parser: argparse.ArgumentParser) -> None:
         metavar="FILE.exr",
         help="render again what this image of mis-render shows: with its integrator, parameters, "
         "seed and samples, and what was found out for it, such "
-        "as merge radii; the scene must be the same",
+        "as merge radii; the scene must be the same (not checked)",
     )
     add("--seed", type=_seed, metavar="S", help="seed of the random numbers (default: 0)")
     add(
@@ -152,12 +154,12 @@ def _which_image(parser: argparse.ArgumentParser) -> None:
         "--all-views",
         action="store_true",
         help="render all views of the scene together (all sensors, and the children of a batch) "
-        "into a contact sheet",
+        "into a contact sheet; needs -i volpath_multiview",
     )
     add(
         "--frames",
         action="store_true",
-        help="also write each view, FILE.000.png and so on: frames of an animation",
+        help="also write each view, FILE.000.png and so on: frames of an animation; as --all-views",
     )
     add(
         "--denoise",

@@ -47,7 +47,7 @@ class BDPM(IterativeIntegrator):
          (Default: 1)
      * - pass_narrow
        - |bool|
-       - Whether camera paths go on through surfaces with narrow lobes, as of smooth metal or
+       - Whether camera paths go on through surfaces with narrow lobes, as of polished metal or
          frosted glass, and curves; with ``bdd`` 0 and an automatic radius through legs, leaves and
          rims, too, that are narrower than merge disks. Only caustic photons are gathered there, and
          ``bdd`` does not count these vertices. Of a coat on a diffuse base, photons make the base's
