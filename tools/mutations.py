@@ -1181,4 +1181,32 @@ MUTATIONS = [
         "direct light of a single iteration is denoised as if it were all noise",
         "tests/integrators/test_direct_paths.py::test_noise_of_an_iteration",
     ),
+    Mutation(
+        "paths/sensor.py",
+        "(depth < self.far)",
+        "(depth > 0)",
+        "light vertices beyond the far clipping plane are joined with the sensor",
+        "tests/paths/test_sensor.py::test_points_beyond_clipping_planes_are_not_joined",
+    ),
+    Mutation(
+        "paths/media.py",
+        "return dr.select(from_origin < left, from_origin, left)",
+        "return left",
+        "short shadow rays behind a boundary meet the lamp that they ask for",
+        "tests/paths/test_media.py::test_short_ways_through_boundaries",
+    ),
+    Mutation(
+        "paths/guides.py",
+        "smooth &= ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)  # holes of masks",
+        "pass",
+        "denoisers are shown masks where these have holes",
+        "tests/app/test_denoising.py::test_guides_show_what_is_behind_holes",
+    ),
+    Mutation(
+        "integrators/pyramid.py",
+        "dr.scatter_add(self.entries[name], value, place, mask)",
+        "dr.scatter(self.entries[name], value, place, mask)",
+        "images of techniques lose light of paths that pass a mask",
+        "tests/integrators/test_bdpt_media.py::test_techniques_of_paths_that_pass_a_mask_are_whole",
+    ),
 ]

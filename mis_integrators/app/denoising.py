@@ -24,8 +24,17 @@ AROUND = 25
 """Tuned: width in pixels of the windows whose mean the variance of a pixel is not below."""
 HIGHLIGHTS = 25
 """Tuned: width in pixels of the windows whose brightest pixel no denoised one is above."""
-LUMINANCE = np.array([0.212671, 0.715160, 0.072169], dtype=np.float32)
-"""Of linear sRGB (ITU-R BT.709), as in images of the format `luminance`."""
+XYZ = np.array(
+    [
+        [0.412453, 0.357580, 0.180423],
+        [0.212671, 0.715160, 0.072169],
+        [0.019334, 0.119193, 0.950227],
+    ],
+    dtype=np.float32,
+)
+"""Of linear sRGB (ITU-R BT.709), row by row."""
+LUMINANCE = XYZ[1]
+"""What images of the format `luminance` have."""
 MISSING = "denoising needs mitsuba-oidn: pip install 'mis-integrators[denoise]'"
 
 
@@ -168,6 +177,8 @@ def denoise(
         seen = np.stack(direct, axis=-1)
         if len(where) == 1:
             seen = seen @ LUMINANCE[:, None]
+        elif channels[where[0]] == "X":
+            seen = seen @ XYZ.T
         light = np.clip(seen, 0, finite)
         found = shrunk(light, without_noise(light, guides), variance)
         found += without_noise(finite - light, guides, all_edges=True)

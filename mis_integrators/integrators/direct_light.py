@@ -224,7 +224,7 @@ class DirectLight:
     def _arguments(self, part, iteration, spectral):
         session = self.session
         most = MOST_PATHS * session.camera_paths
-        block, done = divmod(iteration, INDICES // most)
+        block, done = divmod(iteration, max(INDICES // most, 1))
         sequence = SampleSequence(
             session._pass_seed(iteration, DIRECT, block),
             dr.opaque(mi.UInt32, 0),

@@ -45,7 +45,8 @@ class Ledger:
 
     def _write(self, name, row, path, value, share, mask):
         value = value * share if self.weighted else value
-        dr.scatter(self.entries[name], value, row * self.paths + path, mask)
+        place = row * self.paths + path  # a path that passes a mask comes to the same depth again
+        dr.scatter_add(self.entries[name], value, place, mask)
 
     def hit_emitter(self, path, depth, value, share, mask):
         self._write("met", depth - 1, path, value, share, mask & (depth <= self.longest))

@@ -42,6 +42,7 @@ def first_smooth_surface(scene, camera_pass, hide_emitters=False):
         arriving = mi.UnpolarizedSpectrum(throughput)
         throughput *= mi.unpolarized_spectrum(weight)
         smooth = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+        smooth &= ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)  # holes of masks
         d = si.to_world(bs.wo)
         if dr.hint(hide_emitters, mode="scalar"):
             passes = active & unseen & si.shape.is_emitter()

@@ -139,7 +139,6 @@ def trace_light(world: World, limits: Limits, light_pass: LightPass, visitor: Li
     had_delta = dr.full(mi.Bool, False, lanes)
     scattered = dr.full(mi.Bool, False, lanes)
     depth = dr.zeros(mi.UInt32, lanes)
-    eta = dr.ones(mi.Float, lanes)
     state = visitor.blank(lanes)
     active = dr.full(mi.Bool, False, lanes)
     flight = begin_flights(traits, None)
@@ -161,7 +160,6 @@ def trace_light(world: World, limits: Limits, light_pass: LightPass, visitor: Li
             strength = dr.rcp(dr.maximum(dr.max(flux), 1e-38))
             scattered = mi.Bool(False)
             depth = mi.UInt32(0)
-            eta = mi.Float(1)
             state = visitor.begin(state)
             active = dr.max(flux) > 0
             path = mi.UInt32(next_path)
@@ -232,6 +230,5 @@ def trace_light(world: World, limits: Limits, light_pass: LightPass, visitor: Li
             had_delta |= delta
             scattered |= ~delta
         flux *= weight
-        eta *= bs.eta
         ray = si.spawn_ray(wo)
-        flux, active = russian_roulette(rng, flux, dr.max(flux) * strength, eta, begun, active)
+        flux, active = russian_roulette(rng, flux, dr.max(flux) * strength, 1, begun, active)

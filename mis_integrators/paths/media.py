@@ -122,6 +122,16 @@ def beyond_boundary(traits, hit, ray, medium, met, unseen=None):
     return crosses, share, beyond, dr.select(crosses, surface.spawn_ray(ray.d).o, ray.o)
 
 
+def way_left(ray, step, origin, end):
+    """The length that is left of a `ray` to its `end` (a point, maybe infinitely far), a `step`
+    further, from the `origin` of a new ray. That lies a little in front of the surface that was
+    met, so that the rest is shorter than by the step: else a short ray would reach beyond its end.
+    """
+    left = ray.maxt - step
+    from_origin = dr.dot(end - origin, ray.d)
+    return dr.select(from_origin < left, from_origin, left)
+
+
 @dr.syntax
 def transmittance(scene, traits, ray, medium, rng, active, through_emitters=False):
     """Share of light that gets along `ray` (to its `maxt`) through media and null boundaries (with
@@ -135,6 +145,7 @@ def transmittance(scene, traits, ray, medium, rng, active, through_emitters=Fals
     value = dr.select(active, mi.Spectrum(1), mi.Spectrum(0))
     surface = dr.zeros(mi.SurfaceInteraction3f)
     fresh = mi.Bool(True)  # the next surface is not known yet
+    end = ray(ray.maxt)
     while dr.hint(active, label="transmittance"):
         look = active & fresh
         surface[look] = scene.ray_intersect(ray, traits.boundary_flags, False, look)
@@ -172,7 +183,7 @@ def transmittance(scene, traits, ray, medium, rng, active, through_emitters=Fals
         medium[stands & surface.is_medium_transition()] = surface.target_medium(ray.d)
         step = dr.select(collided, t, surface.t)
         onward = surface.spawn_ray(ray.d)
-        ray.maxt = ray.maxt - step
+        ray.maxt = dr.select(met, way_left(ray, step, onward.o, end), ray.maxt - step)
         ray.o = dr.select(collided, ray.o + ray.d * step, onward.o)
         surface.t = surface.t - step
         fresh |= met

@@ -78,6 +78,10 @@ class RayCones:
 
 def cones_of(sensor):
     """The `RayCones` of a sensor; None where it does not tell how near pixels differ."""
+    middle = mi.Point2f(0.5)
+    ray, _ = sensor.sample_ray_differential(sensor.shutter_open(), 0.5, middle, middle)
+    if sensor.class_name() == "BatchSensor" or not ray.has_differentials:
+        return None
     cones = RayCones(sensor)
     return cones if (cones.width + cones.spread)[0] > 0 else None
 

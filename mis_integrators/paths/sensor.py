@@ -20,6 +20,10 @@ SAME_POINT = 1e-4
 sent."""
 
 
+ROUNDED = 1e-6
+"""Relative to the largest coordinate: how far rounding may move a point."""
+
+
 class Lens:
     """What joins surface points to a sensor. Attribute `connects`: whether that is possible; other
     sensors are only met by camera rays."""
@@ -42,6 +46,14 @@ class Lens:
             self.axis, self.reach = corners[0].d, corners[0].maxt
         elif self.connects:
             self.axis = axis_of(sensor)
+            near, far = sensor.near_clip(), sensor.far_clip()
+            corners = [
+                sensor.sample_ray(0, 0.5, mi.Point2f(u, v), mi.Point2f(0.5))[0].d
+                for u, v in ((0, 0), (1, 0), (0, 1))
+            ]
+            first, *others = [d / dr.dot(d, self.axis) for d in corners]
+            self.area = dr.norm(dr.cross(*[other - first for other in others]))
+            self.near, self.far = dr.opaque(mi.Float, near), dr.opaque(mi.Float, far)
 
     def connect(self, p, time, aperture, active):
         """Joins points `p` to the point of the lens that `aperture` (uniform in [0, 1]^2, as for
@@ -77,10 +89,14 @@ class Lens:
             return -self.axis, distance, mi.Point2f(u, v) * size + offset, dr.rcp(area), valid
         reference = dr.zeros(mi.Interaction3f, dr.width(p))
         reference.p, reference.time = p, time
-        ds, weight = self.sensor.sample_direction(reference, aperture, active)
-        density = weight[0]
-        near = self.sensor.near_clip() / dr.maximum(dr.abs(dr.dot(ds.d, self.axis)), 1e-6)
-        valid = active & (density > 0) & dr.isfinite(density) & (ds.dist > near)
+        # Its weight knows neither the principal point nor the clipping planes (Mitsuba 3.9.1).
+        ds, _ = self.sensor.sample_direction(reference, aperture, active)
+        cosine = -dr.dot(ds.d, self.axis)
+        depth = ds.dist * cosine
+        valid = active & (cosine > 0) & (depth > self.near) & (depth < self.far)
+        valid &= dr.all((ds.uv >= 0) & (ds.uv < size))
+        density = dr.rcp(self.area * dr.square(ds.dist) * cosine * dr.square(cosine))
+        near = self.near * dr.rcp(dr.maximum(cosine, 1e-6))
         return ds.d, ds.dist - near, ds.uv + offset, dr.select(valid, density, 0), valid
 
     def density(self, p, time, aperture, active):
@@ -114,4 +130,5 @@ def unblocked_by_visible(scene, integrator, p, d, distance, active):
     hit = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
     hit, ray = behind_emitters(scene, integrator, hit, ray, active)
     expected = dr.norm(p - ray.o)
-    return active & hit.is_valid() & (dr.abs(hit.t - expected) < SAME_POINT * distance)
+    near = SAME_POINT * distance + ROUNDED * dr.max(dr.abs(p))
+    return active & hit.is_valid() & (dr.abs(hit.t - expected) < near)

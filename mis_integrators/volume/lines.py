@@ -7,7 +7,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..paths.flakes import projected_area
-from ..paths.media import collision, point_in, section
+from ..paths.media import collision, point_in, section, way_left
 from .pivots import (
     IN_MEDIUM,
     ON_SURFACE,
@@ -52,6 +52,7 @@ def _walk(scene, traits, ray, medium, slots: int, hide_emitters: bool, active):
     travelled = mi.Float(0)
     tint = mi.Spectrum(1)
     log_passed = mi.Float(0)
+    end = ray(ray.maxt)
     while dr.hint(active, label="lines of sight"):
         surface = scene.ray_intersect(ray, traits.boundary_flags, False, active)
         stretch = mi.Ray3f(ray)
@@ -88,8 +89,8 @@ def _walk(scene, traits, ray, medium, slots: int, hide_emitters: bool, active):
         medium[crosses & ~hidden & surface.is_medium_transition()] = surface.target_medium(ray.d)
         travelled[crosses] += surface.t
         onward = surface.spawn_ray(ray.d)
+        ray.maxt = way_left(ray, surface.t, onward.o, end)
         ray.o = onward.o
-        ray.maxt = ray.maxt - surface.t
         active = crosses & (ray.maxt > 0)
     return clear, starts, ends, majorants, media, found, tint, log_passed, nulls, depth
 

@@ -107,6 +107,26 @@ def test_guides_do_not_show_what_is_hidden(rgb, hide_emitters):
     np.testing.assert_allclose(normal, np.broadcast_to([0, 0, 1], (4, 6, 3)), atol=1e-5)
 
 
+def test_guides_show_what_is_behind_holes(rgb):
+    """A mask lets all light pass on its left half, and none on its right one."""
+    opacity = mi.Bitmap(np.float32([[[0.0], [1.0]]]).repeat(2, axis=0))
+    mask = {
+        "type": "mask",
+        "opacity": {"type": "bitmap", "bitmap": opacity, "filter_type": "nearest", "raw": True},
+        "nested": {"type": "diffuse", "reflectance": 0.3},
+    }
+    turned = mi.ScalarTransform4f().translate([0, 0, 2]).rotate([1, 0, 0], 30).scale(50)
+    scene = painted_wall({"type": "rectangle", "to_world": turned, "bsdf": mask})
+    albedo, normal = albedo_and_normal(scene, scene.sensors()[0], samples=2)
+    for hole in (albedo[:, :3], albedo[:, 3:]):
+        expected = WALL if np.allclose(hole[0, 0], WALL, atol=1e-4) else [0.3] * 3
+        np.testing.assert_allclose(hole, np.broadcast_to(expected, hole.shape), atol=1e-4)
+    assert not np.allclose(albedo[0, 0], albedo[0, -1])
+    behind = np.all(np.isclose(albedo, WALL, atol=1e-4), axis=-1)
+    np.testing.assert_allclose(normal[behind], [[0, 0, 1]] * behind.sum(), atol=1e-5)
+    assert np.all(normal[~behind][:, 2] < 0.9)
+
+
 def test_guides_of_mirrors_are_what_is_in_them(rgb):
     """A mirror before the wall that shows another wall, behind the camera: half of its light."""
     transform = mi.ScalarTransform4f
@@ -376,6 +396,18 @@ def test_grey_images_beside_other_channels(rgb):
     layers = np.concatenate([grey, direct[..., :2]], axis=-1)
     found = mis_integrators.denoise(layers, channels=["Y", "uv.U", "uv.V"])
     assert same(found[..., 1:], layers[..., 1:])
+
+
+def test_direct_light_is_found_in_xyz(rgb):
+    """Its channels are those of sRGB whatever the film has: a picture of nothing else has no rest,
+    and so keeps the edges of its light."""
+    light = np.zeros((32, 32, 3), np.float32)
+    light[:, 16:] = [0.5, 0.25, 0.1]
+    bitmap = mi.Bitmap(light, mi.Bitmap.PixelFormat.RGB)
+    bitmap = bitmap.convert(mi.Bitmap.PixelFormat.XYZ, mi.Struct.Type.Float32, False)
+    image = np.concatenate([np.array(bitmap), light, np.zeros((32, 32, 1), np.float32)], axis=-1)
+    found = mis_integrators.denoise(image, channels=["X", "Y", "Z", *direct_channels()])
+    np.testing.assert_allclose(found, image, atol=2e-3)
 
 
 def test_sensors_that_are_not_there(rgb):

@@ -35,7 +35,7 @@ from foggy import agree_with_volpath, container, even, flaky, floor, grid, lamp,
 from selection import extended
 from test_bdpm import last_words
 from test_bdpt import JointPaths, pyramid, technique_estimates
-from worlds import diffuse, grey, lamp_inside, look
+from worlds import T, diffuse, grey, lamp_inside, look
 
 FOG = {"type": "ref", "id": "fog"}
 
@@ -413,3 +413,20 @@ def test_a_sensor_must_name_its_medium(rgb):
     with pytest.raises(Exception) as error:
         mi.render(fog_scene(homogeneous(), view(*WITHIN)), integrator=bdpt(), spp=16)
     assert "bdpt: the sensor stands in a medium" in last_words(error.value)
+
+
+def test_techniques_of_paths_that_pass_a_mask_are_whole(rgb):
+    """Such a path comes to the same depth twice, on the mask and behind it: images of techniques
+    have the light of both, and nothing is left for the rest, which is that of longer paths."""
+    curtain = {
+        "type": "rectangle",
+        "to_world": T().translate([0, 0.2, 1.5]).scale(1.5),
+        "bsdf": {"type": "mask", "opacity": 0.5, "nested": {"type": "twosided", "b": diffuse(0.8)}},
+    }
+    scene = fog_scene(homogeneous(0.3), curtain=curtain)
+    session = bdpt(max_depth=3, techniques=3, camera_paths=4).session(scene, 0, seed=1, spp=0)
+    session.iterate()
+    image, names = session.image(), session.channels
+    rest = image[..., [names.index(f"technique.rest.{letter}") for letter in "RGB"]]
+    total = image[..., [names.index(letter) for letter in "RGB"]]
+    assert total.mean() > 0 and np.abs(rest).max() < 1e-4 * total.max()

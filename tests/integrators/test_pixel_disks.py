@@ -349,3 +349,20 @@ def test_the_pilot_counts_little_of_their_noise():
     measured = LEFT * (inner.var(axis=0, ddof=1) * weights).mean()
     predicted = session.prediction.errors["relmse"].variance
     assert 0.5 * measured < predicted < 2 * measured
+
+
+@pytest.mark.parametrize("kind", ["radiancemeter", "irradiancemeter", "distant", "batch"])
+def test_sensors_without_pixels_have_no_cones(kind):
+    """Their rays tell nothing of a pixel's width."""
+    from mis_integrators.paths.ray_cones import cones_of
+
+    film = {"type": "hdrfilm", "width": 1, "height": 1, "rfilter": {"type": "box"}}
+    sensor = {"type": kind, "film": film}
+    if kind == "batch":
+        sensor["child"] = sensor_of("perspective", 60, SIZE)
+    if kind == "irradiancemeter":
+        shape = mi.load_dict({"type": "rectangle", "meter": sensor})
+        sensor = shape.sensor()
+    else:
+        sensor = mi.load_dict(sensor)
+    assert cones_of(sensor) is None

@@ -213,3 +213,29 @@ def test_directions_stay_unit_vectors(rgb):
         direction = si.to_world(sample.wo)
         dr.eval(direction, rng)
     assert np.abs(np.array(dr.norm(direction)) - 1).max() < 1e-5
+
+
+@pytest.mark.parametrize("scale, at", [(1, 0), (0.05, 0), (1, 30)])
+def test_short_ways_through_boundaries(rgb, scale, at):
+    """From within a cube of fog to a lamp that is closer above it than a new ray begins in front of
+    the boundary: the light of that way, not none."""
+    above = 2e-3 * scale
+    place = T().translate([at, 0, scale + above]).scale(scale)
+    shape = {"type": "rectangle", "to_world": place, "emitter": {"type": "area"}}
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "cube": container(homogeneous(0.5 / scale), scale, (at, 0, 0)),
+            "lamp": shape,
+        }
+    )
+    traits = SceneTraits(scene)
+    p, d = mi.Point3f(at, 0, 0.9 * scale), mi.Vector3f(0, 0, 1)
+    (fog,) = (shape.interior_medium() for shape in scene.shapes() if shape.is_medium_transition())
+    medium = mi.MediumPtr(fog)
+    way = 0.1 * scale + above
+    rng = streams(mi.UInt32(0), mi.UInt32(3))
+    sides = Sides(medium, medium, p, [])
+    n = mi.Vector3f(0, 0, 1)
+    found = transmitted(scene, traits, p, n, sides, d, mi.Float(way), [], rng, mi.Bool(True))
+    np.testing.assert_allclose(np.array(found).ravel(), np.exp(-0.05), rtol=2e-2)
