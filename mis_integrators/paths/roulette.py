@@ -10,8 +10,9 @@ def russian_roulette(rng, throughput, strength, eta, begun, active):
 
     `strength`: how much a path still carries, the largest channel of its throughput, or of its flux
     over that at the start; `eta`: the product of relative indices of refraction on the way, whose
-    square undoes the compression of radiance (1 for flux, which boundaries do not compress); `begun`: usually depth >= `rr_depth`. Advances `rng`
-    where a path plays. Returns `(throughput, active)`.
+    square undoes the compression of radiance (1 for flux, which boundaries do not compress);
+    `begun`: usually depth >= `rr_depth`. Advances `rng` where a path plays. Returns `(throughput,
+    active)`.
     """
     active = active & (strength > 0)
     plays = active & begun

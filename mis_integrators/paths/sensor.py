@@ -114,10 +114,15 @@ def unblocked(scene, p, n, d, distance, active):
     return active & ~scene.ray_test(ray, active)
 
 
+def close_to(p, distance):
+    """How far from points `p`, which are `distance` away from others, a ray may meet them."""
+    return SAME_POINT * distance + ROUNDED * dr.max(dr.abs(p))
+
+
 def on_emitter(scene, p, d, distance, active):
     """Whether points `p` lie on emitters' shapes. `d`: any direction that leaves the surface there,
     and `distance` how far it is to the next that matters."""
-    near = SAME_POINT * distance
+    near = close_to(p, distance)
     hit = scene.ray_intersect_preliminary(mi.Ray3f(p + d * near, -d), coherent=False, active=active)
     return active & hit.is_valid() & (hit.t < 2 * near) & hit.shape.is_emitter()
 
@@ -130,5 +135,4 @@ def unblocked_by_visible(scene, integrator, p, d, distance, active):
     hit = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
     hit, ray = behind_emitters(scene, integrator, hit, ray, active)
     expected = dr.norm(p - ray.o)
-    near = SAME_POINT * distance + ROUNDED * dr.max(dr.abs(p))
-    return active & hit.is_valid() & (dr.abs(hit.t - expected) < near)
+    return active & hit.is_valid() & (dr.abs(hit.t - expected) < close_to(p, distance))

@@ -1,12 +1,12 @@
 """How points are joined with a sensor (`paths.sensor.Lens`), next to the rays that it sends."""
 
-from mis_integrators.paths.sensor import Lens
+from mis_integrators.paths.sensor import Lens, unblocked_by_visible
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from worlds import look
+from worlds import T, look
 
 COUNT = 4096
 CROP = {"crop_offset_x": 10, "crop_offset_y": 5, "crop_width": 40, "crop_height": 20}
@@ -82,3 +82,18 @@ def test_points_beyond_clipping_planes_are_not_joined(rgb, kind):
     expected = [False, False, False, True, True, True, False, False]
     assert np.array(valid).tolist() == expected
     assert (np.array(density) > 0).tolist() == expected
+
+
+def test_points_far_from_the_origin_are_seen(rgb):
+    """With `hide_emitters`: a look from the sensor ends where it was sent, but for rounding, which
+    is 0.008 at 100 km."""
+    far = 1e5
+    turned = T().translate([far, 0, 0]).rotate([0, 1, 0], 90).scale(20)
+    scene = mi.load_dict({"type": "scene", "wall": {"type": "rectangle", "to_world": turned}})
+    rng = mi.PCG32(COUNT)
+    p = mi.Point3f(far, 9 * rng.next_float32(), 9 * rng.next_float32())
+    towards = mi.Point3f(5.003, 0, 0) - mi.Point3f(0, p.y, p.z)
+    distance = dr.norm(towards)
+    integrator = mi.load_dict({"type": "bdpt", "hide_emitters": True})
+    seen = unblocked_by_visible(scene, integrator, p, towards / distance, distance, mi.Bool(True))
+    assert np.array(seen).mean() > 0.99
