@@ -1197,8 +1197,8 @@ MUTATIONS = [
     ),
     Mutation(
         "paths/guides.py",
-        "smooth &= ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)  # holes of masks",
-        "pass",
+        "mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth) & ~null",
+        "mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)",
         "denoisers are shown masks where these have holes",
         "tests/app/test_denoising.py::test_guides_show_what_is_behind_holes",
     ),

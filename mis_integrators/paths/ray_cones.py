@@ -27,9 +27,10 @@ class RayCones:
         middle = mi.Point2f(0.5)
         ray, _ = sensor.sample_ray_differential(sensor.shutter_open(), 0.5, middle, middle)
         self.axis = axis_of(sensor)
-        spread = _mean_size(ray.d_x - ray.d, ray.d_y - ray.d)
+        known = mi.Float(ray.has_differentials)  # else they are zero, and these differences wide
+        spread = known * _mean_size(ray.d_x - ray.d, ray.d_y - ray.d)
         ahead = dr.maximum(dr.abs(dr.dot(ray.d, self.axis)), 1e-3)
-        self.width = _mean_size(ray.o_x - ray.o, ray.o_y - ray.o)
+        self.width = known * _mean_size(ray.o_x - ray.o, ray.o_y - ray.o)
         self.spread = spread / _falling_off(ahead)
         dr.make_opaque(self.tables())
 
@@ -78,9 +79,7 @@ class RayCones:
 
 def cones_of(sensor):
     """The `RayCones` of a sensor; None where it does not tell how near pixels differ."""
-    middle = mi.Point2f(0.5)
-    ray, _ = sensor.sample_ray_differential(sensor.shutter_open(), 0.5, middle, middle)
-    if sensor.class_name() == "BatchSensor" or not ray.has_differentials:
+    if sensor.class_name() == "BatchSensor":  # its rays are those of many
         return None
     cones = RayCones(sensor)
     return cones if (cones.width + cones.spread)[0] > 0 else None

@@ -18,8 +18,6 @@ CONNECTED = ("PerspectiveCamera", "ThinLensCamera", "OrthographicCamera")
 SAME_POINT = 1e-4
 """Relative difference of distances up to which a ray has met the point towards which it was
 sent."""
-
-
 ROUNDED = 1e-6
 """Relative to the largest coordinate: how far rounding may move a point."""
 
@@ -33,27 +31,25 @@ class Lens:
         name = sensor.class_name()
         self.connects = name in CONNECTED
         self.parallel = name == "OrthographicCamera"
+        if not self.connects:
+            return
+        corners = [
+            sensor.sample_ray(0, 0.5, mi.Point2f(u, v), mi.Point2f(0.5))[0]
+            for u, v in ((0, 0), (1, 0), (0, 1))
+        ]
         if self.parallel:
-            corners = [
-                sensor.sample_ray(0, 0.5, mi.Point2f(u, v), mi.Point2f(0.5))[0]
-                for u, v in ((0, 0), (1, 0), (0, 1))
-            ]
             self.origin, self.across, self.down = (
                 corners[0].o,
                 corners[1].o - corners[0].o,
                 corners[2].o - corners[0].o,
             )
             self.axis, self.reach = corners[0].d, corners[0].maxt
-        elif self.connects:
+        else:
             self.axis = axis_of(sensor)
-            near, far = sensor.near_clip(), sensor.far_clip()
-            corners = [
-                sensor.sample_ray(0, 0.5, mi.Point2f(u, v), mi.Point2f(0.5))[0].d
-                for u, v in ((0, 0), (1, 0), (0, 1))
-            ]
-            first, *others = [d / dr.dot(d, self.axis) for d in corners]
+            first, *others = [ray.d / dr.dot(ray.d, self.axis) for ray in corners]
             self.area = dr.norm(dr.cross(*[other - first for other in others]))
-            self.near, self.far = dr.opaque(mi.Float, near), dr.opaque(mi.Float, far)
+            self.near = dr.opaque(mi.Float, sensor.near_clip())
+            self.far = dr.opaque(mi.Float, sensor.far_clip())
 
     def connect(self, p, time, aperture, active):
         """Joins points `p` to the point of the lens that `aperture` (uniform in [0, 1]^2, as for
@@ -93,7 +89,7 @@ class Lens:
         ds, _ = self.sensor.sample_direction(reference, aperture, active)
         cosine = -dr.dot(ds.d, self.axis)
         depth = ds.dist * cosine
-        valid = active & (cosine > 0) & (depth > self.near) & (depth < self.far)
+        valid = active & (depth > self.near) & (depth < self.far)
         valid &= dr.all((ds.uv >= 0) & (ds.uv < size))
         density = dr.rcp(self.area * dr.square(ds.dist) * cosine * dr.square(cosine))
         near = self.near * dr.rcp(dr.maximum(cosine, 1e-6))
